@@ -78,7 +78,7 @@ def test_the_threshold_of_a_risk_is_the_lowest_that_promises_it(row, risk):
             bounds.threshold(risk, 1)
 
 
-def test_what_was_not_calibrated_is_not_promised():
+def test_an_uncalibrated_error_rate_is_not_guaranteed():
     bounds = RiskBounds((0.9,), ((0.01,), (0.02,)), 0.1)
     assert bounds.threshold(0.05, 2) == 0.9
     with pytest.raises(RiskError, match="at most 2 views, not 3"):
@@ -158,7 +158,7 @@ def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
         np.testing.assert_allclose(belief, softmax(logits[0] / 0.7))
 
 
-def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
+def test_without_azimuth_bins_the_belief_is_the_sum_of_logits():
     logits, azimuth_bins, azimuth = some_views(3)
     total = log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):
@@ -171,7 +171,7 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
         Calibration().belief(total + np.nan, 3, 3)
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_settings_are_rejected():
     for make, value in (
         (Stopping, 1.01),
         (fuse, np.array([[0.0, np.nan]])),

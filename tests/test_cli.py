@@ -52,7 +52,7 @@ def test_every_command_explains_itself(name, capsys):
     ], "no help"
 
 
-def test_all_commands_are_listed_without_importing_one():
+def test_the_list_of_commands_imports_no_command():
     code = (
         "import sys; from nextview.cli.main import main; main(['--help'])\nslow = {'torch',"
         " 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
@@ -66,7 +66,7 @@ def test_all_commands_are_listed_without_importing_one():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_next_command_is_there(name):
+def test_suggested_next_commands_exist(name):
     named = re.findall(r"nextview (\w+(?: \w+)?)", COMMANDS[name].then)
     assert all(words in COMMANDS or words.split()[0] in COMMANDS for words in named)
 
@@ -96,7 +96,7 @@ def options(name):
     return found
 
 
-def test_an_option_takes_the_same_in_every_command():
+def test_an_option_has_the_same_type_in_every_command():
     pytest.importorskip("torch")
     taken = {}
     for name in COMMANDS:
@@ -205,7 +205,7 @@ def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
         ("2>/dev/full", "recognise none.off", 2, ""),
     ],
 )
-def test_where_an_output_is_full_or_closed_the_status_still_tells(
+def test_the_exit_status_is_right_if_an_output_is_full_or_closed(
     where,
     words,
     status,
@@ -237,7 +237,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
         ("pandas", ["benchmark", "classes", "p.npz"], "benchmark"),
     ],
 )
-def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
+def test_a_missing_extra_is_named_with_its_install_command(package, arguments, extra):
     code = (
         f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main;"
         f" main({arguments!r})"
@@ -301,7 +301,7 @@ def test_python_without_an_extra_names_it_too(code, without_extras):
     assert "\n" not in without_extras[code]
 
 
-def test_a_module_that_is_no_extra_is_no_missing_extra():
+def test_an_unknown_module_is_not_reported_as_a_missing_extra():
     with pytest.raises(ModuleNotFoundError) as raised, extras():
         import no_such_package_at_all  # noqa: F401
     assert not isinstance(raised.value, MissingExtraError)
@@ -388,7 +388,7 @@ def test_bash_completes_commands_and_options(words, offered, completions_for_bas
     assert set(done.stdout.split()) == offered
 
 
-def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypatch):
+def test_a_resumed_stage_reports_its_progress(views, tmp_path, capsys, monkeypatch):
     store = tmp_path / "views.zarr"
     shutil.copytree(views, store)
     (tmp_path / "ones.py").write_text("def one(view):\n    return 1.0\n")
@@ -401,7 +401,7 @@ def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypa
         assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_where_there_is_no_terminal_lines_tell_how_far_it_is_the_first_at_once(
+def test_without_a_terminal_progress_is_printed_as_lines(
     monkeypatch,
     capsys,
 ):
@@ -422,7 +422,9 @@ def test_where_there_is_no_terminal_lines_tell_how_far_it_is_the_first_at_once(
     ]
 
 
-def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, capsys):
+def test_render_warns_early_about_image_sizes_that_the_networks_reject(
+    furniture, tmp_path, capsys
+):
     for size, said in (("48", True), ("112", False)):
         command = [
             "render",

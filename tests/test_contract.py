@@ -323,7 +323,7 @@ PAGES = [
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_pages_import_is_there(page):
+def test_all_imports_of_the_pages_exist(page):
     """Lines "from nextview... import names", each name of which has to be there."""
     lines = re.findall(
         r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)",

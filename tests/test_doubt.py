@@ -106,7 +106,7 @@ def test_a_thing_of_another_size_is_a_stranger_however_noisy_the_camera(
 
 
 @pytest.mark.parametrize("height", [0.02, 0.05])
-def test_what_stands_on_another_thing_is_not_stretched_down_to_the_ground(ycb, height):
+def test_an_object_on_another_thing_does_not_extend_to_the_ground(ycb, height):
     box = trimesh.creation.box([0.16, 0.2, height])
     corners = np.add(box.vertices, [0, 0, height / 2])
     tray = PlacedThing("tray", corners, box.faces.astype(np.int32), np.eye(4))

@@ -102,7 +102,7 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
         ({"data": zipped({"Other/a.off": MESH})}, None, "holds no folder Shapes"),
     ],
 )
-def test_what_is_not_the_published_file_leaves_nothing(
+def test_a_download_with_a_wrong_hash_leaves_no_files(
     tmp_path,
     options,
     published,

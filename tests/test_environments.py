@@ -208,7 +208,7 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path))
 
 
-def test_the_page_does_what_it_says(tmp_path, monkeypatch):
+def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(

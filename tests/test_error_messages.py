@@ -41,19 +41,19 @@ def _part(value: ast.expr) -> str:
 
 
 @pytest.mark.parametrize("sentence", SENTENCES)
-def test_a_sentence_of_the_page_is_one_of_the_source(sentence):
+def test_each_message_of_the_page_is_in_the_source(sentence):
     for part in sentence.split("…"):
         assert part.strip() in texts(), part
 
 
-def test_the_page_has_a_sentence_for_each_door():
+def test_the_page_has_messages_for_each_interface():
     doors = re.split(r"^## ", PAGE, flags=re.M)[1:]
     assert len(doors) == 7
     for door in doors:
         assert len(re.findall(r"^\| `", door, re.M)) >= 5, door.splitlines()[0]
 
 
-def test_a_sentence_of_the_page_is_what_a_user_gets(tmp_path):
+def test_a_message_of_the_page_is_raised(tmp_path):
     with pytest.raises(nextview.NextviewError) as raised:
         nextview.load(str(tmp_path / "missing"))
     (begin,) = [text for text in SENTENCES if "neither a folder with models" in text]

@@ -23,7 +23,7 @@ from nextview.recognition.belief import Calibration
 TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
 
 
-def test_published_scores_stand_only_beside_what_they_were_published_for():
+def test_published_scores_are_shown_only_for_their_own_setting():
     assert published_recognisers(TEN, 40)[0] == ("ResNet34", 32, 0.871)
     assert published_recognisers(TEN[::-1], 12) == [("ResNet18", 32, 0.8901)]
     assert (
@@ -92,7 +92,7 @@ def test_accuracy_by_hand():
     assert table["published"].isna().all()
 
 
-def test_what_is_right_without_knowing_the_size_stands_beside():
+def test_accuracy_without_size_is_reported():
     p = by_hand()
     of_size = np.where(np.eye(2)[p.labels] > 0, 0, -99).astype(np.float32)
     sized = replace(p, logits=p.logits + of_size[:, None], of_size=of_size)
@@ -227,7 +227,7 @@ def test_map_scores_by_hand():
     assert mean.value == pytest.approx(((4 / 9) ** 2 + (1 / 9) ** 2 + (5 / 9) ** 2) / 3)
 
 
-def test_lcm_leaves_out_what_is_never_recognised():
+def test_lcm_leaves_out_objects_that_are_never_recognised():
     found = evaluate(by_hand(), 50, np.random.default_rng(0))
     assert found.left_out == {
         "lcm": "without the objects that are recognised from no view: 1 of 4"

@@ -96,7 +96,7 @@ def test_views_of_identical_things_are_worth_nothing():
     np.testing.assert_allclose(found.divergence, 0, atol=1e-5)
 
 
-def test_a_small_motion_that_registration_takes_away_tells_nothing():
+def test_a_motion_absorbed_by_registration_gives_no_information():
     caster = surfaces_of(box_mesh(BODY), box_mesh(BODY))
     hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
     hypotheses.poses[1, :3, 3] = (0.0015, -0.001, 0.0)
@@ -183,7 +183,7 @@ def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
 
 @pytest.mark.parametrize("shown", [0, 1])
 @pytest.mark.parametrize("side", [0.0, 180.0])
-def test_what_is_expected_is_what_the_verifier_says(shown, side):
+def test_expected_information_agrees_with_the_verifier(shown, side):
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
     mesh = meshes[shown]
     camera = SimulatedCamera(mesh, 200)
@@ -293,7 +293,7 @@ def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monke
     assert settled((0.5, 0.5), [4], travel=travel)[0] == near
 
 
-def test_where_nothing_is_left_to_tell_the_belief_is_tested_from_afar():
+def test_without_informative_views_the_farthest_view_is_chosen():
     chosen, _ = settled((1.0, 0.0), [0])
     assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
     _, values = settled(
@@ -320,7 +320,7 @@ def test_a_policy_without_known_geometry_says_so():
         DiscriminateGeometry(SPHERE, travel_weight=-1.0)
 
 
-def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
+def test_an_outlook_combines_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
     verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)])
     sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
@@ -350,7 +350,7 @@ def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     assert around.obstacles[:, 0].min() > 1.6 * metres
 
 
-def test_nothing_can_be_foreseen_without_geometry():
+def test_views_cannot_be_predicted_without_geometry():
     visited = np.arange(40) == 0
     state = EpisodeState(
         current=np.zeros(1, np.int64),
@@ -401,7 +401,7 @@ def test_poses_of_a_robot_are_ranked():
         (np.zeros((0, 4, 4)), "camera-to-world matrices"),
     ],
 )
-def test_what_is_no_list_of_poses_is_refused(poses, what):
+def test_an_invalid_list_of_poses_is_rejected(poses, what):
     with pytest.raises(UsageError, match=what):
         camera_poses(poses)
 
@@ -511,7 +511,7 @@ def test_what_is_known_exactly_has_an_error_and_a_logarithm(left):
     ).all()
 
 
-def test_the_pose_becomes_sharper_from_where_more_is_told():
+def test_informative_views_reduce_the_pose_uncertainty():
     loose = np.diag([1e-4, 1e-4, 1e-2, 1e-6, 1e-6, 1e-6])  # the azimuth is hardly known
     surfaces = surfaces_of(box_mesh(BODY, HANDLE))
     hypotheses = hypotheses_of((0,), (1.0,))

@@ -92,7 +92,7 @@ def faults(code: str) -> list[str]:
 @pytest.mark.parametrize(
     "path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src"))
 )
-def test_what_is_imported_is_asked_for(path):
+def test_all_imports_are_declared_dependencies(path):
     assert faults(path.read_text(encoding="utf-8")) == []
 
 
@@ -124,7 +124,7 @@ def test_a_wrong_import_is_found(code, wrong):
 
 
 @pytest.mark.parametrize("folder", [".", "research"])
-def test_an_extra_brings_what_its_error_speaks_of(folder):
+def test_an_extra_contains_the_package_that_its_error_names(folder):
     optional = project(folder)["optional-dependencies"]
     of_nextview = project(".")["optional-dependencies"]
     for extra, packages in (EXTRAS if folder == "." else EXTRAS_OF_RESEARCH).items():
@@ -246,7 +246,7 @@ def test_the_help_of_every_script_shows_in_the_base_installation(base):
     assert "pip install './research[film]'" in ended["research/film.py"][1]
 
 
-def test_a_script_without_its_extra_says_what_to_install(base):
+def test_a_script_without_its_extra_prints_installation_advice(base):
     needing = {
         "benchmarks/ablations.py": "nextview[train]",
         "benchmarks/scenes.py": "nextview[benchmark]",

@@ -25,7 +25,7 @@ def everything(folder):
     }
 
 
-def test_a_file_appears_whole_and_replaces_nothing_unless_told(tmp_path):
+def test_a_file_is_written_completely_and_replaces_others_only_on_request(tmp_path):
     path = tmp_path / "new" / "a.txt"
     with files.new_file(path) as part:
         part.write_text("old")
@@ -60,7 +60,7 @@ def test_a_folder_is_new_or_empty_and_with_overwrite_only_its_own_files_are_repl
     assert everything(tmp_path) == {"out/sub/table.csv": "2", "out/mine.txt": "mine"}
 
 
-def test_links_and_places_of_another_kind_are_refused(tmp_path):
+def test_links_and_paths_of_another_kind_are_rejected(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "file")
     os.mkfifo(tmp_path / "pipe")

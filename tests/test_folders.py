@@ -77,7 +77,7 @@ def test_links_are_followed_but_not_in_circles(tmp_path):
     assert {f"{path}" for path, _ in listing.left_out} == {"cup/again", "pot"}
 
 
-def test_what_is_understood_and_what_is_left_out_is_said(tmp_path):
+def test_the_listing_reports_used_and_unused_files(tmp_path):
     root = meshes(
         tmp_path,
         "loose.off",
@@ -268,7 +268,7 @@ def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
     )
 
 
-def test_a_folder_around_the_classes_is_told(tmp_path):
+def test_a_folder_around_the_class_folders_is_reported(tmp_path):
     root = meshes(tmp_path, "data/cup/a.ply", "data/cup/b.ply", "data/jar/train/c.ply")
     (note,) = scan_dataset(root).notes
     assert (
@@ -296,7 +296,7 @@ def test_a_file_is_no_folder_of_things(tmp_path):
         list_dataset(mesh)
 
 
-def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):
+def test_a_dataset_without_meshes_is_rejected_with_its_contents(tmp_path, caplog):
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
     with pytest.raises(

@@ -106,7 +106,7 @@ def link_away(path, place):
 
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
-def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(
+def test_an_output_path_that_is_a_link_is_rejected_early(
     place,
     looked_at,
     run,
@@ -123,7 +123,7 @@ def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_don
 
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("layout", ["now", "earlier"])
-def test_weights_that_are_a_link_are_replaced_and_what_it_points_to_stays(
+def test_linked_weights_are_replaced_and_the_link_target_is_kept(
     place,
     run,
     layout,
@@ -149,7 +149,7 @@ def test_the_very_same_memory_again_keeps_its_file_though_that_is_a_link(place):
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_what_is_not_ours_beside_the_output_stays(place, run):
+def test_foreign_files_next_to_the_output_are_kept(place, run):
     marked = json.dumps({"output": "other", "key": "things"})
     foreign = {
         ".mine.part/thesis.txt": "mine",
@@ -189,7 +189,7 @@ def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
     assert (tmp_path / ".p.npz.part/thesis.txt").read_text() == "mine"
 
 
-def test_a_lock_of_others_is_not_taken_for_ours(tmp_path):
+def test_a_lock_file_of_another_program_is_respected(tmp_path):
     (tmp_path / ".mine.lock").write_text("poetry")
     with (
         pytest.raises(
@@ -202,7 +202,7 @@ def test_a_lock_of_others_is_not_taken_for_ours(tmp_path):
     assert (tmp_path / ".mine.lock").read_text() == "poetry"
 
 
-def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(
+def test_concurrent_runs_are_rejected_without_loss_of_data(
     place,
     monkeypatch,
 ):
@@ -245,7 +245,7 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
     assert {path.name for path in place.iterdir()} == {"first", "more", "mine"}
 
 
-def test_a_memory_of_nothing_is_not_written(place):
+def test_an_empty_memory_is_not_written(place):
     with pytest.raises(
         UsageError,
         match="no thing would be left; delete the folder instead",
@@ -278,7 +278,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_frames_that_were_changed_in_place_are_looked_at_again(
+def test_frames_that_were_changed_in_place_are_processed_again(
     tmp_path,
     looked_at,
     what,
@@ -339,7 +339,7 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
     "image",
     ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"],
 )
-def test_capture_writes_no_views_beside_images_that_would_be_taken_for_theirs(
+def test_capture_rejects_a_folder_with_conflicting_images(
     tmp_path,
     image,
 ):

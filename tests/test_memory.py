@@ -190,7 +190,7 @@ def test_every_array_has_to_be_there(models, name):
         open_memory(models / "memory.json")
 
 
-def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(
+def test_a_memory_of_an_earlier_version_is_rejected_with_advice(
     models,
 ):
     rewrite(
@@ -517,7 +517,7 @@ def test_weights_and_residuals_are_those_on_the_card(models):
         ({"correlation": 1.5}, "correlation"),
     ],
 )
-def test_weights_that_make_no_sense_are_refused(models, weights, sentence):
+def test_invalid_weights_are_rejected(models, weights, sentence):
     card = changed_card(
         models,
         set_at("memory/verification", VERIFIED | {"weights": weights}),

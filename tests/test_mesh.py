@@ -236,7 +236,7 @@ def test_obj_as_it_is_found_in_the_wild(tmp_path, faces, change):
     assert closed.volume * mesh.radius**3 == pytest.approx(4 * 3 / 3)
 
 
-def test_parts_of_a_glb_stand_where_its_nodes_put_them(tmp_path):
+def test_parts_of_a_glb_have_the_transforms_of_their_nodes(tmp_path):
     """A chain of nodes that rotate, scale and move, computed by hand."""
     # x to y, y to z, z to x
     first = {

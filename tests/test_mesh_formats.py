@@ -111,7 +111,7 @@ def test_a_text_in_any_encoding_is_the_same_mesh(tmp_path, kind, encoding, ends)
 
 
 @pytest.mark.parametrize("kind", TEXTS)
-def test_a_text_that_is_not_in_the_encoding_that_it_announces_is_refused(
+def test_a_text_in_another_encoding_than_declared_is_rejected(
     tmp_path,
     kind,
 ):

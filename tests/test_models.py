@@ -134,7 +134,7 @@ def no_numbers(model: onnx.ModelProto) -> None:
         (no_numbers, "gives logits that are not finite numbers"),
     ],
 )
-def test_a_file_that_is_not_what_its_card_promises(
+def test_a_file_that_contradicts_its_card_is_rejected(
     tmp_path,
     monkeypatch,
     change,

@@ -33,7 +33,7 @@ def texts(svg: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", [MATH, r"a\$b", "<b>&"])
-def test_a_figure_shows_a_name_as_it_is(name):
+def test_a_figure_shows_names_literally(name):
     shown = texts(to_svg(confusion_matrix(np.eye(2), [name, "chair"], f"of {name}")))
     assert shown.count(name) == 2  # on both axes
     assert shown.count(f"of {name}") == 1
@@ -106,7 +106,7 @@ def test_no_name_is_markup_in_a_report(strange):
         (b"caf\xe9.off".decode("utf-8", "surrogateescape"), r"caf\udce9.off"),
     ],
 )
-def test_a_terminal_gets_a_name_as_it_is(tmp_path, name, shown, capsys):
+def test_a_terminal_shows_names_literally(tmp_path, name, shown, capsys):
     assert printable(name) == shown
     trimesh.creation.box([1, 2, 3]).export(tmp_path / "box.off")
     (tmp_path / "box.off").rename(tmp_path / name)

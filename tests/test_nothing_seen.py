@@ -126,7 +126,7 @@ def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
 
 
 @pytest.mark.parametrize("name", ["gain", "lem", "spread-local"])
-def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
+def test_every_kind_of_policy_continues_after_an_empty_view(name):
     system = nextview.load(policy=name)
     camera = SimulatedCamera(sample_mesh("chair"))
 

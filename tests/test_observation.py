@@ -125,7 +125,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("other", "words"), BAD.values(), ids=BAD)
-def test_what_no_camera_gives_is_refused_in_one_sentence(other, words):
+def test_impossible_frames_are_rejected_in_one_sentence(other, words):
     with pytest.raises(ObservationError) as refusal:
         observe(**other)
     assert words in str(refusal.value)
@@ -140,7 +140,7 @@ images = npst.arrays(
 
 @settings(deadline=None)
 @given(images)
-def test_any_depth_is_an_object_or_nothing_or_refused(depth):
+def test_any_depth_gives_an_object_or_nothing_or_an_error(depth):
     try:
         view = Observation(depth, POSE, pinhole(max(depth.shape), 3.0))
     except ObservationError:
@@ -154,7 +154,7 @@ def test_any_depth_is_an_object_or_nothing_or_refused(depth):
     np.testing.assert_array_equal(view.picture > 0, kept)
 
 
-def test_what_is_written_into_the_callers_arrays_later_changes_no_observation():
+def test_later_changes_of_input_arrays_do_not_affect_observations():
     depth, pose, intrinsics = np.full((9, 9), 3, np.float32), np.eye(4), pinhole(9, 3.0)
     image = np.full((9, 9), 7, np.uint8)
     seen = Observation(depth, pose, intrinsics, image=image)

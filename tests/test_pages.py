@@ -35,7 +35,7 @@ def there(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
-def test_a_page_does_what_it_says(page):
+def test_the_examples_of_a_page_run(page):
     try:
         failed, tried = doctest.testfile(
             str(ROOT / f"docs/{page}.md"),
@@ -65,7 +65,7 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
         assert not any(view.warnings for view in result.views)
 
 
-def test_a_grasp_point_arrives_where_the_handle_is(monkeypatch, capsys):
+def test_the_grasp_point_is_at_the_handle(monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     importlib.import_module("grasp_point").main()
     printed = capsys.readouterr().out
@@ -73,7 +73,7 @@ def test_a_grasp_point_arrives_where_the_handle_is(monkeypatch, capsys):
     assert float(re.search(r"([\d.]+) mm from where the handle is", printed)[1]) < 3
 
 
-def test_tests_that_a_page_names_are_there():
+def test_the_tests_named_on_pages_exist():
     tests = [
         path
         for folder in ("tests", "research/tests")
@@ -114,7 +114,7 @@ def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
             assert step.command.startswith(step.text.split()[0])
 
 
-def test_a_command_that_fails_is_told(tmp_path, monkeypatch, capsys):
+def test_a_failing_command_is_reported(tmp_path, monkeypatch, capsys):
     page = tmp_path / "page.md"
     page.write_text(
         "```sh\nnextview list models   # fine\nnextview list nonsense\n```\n\n```python\nprint(1 /"
@@ -148,7 +148,7 @@ def test_each_page_names_what_its_commands_need():
     assert needed == set(documented_commands.NEEDS.values())
 
 
-def test_a_command_has_nothing_but_what_it_needs(tmp_path):
+def test_a_command_runs_with_only_its_own_dependencies(tmp_path):
     environments = documented_commands.Environments(tmp_path / "environments")
     asked = "python -c 'import nextview.training.export'"
     status, said, _ = environments.run(asked, tmp_path)
@@ -238,7 +238,7 @@ SMALL = {
 """What makes a command of the page quick."""
 
 
-def test_making_it_ones_own_works_from_the_first_line_to_the_last(
+def test_the_commands_for_your_own_dataset_run(
     furniture,
     there,
     capsys,
@@ -344,7 +344,7 @@ def recorded(tmp_path, monkeypatch, ycb_meshes):
     return tmp_path
 
 
-def test_what_the_page_writes_from_a_realsense_is_what_look_reads(recorded, capsys):
+def test_look_reads_the_recording_of_the_realsense_page(recorded, capsys):
     assert sorted(path.name for path in recorded.iterdir()) == ["shot_0", "shot_1"]
     page = (ROOT / "docs/from_a_realsense.md").read_text()
     for key in json.loads((recorded / "shot_1/intrinsics.json").read_text()):
@@ -358,7 +358,7 @@ def test_what_the_page_writes_from_a_realsense_is_what_look_reads(recorded, caps
     assert (recorded / "shot_1.png").exists()
 
 
-def test_shots_with_poses_in_one_folder_are_looked_at_together(recorded, capsys):
+def test_shots_with_poses_in_one_folder_form_one_scene(recorded, capsys):
     table = recorded / "table"
     shutil.copytree(recorded / "shot_0", table)
     (table / "poses").mkdir()

@@ -175,7 +175,7 @@ def test_no_row_depends_on_another(sphere, seed):
     [Random(SPHERE), RandomAll(SPHERE)],
     ids=["window", "all"],
 )
-def test_random_is_uniform_over_what_is_free(policy):
+def test_random_is_uniform_over_free_views(policy):
     visited = [11, 3, 28, 36, 0, 25]
     state = state_of(SPHERE, np.full(20_000, 11), [visited] * 20_000)
     chosen = policy.next_views(state, np.random.default_rng(0))

@@ -250,7 +250,7 @@ def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     )
 
 
-def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
+def test_things_without_geometry_are_recognised_by_features(known, meshes):
     recogniser = recogniser_of(known)
     surfaces = [
         each
@@ -305,7 +305,7 @@ def test_networks_know_no_orientations():
         nextview.load(threads=1).session(any_orientation=True)
 
 
-def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
+def test_an_object_that_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     usual = KnownResiduals(np.full(len(meshes), 0.3), (np.linspace(-0.3, 0.3, 99),))
     recogniser = recogniser_of(known)
     recogniser.things.residuals = usual
@@ -338,7 +338,7 @@ def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     "again",
     [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
 )
-def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
+def test_a_copy_of_a_session_with_geometry_continues_identically(system, meshes, again):
     session = session_of(system, 2, start=5)
     camera = nextview.SimulatedCamera(meshes["block"])
     session.update(camera.observe(session.pose))
@@ -702,7 +702,7 @@ def test_nothing_is_ranked_where_nothing_can_be_foreseen(known, meshes):
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.1, 5.0])
-def test_what_is_of_another_order_of_size_is_unknown(known, scale):
+def test_an_object_of_another_order_of_size_is_unknown(known, scale):
     recogniser = recogniser_of(known)
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
     carton = THINGS["carton"]()

@@ -67,7 +67,7 @@ def test_json_holds_the_whole_episode(chair, capsys):
     assert views[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 
-def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(
+def test_several_objects_give_a_line_of_json_each_and_failures_are_named(
     chair,
     capsys,
 ):
@@ -129,7 +129,7 @@ def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(
 
 
 @pytest.mark.parametrize("wrong", [{"models": 3}, {"policy": 3}, {"risk": "low"}])
-def test_what_is_no_name_is_refused(wrong):
+def test_an_invalid_name_is_rejected(wrong):
     with pytest.raises(UsageError, match=r"(name or path|a number), not"):
         nextview.load(**wrong)
 
@@ -181,7 +181,7 @@ def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, wor
     assert words in refused(capsys, "recognise", *arguments)
 
 
-def test_bundled_models_are_what_their_cards_say():
+def test_bundled_models_agree_with_their_cards():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
     # nothing that is pickled
@@ -222,7 +222,7 @@ def test_inference_never_imports_torch(chair):
     )
 
 
-def test_the_figure_says_what_its_colours_and_angles_mean():
+def test_the_figure_explains_its_colours_and_angles():
     figure = nextview.recognise(SAMPLE_FILES / "table.off", start=33).plot()
     texts = [text.get_text() for text in figure.findobj(Text)]
     assert {"low", "high"} <= set(texts)

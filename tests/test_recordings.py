@@ -156,7 +156,7 @@ def test_messages_out_of_order_are_put_into_the_order_of_their_stamps(tmp_path):
 
 
 @pytest.mark.parametrize("mcap", [True, False])
-def test_a_long_recording_is_sampled_and_never_held_in_memory(
+def test_a_long_recording_is_sampled_without_loading_all_of_it(
     tmp_path,
     mcap,
     monkeypatch,
@@ -210,7 +210,7 @@ def standing(times):
     return [("/tf_static", START, tf_message(stand)), *images_at(times)]
 
 
-def test_a_camera_that_tf_does_not_move_gives_one_image_whose_plane_tells_up(tmp_path):
+def test_a_static_camera_gives_one_image_with_up_from_its_plane(tmp_path):
     bag = write_bag(tmp_path / "bag", standing([1.0, 1.1, 1.2]))
     capture = read_capture(bag)
     assert len(capture.frames) == 1
@@ -346,7 +346,9 @@ UNUSABLE = {
 
 @pytest.mark.parametrize("mcap", [True, False])
 @pytest.mark.parametrize("what", UNUSABLE)
-def test_what_a_bag_lacks_is_said_in_one_sentence(what, mcap, tmp_path, capsys):
+def test_missing_parts_of_a_bag_are_reported_in_one_sentence(
+    what, mcap, tmp_path, capsys
+):
     made, match = UNUSABLE[what]
     bag = write_bag(tmp_path / "bag", made(), mcap)
     with pytest.raises(DatasetError, match=match):
@@ -473,7 +475,7 @@ def views():
     return views_of(chair())
 
 
-def test_what_was_recorded_is_recognised_from_a_bag_and_from_a_folder(
+def test_a_recording_is_recognised_from_a_bag_and_from_a_folder(
     views,
     tmp_path,
     capsys,
@@ -509,7 +511,7 @@ def test_a_bag_is_a_thing_to_be_taught_beside_scans(views, tmp_path):
 
 
 @pytest.mark.long
-def test_what_was_taught_from_a_bag_is_known_again(views, tmp_path):
+def test_things_taught_from_a_bag_are_recognised(views, tmp_path):
     folder = things_folder(tmp_path / "things", views)
     learned = learn(folder, tmp_path / "mine", unit="m", any_size=True, workers=0)
     assert not learned.left_out
@@ -743,7 +745,7 @@ def test_intrinsics_of_zivid_are_read_and_its_distortion_is_noticed(tmp_path):
         ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "coeffs": [0.1, 0]}', "distorts"),
     ],
 )
-def test_what_is_no_camera_file_is_said(content, match, tmp_path):
+def test_an_invalid_camera_file_is_reported(content, match, tmp_path):
     for name in ("camera.json", "camera.yaml"):
         (tmp_path / name).write_text(content)
         with pytest.raises(DatasetError, match=match):
@@ -838,7 +840,7 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize("what", INCOMPLETE)
-def test_what_a_folder_lacks_is_said(what, views, tmp_path):
+def test_missing_files_of_a_folder_are_reported(what, views, tmp_path):
     folder = written(tmp_path / "folder", views[:3])
     spoil, match = INCOMPLETE[what]
     spoil(folder)

@@ -39,7 +39,7 @@ def test_a_release_has_the_tag_of_its_version_and_a_date():
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.name)
-def test_what_a_workflow_runs_is_there(workflow):
+def test_all_files_of_the_workflows_exist(workflow):
     """Make's targets, files of the repository and extras that a workflow names."""
     text = workflow.read_text(encoding="utf-8")
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")

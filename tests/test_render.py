@@ -105,7 +105,7 @@ def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(
 
 
 @linux
-def test_a_full_disk_says_so_and_the_next_run_goes_on(furniture, whole, tmp_path):
+def test_a_full_disk_is_reported_and_the_next_run_resumes(furniture, whole, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     if (

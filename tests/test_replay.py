@@ -195,7 +195,7 @@ def test_episodes_of_one_system_do_not_share_what_a_rule_compares(specs):
         assert alone.n_views[0] == together.n_views[k]
 
 
-def test_what_a_stopping_rule_does_wrong_is_one_sentence():
+def test_errors_of_a_stopping_rule_are_one_sentence():
     belief = np.full((4, 3), 1 / 3)
     for rule, words in [
         ("test_replay:nothing", "cannot be made"),

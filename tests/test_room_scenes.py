@@ -143,7 +143,7 @@ def test_noise_belongs_to_the_pose_and_the_seed(tmp_path):
     assert np.std(first[middle][known]) == pytest.approx(expected, rel=0.5)
 
 
-def test_where_a_camera_can_be(tmp_path):
+def test_reachable_camera_positions(tmp_path):
     cabinet = Slab(-2.0, 1.0, 0.0, 0.0, 0.5, 0.5, 1.5)
     room = a_room(tmp_path, slabs=(cabinet,))
 
@@ -212,7 +212,7 @@ def test_things_of_known_size_rest_on_a_table(tins, tmp_path):
     assert {("tin", 0.11), ("tin", 0.08), ("plank", 0.02)} <= heights
 
 
-def test_the_same_seed_draws_the_same_bytes_and_goes_on(rooms, furniture, tmp_path):
+def test_the_same_seed_gives_identical_files_and_resumes(rooms, furniture, tmp_path):
     before = {path.name: path.read_bytes() for path in rooms.rglob("*.json")}
     assert len(before) == 4
     out = tmp_path / "rooms"
@@ -223,7 +223,7 @@ def test_the_same_seed_draws_the_same_bytes_and_goes_on(rooms, furniture, tmp_pa
         list(draw_rooms(furniture, out, 2, seed=5, workers=0))
 
 
-def test_what_no_room_can_be_made_of_is_said(tins, tmp_path, rooms, furniture, capsys):
+def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, capsys):
     with pytest.raises(
         UsageError,
         match=r"how large is a plank\? Give the files' --unit",
@@ -261,7 +261,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess:
     )
 
 
-def test_the_benchmark_goes_on_and_draws_its_mistakes(rooms, furniture, tmp_path):
+def test_the_benchmark_resumes_and_draws_its_mistakes(rooms, furniture, tmp_path):
     out = tmp_path / "out"
     options = ("--by", "mask", "--sensors", "none", "--workers", "0")
     first = run(rooms / "chair", furniture, out, *options)

@@ -114,7 +114,7 @@ ROOMS = {
 
 @pytest.mark.parametrize("asked", ["aim", "point"])
 @pytest.mark.parametrize("walls", ["far", "corner", "slanted", "none"])
-def test_what_stands_in_a_room_is_found_without_its_walls(walls, asked):
+def test_objects_in_a_room_are_segmented_without_its_walls(walls, asked):
     pose = pose_at(15, -30, 2.6, middle_of(CUPBOARD))
     scene = [CUPBOARD, FLOOR, *ROOMS[walls], CRATE]
     thing = ObservedObject(point=middle_of(CUPBOARD) if asked == "point" else None)
@@ -161,7 +161,7 @@ def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it
 @pytest.mark.parametrize("asked", ["aim", "point"])
 @pytest.mark.parametrize("behind", [1.5, 3.0, 6.0])
 @pytest.mark.parametrize("elevation", [10, 25])
-def test_what_is_far_behind_a_table_does_not_draw_the_eye(elevation, behind, asked):
+def test_objects_far_behind_a_table_are_ignored(elevation, behind, asked):
     mug = box((0.08, 0.08, 0.1), (0.1, 0, 0.05))
     clutter = [
         box((0.02, 3, 2), (-behind, 0, 0.2)),
@@ -177,7 +177,7 @@ def test_what_is_far_behind_a_table_does_not_draw_the_eye(elevation, behind, ask
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_what_the_camera_is_aimed_at_comes_before_what_is_larger(side):
+def test_the_object_on_the_optical_axis_is_preferred_to_a_larger_one(side):
     mug = box((0.08, 0.08, 0.1), (0, 0, 0.05))
     carton = box((0.2, 0.2, 0.25), (0, 0.28 * side, 0.125))
     thing = ObservedObject()
@@ -263,7 +263,7 @@ def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
     assert_is(thing, table)
 
 
-def test_what_a_nearer_thing_hides_below_is_not_held_by_it():
+def test_an_occluded_object_is_not_part_of_a_nearer_one():
     mug, carton = (
         box((0.1, 0.3, 0.12), (0, 0, 0.06)),
         box((0.1, 0.2, 0.3), (-0.3, 0, 0.15)),
@@ -280,7 +280,7 @@ def test_what_a_nearer_thing_hides_below_is_not_held_by_it():
 
 
 @pytest.mark.parametrize("flying", [0, 1, 4, 40])
-def test_flying_pixels_say_nothing_of_the_size(flying):
+def test_flying_pixels_do_not_affect_the_size(flying):
     ball = trimesh.creation.icosphere(3, 0.04).apply_translation((0, 0, 0.04))
     pose = pose_at(35, 0, 0.6, (0, 0, 0.04))
     depth, which = cast([ball, TABLE], pose)
@@ -310,7 +310,7 @@ TROUGH = trimesh.util.concatenate(
 
 @pytest.mark.parametrize("asked", ["aim", "point"])
 @pytest.mark.parametrize("name", ["trough"])
-def test_what_lies_within_the_outline_of_a_thing_is_a_part_of_it(name, asked):
+def test_parts_within_the_outline_of_a_thing_belong_to_it(name, asked):
     mesh = {"lid": trimesh.util.concatenate([RIM, KNOB]), "trough": TROUGH}[name]
     ground = TABLE if name == "lid" else FLOOR
     pose = pose_at(50, 30, 0.5 if name == "lid" else 2.0, middle_of(mesh))
@@ -320,7 +320,7 @@ def test_what_lies_within_the_outline_of_a_thing_is_a_part_of_it(name, asked):
 
 
 @pytest.mark.parametrize("azimuth", [-60, -45, -30])
-def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
+def test_an_object_in_a_corner_is_not_part_of_the_walls(azimuth):
     corner = [
         box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)),
         box((1.2, 0.06, 0.9), (0, 0.6, 0.45)),
@@ -338,7 +338,7 @@ def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
 
 @pytest.mark.parametrize("shift", [-0.8, 0.8])
 @pytest.mark.parametrize("share", [0.0, 0.004])
-def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(
+def test_with_large_noise_outlying_depths_do_not_affect_the_size(
     share,
     shift,
 ):
@@ -400,7 +400,7 @@ def test_a_handle_behind_the_edge_of_its_mug_is_kept_by_a_mask(azimuth, wide):
     ids=["bed", "sofa", "desk", "cupboard"],
 )
 @pytest.mark.parametrize("sigma", [0.001, 0.008])
-def test_depth_is_told_from_range_in_a_room(mesh, sigma):
+def test_depth_is_distinguished_from_range_in_a_room(mesh, sigma):
     target = middle_of(mesh)
     pose = pose_at(20, 25, 2.6, target)
     right = frame([mesh, FLOOR, FAR_WALL], pose, sigma=sigma)

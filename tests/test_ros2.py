@@ -119,7 +119,7 @@ def depth():
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("padding", [0, 12])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_a_recorded_image_is_what_the_camera_saw(
+def test_a_recorded_image_equals_the_camera_image(
     tmp_path,
     depth,
     encoding,
@@ -441,7 +441,7 @@ def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
 
 
 @pytest.mark.parametrize("path", sorted(ROS.rglob("*.py")), ids=lambda path: path.name)
-def test_its_python_compiles_and_finds_what_it_takes_from_nextview(path):
+def test_the_node_compiles_and_its_imports_from_nextview_exist(path):
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
@@ -457,7 +457,7 @@ def test_its_python_compiles_and_finds_what_it_takes_from_nextview(path):
             assert hasattr(nextview, node.attr)
 
 
-def test_the_action_is_what_the_node_fills():
+def test_the_node_fills_all_fields_of_the_action():
     """Fields that the node gives to goal, result and feedback are those of the action file."""
     text = (ROS / "nextview_msgs/action/Recognise.action").read_text()
     parts = dict(zip(("Goal", "Result", "Feedback"), text.split("---\n"), strict=True))

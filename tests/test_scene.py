@@ -57,7 +57,7 @@ def test_objects_keep_their_numbers_from_frame_to_frame(ycb, ycb_meshes):
             assert set(by_name(scene)[thing.name].pixels) == {0, 1}
 
 
-def test_a_sure_object_keeps_its_pixels_in_every_frame(ycb, ycb_meshes):
+def test_a_settled_object_keeps_its_mask_in_every_frame(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["banana"]])
     scene = nextview.Scene(ycb)
     for degrees in (20, 60, 100, 140):
@@ -70,7 +70,7 @@ def test_a_sure_object_keeps_its_pixels_in_every_frame(ycb, ycb_meshes):
     assert (mask & true).sum() > 0.75 * (mask | true).sum()
 
 
-def test_an_empty_table_is_said_to_be_empty(ycb):
+def test_an_empty_table_is_reported(ycb):
     camera = camera_over([])
     scene = nextview.Scene(ycb)
     look = scene.update(camera.frame(view(20)))
@@ -97,7 +97,7 @@ def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):
         scene.update(frame)
 
 
-def test_strangers_are_unknown_and_their_size_is_told(ycb):
+def test_strangers_are_unknown_and_have_a_size(ycb):
     ring = trimesh.creation.torus(0.06, 0.022)
     stranger = make_mesh(ring.vertices, ring.faces, "ring", "m")
     camera = camera_over([stranger])
@@ -169,7 +169,7 @@ def test_a_frame_with_a_wrong_pose_is_left_out(ycb, ycb_meshes, wrong):
     assert set(by_name(scene)) == set(ycb_meshes)
 
 
-def test_where_to_look_next_shows_what_was_hidden(ycb, ycb_meshes):
+def test_the_next_view_shows_hidden_areas(ycb, ycb_meshes):
     camera = camera_over(list(ycb_meshes.values()), seed=3)
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
@@ -193,7 +193,7 @@ def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_mesh
     assert nowhere.target is None
 
 
-def test_only_the_region_is_looked_at(ycb, ycb_meshes):
+def test_only_the_region_is_searched(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
     middle = camera.table.things[1].placed.mean(0)
     region = Box(middle - 0.1, middle + 0.1)
@@ -261,7 +261,7 @@ def captured(camera: TableCamera, degrees, folder) -> None:
 _CENTRE = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
 
 
-def test_the_command_says_what_is_on_the_table(ycb_meshes, tmp_path, capsys):
+def test_the_command_lists_the_objects_on_the_table(ycb_meshes, tmp_path, capsys):
     camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
     captured(camera, (20, 60), tmp_path / "table")
     figure = tmp_path / "table.png"

@@ -98,7 +98,7 @@ def test_the_report_says_what_is_empty_and_what_is_not(ycb, capsys):
     assert "nothing stands" not in said
 
 
-def test_what_lost_its_name_in_the_last_frame_is_not_settled(ycb, ycb_meshes):
+def test_an_object_that_lost_its_name_is_not_settled(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"]])
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
@@ -131,7 +131,7 @@ def litter(count: int) -> TableCamera:
     return TableCamera(SimulatedTable(tuple(things)), SENSORS["stereo"], rng)
 
 
-def test_of_a_table_full_of_litter_a_part_is_verified(ycb, capsys):
+def test_a_limited_number_of_objects_is_verified_per_frame(ycb, capsys):
     scene = nextview.Scene(ycb)
     look = scene.update(litter(100).frame(view(20)))
     segments = scene.tops[0].segments()

@@ -115,7 +115,7 @@ def test_an_object_that_ended_takes_no_pixels(ycb, ycb_meshes):
     assert taken_over([can, unjudged], benches)[0].absorbed == (5,)
 
 
-def test_a_look_tells_which_numbers_end_in_another_object(ycb, ycb_meshes):
+def test_a_look_lists_the_numbers_of_merged_objects(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"], ycb_meshes["cracker_box"]])
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
@@ -141,7 +141,7 @@ def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(ycb, ycb_meshes):
     assert [warning.name for warning in look.warnings] == ["pose"]
 
 
-def test_what_stands_behind_another_thing_is_not_seen(ycb, ycb_meshes):
+def test_an_occluded_thing_is_not_visible(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["tomato_soup_can"]])
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20, elevation=65.0)))

@@ -73,7 +73,7 @@ def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
 # What is expected to show
 
 
-def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
+def test_occlusion_by_a_box_agrees_with_an_error_free_camera():
     scene = scene_of(BEFORE)
     truth = np.array(
         [OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses]
@@ -135,7 +135,7 @@ def test_the_product_goes_where_gain_goes_if_everything_shows():
     assert set(product.needs) == {*gain.needs, "visibility"}
 
 
-def test_the_product_shuns_what_is_hidden():
+def test_the_product_avoids_occluded_views():
     rng, product = np.random.default_rng(0), make_policy("visible-gain@0", GRID)
     state = state_of(np.ones(40), rng.dirichlet(np.ones(10), 1))
     best = int(product.next_views(state, rng)[0])
@@ -150,7 +150,7 @@ def test_the_product_shuns_what_is_hidden():
 
 
 @pytest.mark.parametrize("frame", ["camera", "object"])
-def test_what_shows_is_told_to_networks_cell_by_cell(frame):
+def test_networks_receive_the_visibility_of_each_cell(frame):
     rng = np.random.default_rng(0)
     state = replace(state_of(rng.random(40)), current=np.array([11]))
     whole = features(
@@ -200,7 +200,7 @@ def predictions(cluttered_views) -> Predictions:
     return scene_predictions(cluttered_views, TEN)
 
 
-def test_what_is_expected_in_a_store_is_what_its_frames_say(cluttered_views):
+def test_expected_visibility_in_a_store_agrees_with_its_frames(cluttered_views):
     opened = ViewStore.open(cluttered_views)
     sight = SceneSight.of(opened, opened.names[1:])
     visited = np.zeros((3, 40), bool)
@@ -258,7 +258,7 @@ def test_views_without_the_target_are_no_evidence(predictions):
     np.testing.assert_array_equal(sized.seen, predictions.seen)
 
 
-def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path):
+def test_gain_learns_to_use_visibility_in_scenes(predictions, tmp_path):
     from nextview.training.gain_training import train_gain
     from nextview.training.recipes import GainRecipe
 
@@ -300,7 +300,7 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
 # Replay
 
 
-def test_scenes_without_their_store_are_not_taken_for_single_objects(
+def test_scenes_without_their_store_are_not_treated_as_single_objects(
     predictions,
     tmp_path,
 ):
@@ -338,7 +338,7 @@ def test_scenes_around_one_target_are_drawn_together():
     )
 
 
-def test_what_the_script_judges_is_what_replay_believes(predictions):
+def test_the_script_agrees_with_the_beliefs_of_replay(predictions):
     specs = make_specs(predictions, 4, 0)
     path = replay("random-all", specs, 4, 0)
     assert (path.views >= 0).all()

@@ -141,7 +141,7 @@ def test_a_page_is_one_file_that_says_all(made, tmp_path, capsys):
     assert "my table" not in path.read_text()
 
 
-def test_what_cannot_be_shown_is_said(made, tmp_path):
+def test_invalid_outputs_of_a_scene_are_rejected(made, tmp_path):
     scene, _, _ = made
     with pytest.raises(UsageError, match=r"called \.html"):
         write_scene_page(scene, tmp_path / "scene.txt")

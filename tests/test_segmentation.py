@@ -198,7 +198,7 @@ def test_no_thing_is_no_mask(given):
         "cup",
     ],
 )
-def test_own_segmentation_of_another_form_is_refused(given):
+def test_an_invalid_own_segmentation_is_rejected(given):
     frame = level_frame(np.ones((48, 64), np.float32))
     with pytest.raises(ObservationError, match=r"segmentation"):
         instances_of(lambda frame: given, frame)
@@ -209,7 +209,7 @@ def test_learned_segmenter_needs_its_card(tmp_path):
         LearnedSegmenter(tmp_path / "none.json")
 
 
-def test_a_learned_segmenter_tells_things_and_surfaces(monkeypatch):
+def test_a_learned_segmenter_separates_things_and_surfaces(monkeypatch):
     depth = np.full((480, 640), 1.0, np.float32)
     depth[101:303, 203:407] = 0.8  # no multiple of the factor
     frame = Frame(depth, INTRINSICS)

@@ -86,7 +86,7 @@ def test_labels_and_depth_are_those_of_rays_that_meet_boxes():
     assert shown == {BACKGROUND, SURFACE, 0}
 
 
-def test_what_is_learned_of_a_picture():
+def test_training_targets_of_a_picture():
     labels = np.full((20, 30), SURFACE, np.int16)
     labels[4:8, 5:11] = 0
     labels[4:8, 11:14] = 1
@@ -162,7 +162,7 @@ list(draw_frames(frame_files(Path(sys.argv[1]), 4, (5, 0), most=2), workers=0))
 """
 
 
-def test_a_killed_drawing_goes_on_and_draws_the_same(tmp_path, drawn):
+def test_an_interrupted_drawing_resumes_with_the_same_frames(tmp_path, drawn):
     command = [sys.executable, "-c", KILLED, str(tmp_path)]
     assert subprocess.run(command, check=False).returncode == 9
     files = frame_files(tmp_path, 4, SEED, most=2)

@@ -120,7 +120,7 @@ def test_a_frame_becomes_an_observation_of_the_object_alone():
     assert thing.warnings == []
 
 
-def test_of_several_objects_the_one_asked_for_is_taken():
+def test_the_requested_object_is_selected_among_several():
     small, large = (
         box((0.08, 0.08, 0.1), (0.2, 0.2, 0.05)),
         box((0.2, 0.2, 0.15), (-0.15, -0.1, 0.075)),
@@ -223,7 +223,7 @@ def test_a_mask_on_a_table_reaches_down_to_it():
 
 
 @pytest.mark.parametrize("told", [{}, {"point": (0, 0, 0.4)}])
-def test_what_stands_on_no_plane_is_told_by_a_mask_or_a_box(told):
+def test_an_object_without_a_support_plane_is_given_by_a_mask_or_a_box(told):
     """A brick that a rod holds above a table: no depth tells where the brick ends."""
     brick = box((0.1, 0.06, 0.04), (0, 0, 0.4))
     rod = box((0.02, 0.02, 0.3), (0, 0, 0.57))
@@ -394,7 +394,7 @@ def in_millimetres(seen) -> Frame:
     return replace(seen, pose=moved, axes="opencv", pixel_centre=0.5)
 
 
-def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tells():
+def test_poses_in_millimetres_are_rejected_by_the_target_or_another_frame():
     first, second = (
         frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7)) for azimuth in (25, 80)
     )
@@ -441,7 +441,7 @@ def test_a_picture_that_is_turned_against_its_pose_is_named(turns, said, azimuth
 
 
 @pytest.mark.parametrize("steps", [0.1, 0.2, 0.25])  # millimetres
-def test_sixteen_bits_in_other_steps_are_refused_with_the_depth_scale(steps):
+def test_a_wrong_unit_of_sixteen_bit_depth_is_rejected_with_the_depth_scale(steps):
     """The target, or another frame, tells; a target that is not asked for and right millimetres
     are taken.
     """

@@ -164,7 +164,7 @@ def test_the_first_pixel_may_have_its_centre_at_zero():
     )
 
 
-def test_positions_lie_on_what_is_seen():
+def test_positions_lie_on_the_visible_surface():
     """The table's top is the plane z = 0."""
     frame = Frame(DEPTH, INTRINSICS, POSE, pixel_centre=0.5)
     rows, columns = np.nonzero(frame.depth)

@@ -85,7 +85,7 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(distance):
     )
 
 
-def test_neighbours_err_together_as_far_as_the_grain():
+def test_errors_of_neighbours_are_correlated_within_the_grain():
     sensor = replace(SENSORS["none"], noise=0.001, grain=1.8)
     depth, _ = plane(sensor, 1.0)
     error = sensor.measure(depth, rng(5))[0].astype(float) - depth
@@ -251,7 +251,7 @@ def test_errors_of_the_object_frame_have_their_strength():
     assert np.degrees(np.sqrt(np.mean(lean))) == pytest.approx(3 * np.sqrt(2), rel=0.15)
 
 
-def test_the_camera_is_not_where_it_believes_to_be():
+def test_the_true_camera_pose_differs_from_the_assumed_one():
     camera = SensedCamera(BALL, replace(SENSORS["none"], moved=0.01), rng(19))
     off = []
     for view in range(40):
@@ -281,7 +281,7 @@ def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
     assert 0.3 < min(kept) < 0.75 < max(kept) <= 1
 
 
-def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
+def test_boxes_occlude_the_object_and_are_not_segmented_as_object():
     mesh = sample_mesh("table")
     alone = SensedCamera(mesh, "none", rng(25))
     among = SensedCamera(mesh, replace(SENSORS["none"], boxes=9.0), rng(25))
@@ -395,7 +395,7 @@ def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp
 
 @pytest.mark.parametrize("name", ["none", "stereo", "kinect"])
 @pytest.mark.parametrize("radius", [0.02, 0.08, 0.3, 1.1])
-def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
+def test_a_mesh_of_known_unit_is_simulated_at_true_size(name, radius):
     ball = make_mesh(BALL.vertices * radius * 1000 + 40, BALL.faces, unit="mm")
     camera = SensedCamera(ball, name, rng(30))
     assert camera.sensor.radius == pytest.approx(radius)
@@ -414,7 +414,7 @@ def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
     assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
 
 
-def test_of_a_thing_of_a_millimetre_nothing_is_seen():
+def test_a_thing_of_a_millimetre_is_not_visible():
     speck = make_mesh(BALL.vertices, BALL.faces, unit="mm")
     camera = SensedCamera(speck, "wrist", rng(30))
     assert not camera.observe(SPHERE.poses[0]).seen

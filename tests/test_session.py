@@ -158,7 +158,7 @@ def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
     [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
 )
 @pytest.mark.parametrize("policy", ["gain", "lem", "visible-gain"])
-def test_a_copy_of_a_session_goes_on_alike_and_apart(camera, policy, again):
+def test_a_copy_of_a_session_continues_independently(camera, policy, again):
     session = nextview.load(policy=policy, threshold=1, max_views=3).session(start=20)
     session.update(camera.observe(session.pose))
     result = again(session).run(camera)
@@ -187,7 +187,7 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     )
 
 
-def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
+def test_an_unfinished_session_reports_the_current_belief(system, camera):
     session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 3))
     before = session.result
     assert (

@@ -51,7 +51,7 @@ def alone():
     return nextview.load(threads=1, policy="spread")
 
 
-def test_memories_come_first_and_names_that_two_know_are_told_apart(several, known):  # noqa: F811
+def test_memories_take_precedence_and_shared_names_are_distinguished(several, known):  # noqa: F811
     assert several.classes[:4] == ("block", "bottle", "carton", "mug")
     assert several.classes[4:] == NetworkRecogniser(threads=1).classes
     twice = SeveralRecognisers({"mine": memory_of(known), "theirs": memory_of(known)})
@@ -90,7 +90,7 @@ def test_a_class_is_named_where_no_thing_explains_what_is_seen(
     )
 
 
-def test_what_is_neither_is_unknown(system):
+def test_an_object_of_neither_kind_is_unknown(system):
     ring = trimesh.creation.torus(0.09, 0.008)
     stranger = trimesh.util.concatenate(
         [ring, box((0.01, 0.01, 0.14), (0.09, 0, 0.07))]
@@ -114,7 +114,7 @@ def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
     assert len(session.views) == 1
 
 
-def test_what_cannot_be_put_together_is_refused(known):  # noqa: F811
+def test_incompatible_models_are_rejected(known):  # noqa: F811
     network, memory = NetworkRecogniser(threads=1), memory_of(known)
     with pytest.raises(
         ModelError,
@@ -142,6 +142,6 @@ def test_what_cannot_be_put_together_is_refused(known):  # noqa: F811
         (3, "models are given by name or path, not 3"),
     ],
 )
-def test_what_names_no_models_is_refused(models, sentence):
+def test_an_invalid_models_argument_is_rejected(models, sentence):
     with pytest.raises(UsageError, match=sentence):
         nextview.load(models=models)

@@ -82,7 +82,7 @@ def test_casting_only_inside_the_bound_loses_nothing(mesh):
     st.tuples(*[st.floats(-2.5, 2.5)] * 3),
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
-def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
+def test_bounded_ray_casting_agrees_with_casting_every_ray(position, quaternion):
     pose = trimesh.transformations.quaternion_matrix(quaternion)
     pose[:3, 3] = position
     assert_as_every_ray(CHAIR, pose, 64)

@@ -70,7 +70,7 @@ def test_the_p_value_is_that_of_scipy_s_permutation_test(families):
     )
 
 
-def test_with_one_run_it_is_the_exact_test_of_mcnemar():
+def test_with_one_run_the_test_is_mcnemars_exact_test():
     right = np.array([1, 1, 1, 1, 1, 1, 0, 0, 1, 0, 1, 1, 1.0])
     other = np.array([1, 0, 0, 0, 0, 0, 1, 0, 1, 1, 0, 0, 0.0])
     b, c = int(((right - other) > 0).sum()), int(((right - other) < 0).sum())

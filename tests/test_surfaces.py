@@ -117,7 +117,7 @@ def test_a_bin_does_not_swallow_its_parts(ycb, bin_of_things, posed):
     assert names == {0: "mug", 1: "banana", 2: "tomato_soup_can"}
 
 
-def test_what_stands_on_nothing_seen_is_left_out(ycb, table_and_distant_box):
+def test_objects_without_a_visible_support_are_ignored(ycb, table_and_distant_box):
     camera = LabelledCamera(table_and_distant_box)
     frame = camera.frame(
         looking_at((0, 0, TABLE + 0.03), 0, elevation=25, distance=0.9)
@@ -254,7 +254,7 @@ def test_a_box_and_the_aim_choose_an_instance(ycb, small_table):
         assert session.result.answer == "cracker_box"
 
 
-def test_a_given_mask_stays_as_it_is(ycb, small_table):
+def test_a_given_mask_is_unchanged(ycb, small_table):
     camera = LabelledCamera(small_table)
     frame = camera.frame(looking_at((0, 0, 0.45), distance=1.0))
     mask = camera.owner == 2
@@ -265,7 +265,7 @@ def test_a_given_mask_stays_as_it_is(ycb, small_table):
     assert height_of(sighting.plane) == pytest.approx(0.45, abs=0.01)
 
 
-def test_what_no_surface_carries_is_not_sure(ycb, table_and_distant_box):
+def test_an_object_without_support_is_not_confident(ycb, table_and_distant_box):
     camera = LabelledCamera(table_and_distant_box)
     pose = looking_at((0, 0, TABLE + 0.03), 0, elevation=25, distance=0.9)
     point = middle_of(table_and_distant_box, 4)

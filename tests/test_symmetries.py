@@ -51,7 +51,7 @@ def test_the_symmetries_of_a_part_are_its_true_ones_and_no_others(name):
         assert apart == pytest.approx(degrees_off(other, np.eye(3), true), abs=NEAR)
 
 
-def test_what_breaks_a_symmetry_leaves_a_near_one():
+def test_a_detail_that_breaks_a_symmetry_leaves_a_near_symmetry():
     # Without its keyway the gear comes back after each tooth, and the flange without its holes
     # after any turn. A bracket is like nothing else.
     expected = {"gear_with_keyway": 20, "flange_of_six": 0, "bracket": None}
@@ -118,7 +118,7 @@ def test_a_person_names_symmetries():
         "mug=nan/0/0",
     ],
 )
-def test_what_names_no_symmetry_is_refused_with_how_it_is_done(text):
+def test_an_invalid_symmetry_is_rejected_with_advice(text):
     with pytest.raises(UsageError, match="a symmetry is NAME=none") as error:
         named_symmetries([text])
     assert repr(text) in str(error.value)

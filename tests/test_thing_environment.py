@@ -90,7 +90,7 @@ def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
         env.unwrapped.step(0)
 
 
-def test_what_makes_no_sense_is_refused(knobs, knobs_memory, tmp_path):
+def test_invalid_settings_are_rejected(knobs, knobs_memory, tmp_path):
     given = {"scans": knobs, "models": str(knobs_memory)}
     with pytest.raises(UsageError, match="the number of views"):
         gymnasium.make(NAME, **given, max_views=1)

@@ -483,7 +483,7 @@ def test_several_runs_are_averaged(trained, views, tmp_path):
     assert [recipe["ensemble_seed"] for recipe in both.card.training.recipes] == [0, 1]
 
 
-def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
+def test_training_continues_from_the_weights_of_a_run(trained, views, tmp_path):
     run = trained / "runs/recogniser"
     network = ResNet(18, 3, 4, 8)
     start_from(network, run)
@@ -572,7 +572,7 @@ def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
     }
 
 
-def test_what_is_no_finished_run_is_not_exported(trained, views, tmp_path):
+def test_an_unfinished_run_is_not_exported(trained, views, tmp_path):
     with pytest.raises(ModelError, match="holds no training run"):
         export_map(tmp_path, views, tmp_path / "models")
     with pytest.raises(ModelError, match="holds no run of a RecogniserRecipe"):

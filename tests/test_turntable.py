@@ -83,7 +83,7 @@ def test_the_poses_are_those_of_the_camera_around_the_axis(frames):
         )
 
 
-def test_what_does_not_fit_is_noticed(frames, tmp_path):
+def test_a_wrong_or_uneven_rotation_is_reported(frames, tmp_path):
     with pytest.raises(
         DatasetError,
         match="agree if the thing turned the other way, not cw",

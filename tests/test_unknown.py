@@ -54,7 +54,7 @@ def units(rng, n, f):
 # The score
 
 
-def test_the_score_is_what_brute_force_gives():
+def test_the_score_agrees_with_brute_force():
     rng = np.random.default_rng(0)
     score, views = some_score(rng), units(rng, 20, 7)
     # Between unit vectors the squared distance is 2 less twice their product; the rows are units up
@@ -362,7 +362,7 @@ def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     assert "It is a " in capsys.readouterr().out
 
 
-def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
+def test_an_object_of_an_impossible_size_is_not_in_the_class():
     chair = sample_mesh("chair")
     for radius, known in ((0.6, True), (0.05, False), (60.0, False)):
         seen = SimulatedCamera(chair)
@@ -373,7 +373,7 @@ def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
     assert "has a radius of 60 m" in repr(result)
 
 
-def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
+def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
     assert (usual.confident, len(usual.views)) == (True, 1)
     assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == (
@@ -383,7 +383,7 @@ def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
     )
 
 
-def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(
+def test_a_change_of_light_does_not_contradict_the_object(
     monkeypatch,
 ):
     """From the front a long box is half as long: novel.

@@ -200,7 +200,7 @@ def test_a_centre_that_is_a_quarter_radius_off_is_made_up_for():
     assert moved < 1
 
 
-def test_errors_of_the_cameras_places_are_told_from_the_pose():
+def test_camera_position_errors_are_separated_from_the_object_pose():
     mesh = l_block()
     errors = 0.001 * np.array([[4.0, -2.0, 1.0], [-3.0, 3.0, 2.0], [-1.0, -1.0, -3.0]])
     exact = views_of(mesh, 0.5)
@@ -269,7 +269,7 @@ def standing_view(mesh: Mesh, lean: np.ndarray, noise: float = 0.0) -> Observati
     return with_scene(observation, 1 / q, target)
 
 
-def test_the_ground_tells_the_vertical_and_the_noise():
+def test_the_ground_determines_the_vertical_and_the_noise():
     lean = Rotation.from_rotvec([0.05, -0.04, 0.0]).as_matrix()
     image = MetricImage.of(standing_view(l_block(), lean, noise=0.01))
     assert image.ground is not None
@@ -296,7 +296,7 @@ def test_a_thing_is_found_upright_on_a_table_that_leans():
     assert moved < 1.5
 
 
-def test_nothing_reaches_below_the_ground():
+def test_poses_do_not_extend_below_the_ground():
     # Seen from the front, a higher block would hide its lower part below the table.
     low = mesh_of(((0.08, 0.06, 0.04), (0, 0, 0)))
     high = mesh_of(((0.08, 0.06, 0.09), (0, 0, 0)))
@@ -342,7 +342,7 @@ def test_a_pose_that_is_hardly_determined_has_no_negative_variance():
     assert (np.trace(inverses(singular), axis1=1, axis2=2) > 1e-6).all()
 
 
-def test_more_pixels_show_what_is_thin():
+def test_thin_parts_get_more_pixels():
     rod = mesh_of(((0.2, 0.01, 0.01), (0, 0, 0)))
     slanted, ball = views_of(rod, 0.7)[0], views_of(l_block(), 0.3)[0]
     thin, thick = depth_view(slanted, 16), depth_view(ball, 16)
@@ -478,7 +478,7 @@ def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
         )
 
 
-def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
+def test_a_surface_keeps_the_scan_frame_and_drops_invisible_parts():
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     ball.apply_translation((2.0, -1.0, 0.5))
     in_millimetres = make_mesh(1000 * ball.vertices, ball.faces, unit="mm")
@@ -558,7 +558,7 @@ def test_a_thing_is_named_by_its_geometry_alone(shown):
     assert turn < 1 or shown == 2 or (shown == 1 and turn > 179)
 
 
-def test_a_pose_that_a_near_symmetry_leads_to_is_looked_at():
+def test_poses_related_by_a_near_symmetry_are_tested():
     # A box with a knob near its upper end, which was taught upright alone, stands on its head.
     mesh = mesh_of(
         ((0.1, 0.06, 0.08), (0, 0, 0)), ((0.02, 0.02, 0.02), (0.06, 0, 0.02))
@@ -605,7 +605,7 @@ def residual_of(verifier: Verifier, mesh: Mesh) -> Verified:
     return verifier(views_of(mesh, 0.3)[:2])
 
 
-def test_what_no_hypothesis_explains_has_a_small_p_value():
+def test_an_unexplained_object_has_a_small_p_value():
     known = KnownResiduals.fit(
         np.array([0, 0, 1, 1]),
         np.array([0.1, 0.2, 0.15, 0.25]),
@@ -625,7 +625,7 @@ def test_what_no_hypothesis_explains_has_a_small_p_value():
     assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
 
 
-def test_what_is_always_explained_badly_is_not_unknown_for_that():
+def test_a_known_thing_that_always_fits_badly_is_not_unknown():
     rng = np.random.default_rng(0)
     things = np.arange(2).repeat(100)
     usual = np.array([0.5, 0.05])
@@ -639,7 +639,7 @@ def test_what_is_always_explained_badly_is_not_unknown_for_that():
     assert known.p_value(0.6, 0, 7) == known.p_value(0.6, 0, 1)
 
 
-def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
+def test_real_camera_noise_does_not_make_a_stranger():
     known = KnownResiduals(np.full(1, 0.05), (np.linspace(-0.3, 0.3, 99),))
     # Pixels that are off by the noise, 50 % more of it than was measured, have this mean.
     off = np.random.default_rng(0).normal(0, 1.49, 100_000)
@@ -726,7 +726,7 @@ def test_views_that_err_together_are_not_trusted_as_many():
         fit_weights([])
 
 
-def test_a_memory_and_scans_name_a_thing_and_tell_its_pose(taught, scans):
+def test_a_memory_with_scans_gives_name_and_pose(taught, scans):
     recogniser = TaughtRecogniser(taught / "memory.json", threads=1)
     meshes = {
         name: load_mesh(scans / f"{name}.off", unit="m") for name in ("chair", "table")
@@ -810,7 +810,9 @@ def with_handle(size):
 
 
 @pytest.mark.parametrize(("handle", "symmetric"), [(0.0003, True), (0.03, False)])
-def test_what_a_camera_cannot_tell_is_symmetric_and_a_handle_is_not(handle, symmetric):
+def test_indistinguishable_rotations_are_symmetries_unless_a_handle_breaks_them(
+    handle, symmetric
+):
     mesh = with_handle(handle)
     found = find_symmetries(turned_about(mesh.vertices, mesh.faces, 3)[1])
     assert any(one.order == 0 for one in found) == symmetric
@@ -855,7 +857,7 @@ def captured(tmp_path_factory):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
-def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(
+def test_a_surface_from_frames_covers_the_visible_part_of_the_thing(
     captured,
     noise,
 ):
@@ -892,7 +894,7 @@ def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(
     assert np.quantile(gaps, 0.95) < 0.003
 
 
-def test_of_frames_that_show_almost_nothing_there_is_no_surface(captured):
+def test_frames_with_almost_no_visible_points_give_no_surface(captured):
     camera = CapturedCamera(read_capture(captured[1]))
     camera.take_all(look_at_origin(0.3, 0.0))
     one = camera.object.sightings[0]

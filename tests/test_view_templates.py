@@ -157,7 +157,7 @@ def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
     assert np.mean(turned.outline == upright.outline) > 0.98
 
 
-def test_the_mismatch_is_what_is_defined():
+def test_the_mismatch_follows_its_definition():
     rng = np.random.default_rng(0)
     made = []
     for count in (3, 5):
@@ -195,7 +195,7 @@ def test_directions_are_spread_evenly_and_cameras_look_along_them():
     np.testing.assert_allclose(looks[:, 2], -directions)
 
 
-def test_where_almost_nothing_is_seen_nothing_is_proposed(verifier, templates):
+def test_almost_empty_views_give_no_proposals(verifier, templates):
     observations, _ = turned_views(THINGS[0], np.eye(3))
     depth = np.zeros_like(observations[0].depth)
     depth[64:66, 64:67] = 3

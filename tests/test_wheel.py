@@ -135,7 +135,7 @@ def test_no_version_with_a_known_hole_is_asked_for(project):
     assert not admitted
 
 
-def test_the_constraints_are_within_what_is_asked_for():
+def test_the_constraints_satisfy_the_requirements():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {
         canonicalize_name(name): version
@@ -158,7 +158,7 @@ def test_every_extra_has_an_example():
     "extra",
     EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK,
 )
-def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
+def test_it_runs_with_its_declared_requirements(wheel, extra, tmp_path):
     python, packages = empty_environment(tmp_path / "venv")
     zipfile.ZipFile(wheel).extractall(packages)
     (own,) = packages.glob("nextview-*.dist-info")
@@ -179,7 +179,7 @@ def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
     )
 
 
-def test_it_holds_the_package_and_nothing_else(wheel):
+def test_it_contains_only_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
     assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {

@@ -37,7 +37,7 @@ GROW = "mkdir -p out && echo line >> out/lines && test -e enough"
 """A command that leaves more each time, and is done when a file is there."""
 
 
-def test_a_stage_that_was_cut_off_goes_on_with_what_it_left(tmp_path):
+def test_an_interrupted_stage_resumes(tmp_path):
     arguments = ("out", "--needs", needed(tmp_path, "meshes", "a"), "--commands", GROW)
     assert stage(tmp_path, *arguments).returncode
     assert not (tmp_path / "out.done").exists()
@@ -47,7 +47,7 @@ def test_a_stage_that_was_cut_off_goes_on_with_what_it_left(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["input", "command", "state"])
-def test_a_stage_begins_anew_when_what_it_is_made_from_has_changed(tmp_path, change):
+def test_a_stage_starts_over_if_its_inputs_have_changed(tmp_path, change):
     needs, state, command = needed(tmp_path, "meshes", "a"), "1", GROW
     assert stage(
         tmp_path,

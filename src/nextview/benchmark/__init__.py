@@ -1,1 +1,1 @@
-"""Policies compared by replay, with intervals and tests."""
+"""Compare next-view policies, with confidence intervals and significance tests."""

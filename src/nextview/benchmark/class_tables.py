@@ -1,4 +1,4 @@
-"""From episodes of classes to tables: every number with its interval, test and published value."""
+"""Summarise episodes of classes as tables of numbers with intervals, tests and published values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,11 +35,11 @@ with extras():
 Cell = tuple[str, float | None, Outcome]
 Both = tuple["pd.DataFrame", "pd.DataFrame"]  # measures and tests
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
-OF_CLASSES = ("accuracy", "travel_moved")  # measures that are given by class, too
-# from the first view for all to the last for most
+OF_CLASSES = ("accuracy", "travel_moved")  # measures that are also reported by class
+# thresholds of the curves: from stopping at the first view to taking almost all views
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-LEVEL_VIEWS = (2, 3, 5)  # after so many views the policies are compared
-ONE_STEP = "oracle-gain"  # the policy whose lead over the reference is the gap
+LEVEL_VIEWS = (2, 3, 5)  # numbers of views after which the policies are compared
+ONE_STEP = "oracle-gain"  # the policy whose lead over the reference defines the gap
 
 
 @dataclass(frozen=True)
@@ -47,16 +47,21 @@ class ClassTables(Tables):
     """The results of a benchmark of classes.
 
     The sets are ``all``; ``class NAME``, the objects of a class; and ``LEVEL clutter``, the scenes
-    of a level of clutter. Measures at a threshold are ``accuracy``; ``clean_accuracy``, without the
-    objects whose very mesh also has another label; ``n_views``; ``travel_moved``, over the episodes
-    that moved, as published, and ``travel_all``, grid cells; ``arc_all``, radians; ``confident``,
-    the share that reached the threshold, and ``confident_accuracy``, of these;
-    ``calibration_error``; with ``class_`` before it the mean over classes. After a number of views
-    they are ``accuracy``; ``travel``, grid cells; and ``share_of_gap``, the share of the lead of
-    ``oracle-gain`` over the reference that a policy has. "published" stands in a column of its own.
+    of a clutter level.
 
-    One Holm correction is over all tests of a measure at the thresholds, one over those after so
-    many views, without policies that know the truth, and one over those of all levels.
+    Measures at a threshold are ``accuracy``; ``clean_accuracy``, without objects whose identical
+    mesh also has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as
+    published, and ``travel_all``, grid cells; ``arc_all``, radians; ``confident``, the share that
+    reached the threshold, and ``confident_accuracy``, the accuracy of these; and
+    ``calibration_error``. The prefix ``class_`` marks means over classes.
+
+    Measures after a number of views are ``accuracy``; ``travel``, grid cells; and ``share_of_gap``,
+    the lead of a policy over the reference as a share of the lead of ``oracle-gain``. Published
+    values have a column of their own, "published".
+
+    Holm's correction is applied to all tests of a measure at the thresholds, to all tests after
+    fixed numbers of views, without policies that know the truth, and to the tests of all clutter
+    levels.
 
     Attributes:
         sweep: the points of the curves of accuracy against views and travel.
@@ -69,11 +74,11 @@ class ClassTables(Tables):
 
 @dataclass(frozen=True)
 class ClassResults:
-    """A folder of results: how it was run, from which predictions, and the tables.
+    """A folder of results: settings, predictions and tables.
 
     Attributes:
-        folder: that holds them.
-        settings: with which they were made.
+        folder: with the results.
+        settings: of the benchmark.
         predictions: that were replayed.
         tables: the results.
     """
@@ -91,7 +96,7 @@ class ClassResults:
             threshold: of the belief; None for fixed views.
 
         Returns:
-            One episode per row: run by run, with the objects in the order of the predictions.
+            One episode per row, run by run, with the objects in the order of the predictions.
         """
         cell = [("policy", "==", policy)] + (
             [] if threshold is None else [("threshold", "==", threshold)]
@@ -100,7 +105,7 @@ class ClassResults:
 
 
 def class_set(label: str) -> str:
-    """The name of the set of the objects of a class."""
+    """Return the name of the set of the objects of a class."""
     return f"class {label}"
 
 
@@ -118,7 +123,7 @@ def summarise(
         reference: name of the reference policy.
         samples: number of bootstrap samples.
         rng: source of all random numbers.
-        n_views: numbers of views after which policies are compared, too; empty for none.
+        n_views: further numbers of views after which policies are compared; empty for none.
 
     Returns:
         The tables.
@@ -144,7 +149,7 @@ def summarise(
 
 
 def _counted(grid: Grid, cells: list[Cell], families: Index) -> Counted:
-    """All measures of whole episodes."""
+    """Compute all measures of whole episodes."""
     sums = {
         Key(policy, threshold, 0, measure): both
         for policy, threshold, ends in cells
@@ -154,7 +159,7 @@ def _counted(grid: Grid, cells: list[Cell], families: Index) -> Counted:
 
 
 def _sums(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
-    """Each measure of a cell as a sum for each object and what to divide it by, (N,) each."""
+    """Return each measure of a cell as numerator and denominator per object, (N,) each."""
     right = grid.right(ends.answer).astype(np.float64)
     clean = np.where(grid.specs.predictions.conflicting, 0.0, 1.0)
     one = np.ones(right.shape[1])
@@ -186,7 +191,7 @@ def _measures(
     counted: Counted,
     weights: Float,
 ) -> pd.DataFrame:
-    """Measures of whole episodes: over all objects, over classes, and of each class."""
+    """Return measures of whole episodes over all objects, over classes, and for each class."""
     p = grid.specs.predictions
     over_classes = counted.only([*OF_CLASSES, "n_views"])
     means = over_classes.measures(ALL, weights, p.labels)
@@ -224,7 +229,7 @@ def _measures(
 
 
 def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
-    """The error of the calibration, and how far the accuracies of the classes are apart."""
+    """Return the calibration error, and the spread of the accuracies of the classes."""
     labels = grid.specs.predictions.labels
     rows = []
     for policy, threshold, ends in cells:
@@ -245,7 +250,7 @@ def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
 
 
 def _sweep(grid: Grid, families: Index) -> pd.DataFrame:
-    """The points of the curves."""
+    """Return the points of the curves."""
     measures = ["accuracy", "n_views", "travel_all", "arc_all"]
     points = []
     for name, paths in grid.paths.items():
@@ -261,7 +266,7 @@ def _sweep(grid: Grid, families: Index) -> pd.DataFrame:
 
 
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
-    """Confidence and accuracy in bins of the confidence."""
+    """Return confidence and accuracy in bins of the confidence."""
     rows = []
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer).ravel()
@@ -275,7 +280,7 @@ def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
 
 
 def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
-    """The level of clutter of each scene, by its name, (N,); "" for a single object."""
+    """Return the clutter level of each scene, from its name, (N,); "" for a single object."""
     return np.array([clutter_level(name) for name in names])
 
 
@@ -285,7 +290,7 @@ def by_level(
     samples: int,
     rng: np.random.Generator,
 ) -> Both:
-    """Compare policies in scenes by the level of clutter, after 1 view and LEVEL_VIEWS views.
+    """Compare policies in scenes by clutter level, after 1 view and LEVEL_VIEWS views.
 
     Args:
         grid: the episodes.
@@ -294,7 +299,7 @@ def by_level(
         rng: source of all random numbers.
 
     Returns:
-        Measures and tests; none where there are no scenes.
+        Measures and tests; empty without scenes.
     """
     names = grid.specs.predictions.names
     level_of = levels_of(names)
@@ -317,7 +322,7 @@ def by_level(
 
 
 def _chosen_view(key: Key) -> bool:
-    """Whether a policy has chosen a view by then."""
+    """Return True if a measure includes a view chosen by the policy."""
     return key.measure == "accuracy" and key.views > 1
 
 
@@ -327,15 +332,15 @@ def after_views(
     weights: Float,
     references: Sequence[str],
 ) -> Both:
-    """Compare policies after fixed numbers of views; no threshold ends the episodes.
+    """Compare policies after fixed numbers of views, without a threshold.
 
-    A policy chooses without knowing how many views there will be, so it is run once and its path
-    cut after each number.
+    A policy does not know the number of views, so it is run once and its path is cut after each
+    number.
 
     Args:
-        grid: the episodes; the paths are as long, or end by themselves.
+        grid: the episodes; the paths are long enough, or end by themselves.
         n_views: numbers of views.
-        weights: how often each sample of the bootstrap holds each object, (S, N).
+        weights: bootstrap weight of each object in each sample, (S, N).
         references: names of the reference policies.
 
     Returns:
@@ -360,7 +365,7 @@ def after_views(
 
 
 def _gap(counted: Counted, references: Sequence[str]) -> pd.DataFrame:
-    """The share of the lead of one step of foresight over the first reference."""
+    """Return the share of the lead of one-step lookahead over the first reference."""
     right = counted.only(["accuracy"])
     of_each = dict(zip(right.keys, right.top.T, strict=True))
     rows = []
@@ -382,7 +387,7 @@ def _after(
     objects: Index,
     families: Index,
 ) -> Counted:
-    """Accuracy and travel of some objects after numbers of views, or at the end of a path."""
+    """Return accuracy and travel of objects after numbers of views, or at the end of a path."""
     sums: dict[Key, tuple[Float, Float]] = {}
     for policy in policies:
         path = grid.paths[policy]

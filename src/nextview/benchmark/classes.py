@@ -1,4 +1,4 @@
-"""The benchmark of classes: from predictions to a folder of results, and back from the folder."""
+"""The benchmark of classes: from predictions to a folder of results, and reading that folder."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -36,18 +36,19 @@ class ClassSettings:
     Attributes:
         policies: names of policies, or MODULE:CLASS for your own; by default all that the
             predictions allow.
-        models: folder of your own models, whose learned policies take part by name.
+        models: folder of your own models, whose learned policies can be used by name.
         thresholds: thresholds of the belief.
-        risks: error rates; the thresholds that guarantee them by the recogniser's calibration are
-            run too. With risks, thresholds are constant; otherwise they decrease with the views.
-        views: numbers of views after which the policies are compared too, such as 1 2 3 5.
+        risks: largest error rates; the thresholds that guarantee them, according to the
+            recogniser's calibration, are added. With risks, thresholds are constant; otherwise they
+            decrease with the views.
+        views: further numbers of views after which the policies are compared, such as 1 2 3 5.
         stopping: stopping rule of your own, MODULE:NAME, called with each threshold.
         uncalibrated: use the plain sum of the logits, as published, instead of the calibration on
             the card.
         split: use only objects of this split; needed if the predictions contain several.
         runs: random first views of each object.
         max_views: largest number of views.
-        reference: policy that the others are compared with.
+        reference: policy with which the others are compared.
         samples: number of bootstrap samples.
         seed: seed of first views, random policies and the bootstrap.
     """
@@ -77,8 +78,8 @@ def benchmark_classes(
 ) -> ClassResults:
     """Run all policies at all thresholds from the same first views, and compare them.
 
-    It writes episodes, tables and significance tests; nextview report makes a page of them. If a
-    policy fails, the settings of the results name the reason.
+    It writes episodes, tables and significance tests; nextview report makes an HTML page of them.
+    If a policy fails, the settings of the results give the reason.
 
     Args:
         predictions: predictions of nextview predict.
@@ -86,8 +87,8 @@ def benchmark_classes(
         overwrite: replace earlier results.
 
     Raises:
-        UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no
-            policy ends.
+        UsageError, RiskError, EntryError: settings are invalid, a risk cannot be guaranteed, or all
+            policies fail.
     """
     check_new(out, overwrite, folder=True)
     grid, names, promised = _prepare(predictions, settings)
@@ -135,7 +136,7 @@ def _prepare(
     predictions: Path,
     s: ClassSettings,
 ) -> tuple[Grid, list[str], dict[float, float]]:
-    """What is run, the names of the entries, and the threshold that promises each error rate."""
+    """Return the grid, the entry names, and the threshold that guarantees each error rate."""
     if not s.thresholds:
         raise UsageError("at least one threshold is needed")
     if s.views and not 1 <= min(s.views) <= max(s.views) <= s.max_views:
@@ -149,7 +150,7 @@ def _prepare(
         table = replace(table, calibration=PLAIN_SUM)
     decay = 0.0 if s.risks else table.calibration.correlation
     for threshold in s.thresholds:
-        Stopping(threshold, s.max_views, decay)  # says what is wrong with it
+        Stopping(threshold, s.max_views, decay)  # raises an error for invalid settings
     if s.stopping and s.risks:
         raise UsageError(
             "error rates are promised for the package's own stopping rule, not for yours"

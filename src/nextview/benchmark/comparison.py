@@ -1,4 +1,4 @@
-"""What policies come to: one format of measures and of tests, whatever was looked at."""
+"""Compare policies: one format of measures and tests for all benchmarks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from nextview.types import Float, Index
 with extras():
     import pandas as pd
 
-ALL = "all"  # the set of everything that was looked at
-# a difference is called one when its p-value after Holm's correction is below this
+ALL = "all"  # the set of all objects
+# significance level of differences after Holm's correction
 SIGNIFICANT = 0.05
 
 
 class Key(NamedTuple):
-    """What a number is of.
+    """Identifies a number.
 
     Attributes:
         policy: its name.
-        threshold: of the belief, at which episodes stop; None where no threshold ends them.
-        views: after how many; 0 for whole episodes.
+        threshold: of the belief, at which episodes stop; None without a threshold.
+        views: number of views; 0 for whole episodes.
         measure: its name.
     """
 
@@ -44,11 +44,12 @@ class Tables:
     """The results of a benchmark. Intervals are 95 % bootstrap intervals, ``low`` to ``high``.
 
     Attributes:
-        measures: a number a row, with the columns MEASURE_COLUMNS; "set" says of which objects.
-        tests: differences to a reference policy, with the columns TEST_COLUMNS and "p_holm": p by
-            flips of signs (``statistics.sign_flip_p``) over "families" families of objects, and p
-            after Holm's correction over all tests of one question.
-        reference: the policy that the others are compared with.
+        measures: one number per row, with the columns MEASURE_COLUMNS; "set" names the set of
+            objects.
+        tests: differences to a reference policy, with the columns TEST_COLUMNS and "p_holm":
+            p-values of a sign-flip test (``statistics.sign_flip_p``) over "families" families of
+            objects, and the p-values after Holm's correction over all tests of one question.
+        reference: the policy with which the others are compared.
     """
 
     measures: "pd.DataFrame"
@@ -56,24 +57,24 @@ class Tables:
     reference: str
 
     def policies(self) -> list[str]:
-        """The policies, in their order."""
+        """Policies in their order."""
         return list(self.measures["policy"].unique())
 
     def frames(self) -> dict[str, "pd.DataFrame"]:
-        """All tables by their names."""
+        """Return all tables by name."""
         there = vars(self).items()
         return {name: table for name, table in there if isinstance(table, pd.DataFrame)}
 
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """What M measures of policies are of N objects: each is a ratio of sums over the objects.
+    """M measures of policies on N objects, each a ratio of sums over the objects.
 
     Attributes:
         keys: of the measures.
         top: numerators, (N, M) float64.
         bottom: denominators, (N, M) float64.
-        families: number of each object's family, (N,) int64; families are drawn as a whole.
+        families: family index of each object, (N,) int64; families are resampled as a whole.
     """
 
     keys: tuple[Key, ...]
@@ -87,17 +88,17 @@ class Counted:
         sums: Mapping[Key, tuple[Float, Float]],
         families: Index,
     ) -> "Counted":
-        """Put numerators and denominators, (N,) each, side by side.
+        """Combine numerators and denominators, (N,) each, as columns.
 
         Args:
             sums: of each measure.
-            families: number of each object's family, (N,).
+            families: family index of each object, (N,).
         """
         tops, bottoms = zip(*sums.values(), strict=True)
         return cls(tuple(sums), np.stack(tops, 1), np.stack(bottoms, 1), families)
 
     def only(self, measures: Sequence[str]) -> "Counted":
-        """Some of the measures, by name."""
+        """Select measures by name."""
         kept = [i for i, key in enumerate(self.keys) if key.measure in measures]
         keys = tuple(self.keys[i] for i in kept)
         return Counted(keys, self.top[:, kept], self.bottom[:, kept], self.families)
@@ -108,11 +109,11 @@ class Counted:
         weights: Float,
         labels: Index | None = None,
     ) -> "pd.DataFrame":
-        """The measures with their intervals.
+        """Return the measures with their intervals.
 
         Args:
             name: of the set of objects.
-            weights: how often each sample of the bootstrap holds each object, (S, N).
+            weights: bootstrap weight of each object in each sample, (S, N).
             labels: class of each object, (N,), for means over classes; None for sums over objects.
         """
         value, drawn = st.estimate(self.top, self.bottom, weights, labels)
@@ -126,13 +127,13 @@ class Counted:
         reference: str,
         tested: Callable[[Key], bool],
     ) -> "pd.DataFrame":
-        """Differences to a reference policy.
+        """Return the differences to a reference policy.
 
         Args:
             name: of the set of objects.
-            weights: how often each sample of the bootstrap holds each object, (S, N).
+            weights: bootstrap weight of each object in each sample, (S, N).
             reference: the policy; its measures have the same denominators.
-            tested: which measures are compared.
+            tested: selects the measures to compare.
         """
         place = {key: i for i, key in enumerate(self.keys)}
         pairs = [
@@ -154,7 +155,7 @@ class Counted:
 
 
 def measures_of(name: str, rows: Sequence[tuple]) -> "pd.DataFrame":
-    """Measures of a set as a table.
+    """Return measures of a set as a table.
 
     Args:
         name: of the set.
@@ -165,11 +166,11 @@ def measures_of(name: str, rows: Sequence[tuple]) -> "pd.DataFrame":
 
 
 def tests_of(name: str, reference: str, rows: Sequence[tuple]) -> "pd.DataFrame":
-    """Tests in a set as a table.
+    """Return tests in a set as a table.
 
     Args:
         name: of the set.
-        reference: the policy that the others are compared with.
+        reference: the policy with which the others are compared.
         rows: key, difference, low, high, p and number of families of each.
     """
     given = [(name, *key, reference, *rest) for key, *rest in rows]
@@ -180,11 +181,11 @@ def corrected(
     tests: Sequence["pd.DataFrame"],
     bound: Callable[[str], bool] | None = None,
 ) -> "pd.DataFrame":
-    """Tests of one question with their p-values after one Holm correction, "p_holm".
+    """Apply one Holm correction to the tests of one question and add "p_holm".
 
     Args:
         tests: of the question.
-        bound: which policies know the truth: such a bound is no rival, and is not tested.
+        bound: selects policies that know the truth; as upper bounds, they are not tested.
     """
     table = pd.concat(tests, ignore_index=True)
     if bound is not None:
@@ -193,13 +194,13 @@ def corrected(
 
 
 def too_few(tests: "pd.DataFrame") -> dict[str, str]:
-    """Warnings where no difference, however clear, could be significant.
+    """Return warnings for sets in which no difference could be significant.
 
     Args:
         tests: that are corrected together.
 
     Returns:
-        A sentence for each set of too few families of objects, by its name.
+        A sentence for each set with too few families of objects, by name.
     """
     tested = tests[tests["p"].notna()]
     found = {}
@@ -225,12 +226,12 @@ def values_of(
     name: str,
     threshold: float | None = None,
 ) -> dict[tuple[str, str, int], Any]:
-    """Value, low and high by policy, measure and number of views.
+    """Return value, low and high by policy, measure and number of views.
 
     Args:
         tables: of the benchmark.
         name: of the set of objects.
-        threshold: of the belief; None for measures that no threshold ends.
+        threshold: of the belief; None for measures without a threshold.
     """
     some = tables.measures[tables.measures["set"] == name]
     at = some["threshold"]
@@ -241,7 +242,7 @@ def values_of(
 
 
 def significant(tables: Tables, name: str) -> set[tuple[str, str, int]]:
-    """Policy, measure and number of views of the differences that are significant in a set."""
+    """Return policy, measure and number of views of the significant differences in a set."""
     tests = tables.tests
     some = tests[(tests["set"] == name) & (tests["p_holm"] < SIGNIFICANT)]
     return set(zip(some["policy"], some["measure"], some["views"], strict=True))

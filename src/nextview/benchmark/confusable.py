@@ -1,4 +1,4 @@
-"""Which things look most alike, by their surfaces alone: no answer of a recogniser counts."""
+"""Find the things that look most alike by their surfaces alone, independent of any recogniser."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -10,20 +10,21 @@ from nextview.geometry.viewsphere import rotation_z
 from nextview.things.surface import Surface
 from nextview.types import Float, Mask
 
-COMPARED_SURFACE_POINTS = 300  # by which two things are compared
-AZIMUTHS_TRIED = 16  # at which one is laid over the other
-RADII_APART = 1.25  # times as large as another, from which a thing is not like it
+COMPARED_SURFACE_POINTS = 300  # sampled points of each surface
+AZIMUTHS_TRIED = 16  # tried rotations about the vertical
+RADII_APART = 1.25  # ratio of radii above which two things are not alike
 
 
 @dataclass(frozen=True, eq=False)
 class Alikeness:
-    """How alike things are.
+    """Similarity of things.
 
     Attributes:
         names: of the things.
-        nearest: name of the thing that is most like each; its own where none is of about its size.
+        nearest: name of the most similar other thing; its own name if no other one has a similar
+            size.
         distance: mean distance of the two surfaces at the best azimuth, in mean radii, (T,)
-            float64; infinity where none is of about its size.
+            float64; infinity if no other one has a similar size.
     """
 
     names: tuple[str, ...]
@@ -32,15 +33,15 @@ class Alikeness:
 
     @property
     def confusable(self) -> Mask:
-        """The half of the things to which another one is most like, (T,) bool."""
+        """Half of the things with the most similar counterparts, (T,) bool."""
         rank = np.argsort(np.argsort(self.distance, kind="stable"), kind="stable")
         return rank < len(self.names) // 2
 
     def of(self, names: Collection[str]) -> "Alikeness":
-        """The same of some of the things; the nearest of each may be none of them.
+        """Select some of the things; the nearest of each may be another one.
 
         Args:
-            names: of these.
+            names: of the selected things.
         """
         rows = [row for row, name in enumerate(self.names) if name in names]
         some = tuple(self.names[row] for row in rows)
@@ -49,14 +50,14 @@ class Alikeness:
 
 
 def distances_between(surfaces: Sequence[Surface]) -> Float:
-    """Lay the surfaces of things over each other, as they stand in their files.
+    """Compare the surfaces of things in the orientation of their files.
 
     Args:
         surfaces: of T things.
 
     Returns:
         Mean distance of two surfaces at the best azimuth, as a share of their mean radius, (T, T)
-        float64; infinity where they are of different sizes, and for a thing itself.
+        float64; infinity if their sizes differ, and on the diagonal.
     """
     rng = np.random.default_rng(0)
     points = [surface.sample(COMPARED_SURFACE_POINTS, rng) for surface in surfaces]
@@ -79,13 +80,13 @@ def distances_between(surfaces: Sequence[Surface]) -> Float:
 
 
 def how_alike(surfaces: Sequence[Surface]) -> Alikeness:
-    """Which other thing is most like each, see ``distances_between``.
+    """Find the most similar other thing of each thing, see ``distances_between``.
 
     Args:
         surfaces: of the things.
 
     Returns:
-        The nearest other thing of each.
+        The similarity of the things.
     """
     apart = distances_between(surfaces)
     distance = apart.min(1)

@@ -1,4 +1,4 @@
-"""Who can take part in the benchmark, by name: policies, oracles, fixed views, and a user's own."""
+"""Entries of the benchmark by name: policies, oracles, fixed views, and custom policies."""
 
 import re
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class EpisodeSpecs:
         predictions: of all objects from every view.
         objects: object of each episode, (E,).
         starts: first view of each, (E,).
-        scenes: what hides the objects; None for clear views.
+        scenes: occluders of the objects; None without occlusion.
     """
 
     predictions: Predictions
@@ -51,13 +51,13 @@ class EpisodeSpecs:
         return self.predictions.labels[self.objects]
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
-        """Classes (indices) for which a map's valley is the better view."""
+        """Return the classes (indices) for which a map's valley is the better view."""
         named = self.predictions.valley_classes.get(map_name, ())
         classes = self.predictions.classes
         return tuple(classes.index(name) for name in named if name in classes)
 
 
-MAP_ORACLES = {  # the thesis's oracles, under its names
+MAP_ORACLES = {  # oracles of the thesis, by their published names
     "oracle-valley": ("", LEM, "-oracle-valley"),
     f"{TRUE}{LEM}": (TRUE, LEM, ""),
     f"{TRUE}{LEM}-peak": (TRUE, LEM, "-peak"),
@@ -65,14 +65,14 @@ MAP_ORACLES = {  # the thesis's oracles, under its names
     f"{LCM}-oracle-valley": ("", LCM, "-oracle-valley"),
     f"{TRUE}{LCM}": (TRUE, LCM, "-peak"),
 }
-# the ceiling: one step of foresight
+# upper bound: one-step lookahead with the true outcomes
 GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}
-# by what a robot cannot know; always compared. Every map has such, see MAP_ORACLE
+# policies with access to the ground truth, always compared; more for each map, see MAP_ORACLE
 ORACLES = (*MAP_ORACLES, *GAINS)
 MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
-"""Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some
-classes, by the belief; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class
-decides, also on the predicted map."""
+"""Oracles that use a map. "true-MAP" climbs the true map: to its peaks, or to its valleys if the
+most likely class uses them; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true
+class decides, also on the predicted map."""
 MORE = f"{LEM}{SPHERE_SUFFIX}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
 FIXED_ENTRIES = (
     "best",
@@ -82,20 +82,19 @@ FIXED_ENTRIES = (
     "random-fixed",
     "orbit",
 )
-"""Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end
-whatever is believed.
+"""Fixed views by name, followed by their number: "best-5", "orbit-8". They do not stop early.
 
-"best" and "worst" are by the confidence in the true class; "orbit" goes round the first view's
-ring, then the next.
+"best" and "worst" refer to the confidence in the true class; "orbit" moves around the ring of the
+first view, then around the next ring.
 """
 TRUE_MEASURE = re.compile(r"true-([\w.:]+)-all(-peak)?")
-"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes
-to the highest unvisited view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are
-fixed views: the K highest."""
+"""Oracles that use the true value of any measure in the view store, over all views: "true-NAME-all"
+chooses the highest unvisited view, "true-NAME-all-peak" prefers the peaks of its map. "true-NAME-K"
+are fixed views: the K highest."""
 
 
 def is_oracle(policy: str) -> bool:
-    """Whether a policy takes what a robot cannot know."""
+    """Return True if a policy uses information that a robot does not have."""
     return (
         policy in ORACLES
         or policy.startswith(TRUE)
@@ -104,18 +103,18 @@ def is_oracle(policy: str) -> bool:
 
 
 def knows_truth(entry: str) -> bool:
-    """Whether a policy or fixed views are chosen by what a robot cannot know."""
+    """Return True if a policy or fixed views use information that a robot does not have."""
     return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
 
 
-# where things hide an object
+# additional entries in scenes with occlusion
 IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT_POLICY}", "true-visible_share-all")
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:
-    """All that these predictions allow.
+    """Return all entries that these predictions allow.
 
-    Fixed views ignore what can be reached, so scenes have none.
+    Fixed views ignore reachability, so they are not used in scenes.
     """
     sphere = specs.predictions.sphere
     n = sphere.azimuths
@@ -159,7 +158,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     policy = _make(name, specs)
     if (
         "observations" in policy.needs
-    ):  # predictions hold no depth; the ways are planned
+    ):  # predictions contain no depth, so the paths are planned in advance
         return ViewList(
             stored_rows(specs.predictions, f"plans/{name}")[
                 specs.objects,
@@ -255,7 +254,7 @@ def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
 
 
 def _ready(name: str, specs: EpisodeSpecs) -> bool:
-    """Return whether predictions and view store hold what an entry needs."""
+    """Return True if predictions and view store contain what an entry needs."""
     try:
         entry_policy(name, specs)
     except (EntryError, OtherUseError):
@@ -268,7 +267,7 @@ def fixed_views(
     specs: EpisodeSpecs,
     rng: np.random.Generator,
 ) -> Index | None:
-    """Return the views of an entry that always takes the same views.
+    """Return the views of an entry with fixed views.
 
     Args:
         name: of the entry, such as "orbit-8" or "best-5".
@@ -276,7 +275,7 @@ def fixed_views(
         rng: source of all random numbers.
 
     Returns:
-        Views in order, (E, k) int64; None if the name is not one of fixed views.
+        Views in order, (E, k) int64; None if the entry does not have fixed views.
 
     Raises:
         EntryError: there are fewer views than the name asks for.

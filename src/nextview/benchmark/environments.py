@@ -1,11 +1,11 @@
-"""Gymnasium environments to train or judge a policy; see docs/environments.md.
+"""Gymnasium environments to train or evaluate a policy; see docs/environments.md.
 
-Importing this module registers them.
+Importing this module registers them:
 
-- ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing
-is rendered.
-- ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
-- ``nextview/RecogniseThings-v0``: over taught things of known geometry, see ``thing_environment``.
+- ``nextview/Recognise-v0``: replays a file of predictions, thousands of episodes in one batch,
+  without rendering.
+- ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
+- ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
 """
 
 import logging
@@ -54,7 +54,7 @@ with extras():
 
 log = logging.getLogger(__name__)
 PredictionsSource = str | Path | Predictions
-CAMERAS = 16  # meshes that are kept ready to be looked at
+CAMERAS = 16  # meshes that are cached
 _HERE = "nextview.benchmark.environments"
 gymnasium.register(
     "nextview/Recognise-v0",
@@ -66,29 +66,28 @@ gymnasium.register(
     "nextview/RecogniseThings-v0",
     "nextview.benchmark.thing_environment:RecogniseThingsEnv",
 )
-# objects to learn from, or objects to judge by; None for all
+# objects for training or for evaluation; None for all
 EnvironmentSplit = Literal["train", "test"] | None
 Info = dict[str, Any]
-# bound of the observation space for what a map network says; the networks of this project stay far
-# below
+# bound of the observation space for map outputs, far above those of the networks of this project
 MAP_LIMIT = 100.0
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What the agent sees, what it is paid for, and when an episode ends.
+    """Observations and rewards of the agent, and the end of an episode.
 
     Attributes:
-        inputs: of an observation: "belief", "view" (what the last one alone says), "place" (the
-            ring and which views were taken), "azimuth_bin", and predicted maps by name ("lem",
+        inputs: of an observation: "belief", "view" (the belief from the last view alone), "place"
+            (the ring and the visited views), "azimuth_bin", and predicted maps by name ("lem",
             "view_area-sphere").
-        frame: where azimuths are counted from: or the "object" as it is believed to be turned.
-        objective: or "belief" in the true class, or its "log-belief": what is paid is the change by
-            a view.
-        max_views: at most, at least 2; the first is not the agent's.
+        frame: origin of azimuths: the "camera", or the "object" in its estimated orientation.
+        objective: "right" answer, "belief" in the true class, or its "log-belief"; the reward is
+            its change by a view.
+        max_views: largest number of views, at least 2; the first view is not chosen by the agent.
         threshold: belief that ends an episode after the second view or later; None takes all views.
-        view_price: taken from the reward for each view.
-        travel_price: taken from it for each grid cell of travel.
+        view_price: subtracted from the reward for each view.
+        travel_price: subtracted from the reward for each grid cell of travel.
     """
 
     inputs: tuple[str, ...] = ("belief", "view", "place")
@@ -112,16 +111,16 @@ class Rules:
                 raise UsageError(f"{value!r} is none of {', '.join(known)}")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
-        # says what is wrong with it
+        # raises an error for an invalid threshold
         Stopping(0.5 if self.threshold is None else self.threshold)
 
     @property
     def maps(self) -> tuple[str, ...]:
-        """The maps among the inputs."""
+        """Maps among the inputs."""
         return maps_of(self.inputs)
 
     def stopping(self, calibration: Calibration) -> Stopping:
-        """The rule that ends episodes, with the decay that the calibration asks for."""
+        """Return the stopping rule, with the decay of the threshold from the calibration."""
         if self.threshold is None:
             return FixedLength(max_views=self.max_views)
         return AfterAction(self.threshold, self.max_views, calibration.correlation)
@@ -129,19 +128,19 @@ class Rules:
 
 @dataclass(frozen=True)
 class AfterAction(Stopping):
-    """Stops as ``Stopping`` does, but never at the first view."""
+    """Stopping rule that never ends an episode at the first view."""
 
     def threshold_at(self, n_views: Index | int) -> Float:
-        """See ``Stopping``; infinity for one view."""
+        """Return the threshold, see ``Stopping``; infinity for one view."""
         return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
 
 
 def rows(values: Any, n: int, below: int, what: str) -> Index:
-    """Check whole numbers that an agent or a user chose.
+    """Check integers chosen by an agent or a user.
 
     Args:
         values: the numbers; one number for one row.
-        n: how many there have to be.
+        n: expected number of them.
         below: upper limit, exclusive; the lower limit is 0.
         what: name of the numbers in the error message.
 
@@ -166,7 +165,7 @@ def rows(values: Any, n: int, below: int, what: str) -> Index:
 
 @dataclass(frozen=True)
 class EnvironmentTask:
-    """N objects, what is seen of them, and the rules.
+    """N objects, their views, and the rules.
 
     Attributes:
         labels: true class of each object, (N,).
@@ -175,7 +174,7 @@ class EnvironmentTask:
         calibration: from summed evidence to the belief.
         observe: from objects, (A,), and views, (A,), to the evidence of each view.
         rules: of an episode.
-        balanced: whether each class is drawn as often as every other one.
+        balanced: whether all classes are drawn equally often.
     """
 
     labels: Index
@@ -200,7 +199,7 @@ class EnvironmentTask:
         Args:
             n: number of episodes.
             rng: source of all random numbers.
-            options: of ``reset``: "object" and "start" of each episode; what is missing is drawn.
+            options: of ``reset``: "object" and "start" of each episode; random by default.
 
         Returns:
             The episodes.
@@ -221,7 +220,7 @@ class EnvironmentTask:
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
-        """Space of ``policies.gain.features``, (D,) float32; all but the maps in 0 to 1."""
+        """Space of ``policies.gain.features``, (D,) float32; all but the maps are in 0 to 1."""
         c = len(self.classes)
         rules = self.rules
         widths = {
@@ -255,12 +254,12 @@ def replayed(
     """Create the task of recognising the objects of predictions.
 
     Train on objects that the recogniser was not trained on (``nextview predict --held-out``).
-    Predictions without splits, such as those of taught things, are used completely for "train".
+    Predictions without splits, such as those of taught things, are all used for "train".
 
     Args:
         predictions: the predictions, or their path.
         split: "train" (each shape once), "test", or None for all objects.
-        balanced: whether every class is drawn equally often.
+        balanced: whether all classes are drawn equally often.
         rules: of the episodes.
 
     Returns:
@@ -313,12 +312,12 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of a cohort: goes to the free view nearest to the action.
+    """The policy of a cohort: takes the free view nearest to the agent's action.
 
     Attributes:
         sphere: of the views.
-        views: that are asked for, one an episode.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        views: requested views, one per episode.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -326,7 +325,7 @@ class Asked:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Take the free view that is nearest to the one that the agent asked for.
+        """Return the free view nearest to the requested one.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -344,16 +343,16 @@ class Asked:
 
 @dataclass(frozen=True)
 class Seen:
-    """What A episodes show after their actions.
+    """Outcomes of the actions in A episodes.
 
     Attributes:
         observation: (A, D) float32.
         change: of the objective, (A,).
-        price: of the view and of the way to it, (A,).
-        ended: whether each episode is over, (A,) bool.
-        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer",
-            its "confidence", "prediction_target" and "action_mask", the actions that lead to
-            a view not taken yet, (A, V) int8.
+        price: of the view and the travel to it, (A,).
+        ended: whether each episode has ended, (A,) bool.
+        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer", its
+            "confidence", "prediction_target" and "action_mask", the actions that lead to an
+            unvisited view, (A, V) int8.
     """
 
     observation: Float32
@@ -364,16 +363,16 @@ class Seen:
 
 
 class Cohort:
-    """B episodes side by side, all at the same view.
+    """B episodes that run side by side, all with the same number of views.
 
-    ``first`` is what is seen before any action.
+    ``first`` is the outcome before any action.
     """
 
     def __init__(self, task: EnvironmentTask, objects: Index, starts: Index) -> None:
         self.task = task
         self.objects = objects
         self._asked = Asked(task.sphere, np.array(starts))
-        # nothing is drawn
+        # not used for any draw
         rng = np.random.default_rng(0)
         stopping = task.rules.stopping(task.calibration)
         self.episodes = Episodes(
@@ -390,11 +389,11 @@ class Cohort:
         self.first = self._look(np.zeros(len(objects)))
 
     def step(self, actions: Index) -> Seen:
-        """Continue all running episodes; a visited view is replaced by the nearest unvisited."""
+        """Continue all running episodes; visited views are replaced by the nearest free ones."""
         sphere = self.task.sphere
         running = self.episodes.running
         rules = self.task.rules
-        # ``current`` is what comes next
+        # ``current`` is the next view
         before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]
         self._asked.views[running] = self._reached[np.arange(len(running)), actions]
         self.episodes.keep_choice(self.episodes.next_choice())
@@ -461,7 +460,7 @@ class Cohort:
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """One episode at a time of any task."""
+    """A task as an environment with one episode at a time."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
@@ -480,8 +479,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         """Begin an episode; see Gymnasium.
 
         Args:
-            seed: of the draws; None to continue them.
-            options: "object" and "start"; what is missing is drawn.
+            seed: of the random numbers; None to continue their sequence.
+            options: "object" and "start"; random by default.
 
         Returns:
             The first observation and its info.
@@ -501,25 +500,25 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         )
 
     def go(self, action: Any) -> Seen:
-        """What is seen after an action."""
+        """Return the outcome of an action."""
         if self._cohort is None or len(self._cohort.episodes.running) == 0:
             raise SessionError("no episode is under way; call reset")
         return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
 
     def observed(self, seen: Seen) -> Any:
-        """The observation of the one episode."""
+        """Return the observation of the single episode."""
         return seen.observation[0]
 
 
 def info_of(seen: Seen) -> Info:
-    """The info of a single episode."""
+    """Return the info of a single episode."""
     return {name: values[0] for name, values in seen.info.items()}
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object from few views, looked up in predictions; see ``replayed``.
+    """Recognise an object from few views that are looked up in predictions; see ``replayed``.
 
-    ``rules`` are as for ``Rules``.
+    ``rules`` are the arguments of ``Rules``.
     """
 
     def __init__(
@@ -533,7 +532,7 @@ class RecogniseEnv(TaskEnv):
 
 
 class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
-    """Many episodes of a task at once, in at most as many cohorts as numbers of views."""
+    """Many episodes of a task at once, grouped in cohorts by number of views."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
     metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
@@ -556,8 +555,8 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
         """Begin an episode in every environment; see Gymnasium.
 
         Args:
-            seed: of the draws; None to continue them.
-            options: "object" and "start" of each episode; what is missing is drawn.
+            seed: of the random numbers; None to continue their sequence.
+            options: "object" and "start" of each episode; random by default.
 
         Returns:
             The first observations, (E, D) float32, and their infos.
@@ -578,7 +577,7 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
         )
 
     def go(self, actions: Any) -> tuple[Seen, Info]:
-        """Return the next observation of each episode, of a new one where an episode ended."""
+        """Return the next observation of each episode; ended episodes are replaced by new ones."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
 
@@ -628,7 +627,7 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
 
 
 class RecogniseVectorEnv(TaskVectorEnv):
-    """See ``RecogniseEnv``, of which this runs ``num_envs`` side by side."""
+    """Vector version of ``RecogniseEnv`` with ``num_envs`` episodes side by side."""
 
     def __init__(
         self,
@@ -645,15 +644,22 @@ class RecogniseVectorEnv(TaskVectorEnv):
 
 
 class RecogniseMeshEnv(TaskEnv):
-    """Recognise an object by few views of its mesh.
+    """Recognise an object from few rendered views of its mesh.
 
-    ``meshes`` are a folder, CLASS/train|test/MESH or CLASS/MESH; ``split`` None is for one without
-    splits, as are the samples, the default. ``models`` are bundled ones by name, or a folder;
-    ``viewpoints`` a layout of ``ViewSphere.named``. With ``depth`` the observation is {"state":
-    (D,), "depth": (size, size) float32, object radii, 0 where there is no object}; ``size`` is a
-    multiple of what the networks take, 112 for the bundled ones. ``balanced`` draws every class
-    equally often; ``rules`` are options of ``Rules``. DatasetError: no such meshes, or a class that
-    the recogniser does not know.
+    Args:
+        meshes: folder CLASS/train|test/MESH or CLASS/MESH; by default the samples.
+        split: "train" or "test"; None for folders without splits, such as the samples.
+        models: name of bundled models, or a folder.
+        viewpoints: layout of ``ViewSphere.named``.
+        depth: return observations {"state": (D,), "depth": (size, size) float32, object radii, 0
+            for the background}.
+        size: side of the images, pixels, a multiple of the input size of the networks, which is 112
+            for the bundled ones.
+        balanced: draw all classes equally often.
+        rules: arguments of ``Rules``.
+
+    Raises:
+        DatasetError: there are no such meshes, or the recogniser does not know a class.
     """
 
     def __init__(
@@ -736,6 +742,6 @@ class RecogniseMeshEnv(TaskEnv):
         return self._models.evidence(seen)
 
     def observed(self, seen: Seen) -> Any:
-        """The state, and the depth image if it is wanted."""
+        """Return the state, with the depth image if requested."""
         state = super().observed(seen)
         return {"state": state, "depth": self._last.depth} if self._depth else state

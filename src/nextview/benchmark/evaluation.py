@@ -1,4 +1,4 @@
-"""Evaluate the models: every view of every object, without a policy."""
+"""Evaluate the models on every view of every object, without a policy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 with extras():
     import pandas as pd
 
-# views after which confidence is compared with accuracy, beside all of them
+# numbers of views after which confidence is compared with accuracy, in addition to all views
 RELIABILITY_LOOKS = (1, 2, 5)
 
 
@@ -38,15 +38,16 @@ class Evaluation:
 
     Attributes:
         accuracy: by n_views (1, or V: all logits summed), label (empty: all) and measure:
-            ``accuracy``; ``clean_accuracy``, without the objects whose very mesh also has another
-            label; ``shape_accuracy``, where the recogniser is not told the size; with ``class_``
-            before it the mean over classes.
-        fusion: the same, mean confidence and calibration error of so many random views fused.
-        confusion: answers by n_views, label and answer; a view is an answer, or a whole object.
+            ``accuracy``; ``clean_accuracy``, without objects whose identical mesh also has another
+            label; ``shape_accuracy``, without size evidence; the prefix ``class_`` marks means over
+            classes.
+        fusion: accuracy, mean confidence and calibration error after fusing a number of random
+            views.
+        confusion: answers by n_views, label and answer; an answer is given per view, or per object.
         reliability: confidence and accuracy by n_views and bin.
         maps: scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean
-            of the true maps of these very objects: over all, or for the true class at the view.
-        left_out: for each map that is not judged, or not of all objects, why.
+            of the true maps of these objects: over all, or for the true class at the view.
+        left_out: reason for each map that is not evaluated, or not on all objects.
     """
 
     accuracy: pd.DataFrame
@@ -57,7 +58,7 @@ class Evaluation:
     left_out: dict[str, str]
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables by name."""
+        """Return the tables by name."""
         return {
             name: table
             for name, table in vars(self).items()
@@ -127,7 +128,7 @@ def fused_views(
     rng: np.random.Generator,
     classes: int,
 ) -> tuple[Mask, Float32]:
-    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
+    """Fuse 1, 2, ... V views of each object, in a random order and all of its rotations.
 
     Args:
         log_evidence: of the views, (N, V, D).
@@ -171,7 +172,7 @@ def _means(
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
     """Return ratios of sums over objects, (N, M): over all, over classes, and by class.
 
-    The mean over classes has "class_" before its name.
+    The prefix "class_" marks the mean over classes.
     """
     every = np.ones(len(labels), bool)
     in_classes = [(classes[index], "", labels == index) for index in np.unique(labels)]
@@ -302,7 +303,7 @@ def _reliability(right: Mask, confidence: Float32) -> pd.DataFrame:
     rows = []
     v = len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
-        # all views are the same in every order
+        # all views together do not depend on the order
         turns = slice(None) if n_views < v else slice(1)
         belief = confidence[n_views - 1, :, turns].ravel().astype(np.float64)
         answers = right[n_views - 1, :, turns]
@@ -337,7 +338,7 @@ def judged_objects(p: Predictions, name: str) -> Index:
 
 
 def baselines(true: Floats, labels: Index) -> dict[str, Floats]:
-    """Return maps that networks are compared with.
+    """Return baseline maps for the comparison with networks.
 
     Args:
         true: the true maps, (N, V, rings, 3).
@@ -360,7 +361,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
     known = known_maps(p)
 
     for name, predicted in p.maps.items():
-        if name.endswith("-sphere"):  # its window is judged
+        if name.endswith("-sphere"):  # its local window is evaluated
             continue
         if name not in known:
             left_out[name] = (
@@ -429,13 +430,13 @@ def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
 
     Args:
         card: of the model.
-        p: predictions that it made.
+        p: predictions of the model.
 
     Returns:
-        The scores by their names.
+        The scores by name.
 
     Raises:
-        ResultsError: another model made the predictions, or no object can be judged.
+        ResultsError: the predictions are from another model, or no object can be evaluated.
     """
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise ResultsError(f"these predictions were not made by model {card.name}")

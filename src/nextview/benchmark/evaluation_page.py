@@ -1,4 +1,4 @@
-"""Evaluate the models behind predictions: a folder of tables and an HTML page."""
+"""Evaluate the models behind predictions, and write a folder of tables and an HTML page."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -26,9 +26,9 @@ class EvaluationSettings:
 
     Attributes:
         split: use only objects of this split; needed if the predictions contain several.
-        deduplicate: evaluate only the first of identical meshes under one label; the published
+        deduplicate: evaluate only the first of identical meshes with the same label; the published
             numbers include all of them.
-        cards: cards of the models that made the predictions; their scores are written into them.
+        cards: cards of the models that made the predictions; the scores are written into them.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap and of the orders of views.
     """
@@ -57,8 +57,8 @@ def write_evaluation(
         overwrite: replace an earlier evaluation.
 
     Raises:
-        UsageError: the predictions hold several splits, and none is chosen.
-        ResultsError: there is nothing to judge, or a card's model did not make them.
+        UsageError: the predictions contain several splits, and none is selected.
+        ResultsError: there is nothing to evaluate, or a card belongs to another model.
     """
     for folder in filter(None, (out, figures)):
         check_new(folder, overwrite, folder=True)
@@ -96,7 +96,7 @@ def write_evaluation(
         write_figures(figures, _figures(found, p), found.tables(), overwrite)
     for path, (sha256, scores) in noted.items():
         with only_one(path):
-            card = read_card(path)  # as it is by now
+            card = read_card(path)  # it may have changed
             if card.sha256 != sha256:
                 raise ModelError(
                     f"{path}: became the card of another model while this ran, and is left as it is"

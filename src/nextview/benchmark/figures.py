@@ -1,4 +1,4 @@
-"""The figures of a benchmark, from its tables, and of an evaluation."""
+"""Figures of a benchmark, from its tables, and of an evaluation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -55,7 +55,7 @@ POLICY_COLOURS = {
     "ceiling": "#111111",
     "target": ACCENT,
 }
-# all others, in turn
+# colours of all other policies, in order
 OWN = (
     "#3a7d00",
     "#7209b7",
@@ -69,22 +69,22 @@ FORESEES = (
     "ceiling",
     ONE_STEP,
     f"{ONE_STEP}-all",
-)  # what comes of a view: drawn dotted
-LOWEST_AXIS = 0.9  # share that the axis reaches down to, at least
-MOST_CURVES = 8  # curves of policies that a robot could follow, at most
+)  # policies that depend on the true outcome of a view: drawn dotted
+LOWEST_AXIS = 0.9  # largest lower limit of an axis of shares
+MOST_CURVES = 8  # largest number of curves of realisable policies
 
 
 def ceiling(results: ClassResults) -> list[str]:
-    """Return the oracle of one step ahead, in the window or over all views.
+    """Return the one-step oracle, in the window or over all views.
 
-    It is empty if neither was run.
+    Empty if neither was run.
     """
     ran = set(results.tables.sweep["policy"])
     return [name for name in FORESEES if name in ran][:1]
 
 
 def compared(results: ClassResults) -> list[str]:
-    """Return the policies of the curves.
+    """Return the policies shown as curves.
 
     They are the reference, the most accurate others, the published oracle and the upper bound.
     """
@@ -106,10 +106,10 @@ def look_of(policy: str, tables: Tables) -> dict[str, Any]:
 
     Args:
         policy: its name.
-        tables: that name all policies.
+        tables: with all policies.
 
     Returns:
-        Keyword arguments of ``plot``; no two of eight policies without a colour have the same.
+        Keyword arguments of ``plot``; different for any eight policies without a fixed colour.
     """
     own = [name for name in tables.policies() if name not in POLICY_COLOURS]
     colour = POLICY_COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
@@ -123,7 +123,7 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
     Args:
         tables: of the benchmark.
         measure: name of the share.
-        what: the same in words.
+        what: description of the share.
     """
     figure, axes = new_figure(4.6, 3.5)
     values = values_of(tables, ALL)
@@ -131,7 +131,7 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
     policies = tables.policies()
     for row, policy in enumerate(policies):
         shares = np.array([values[policy, measure, k] for k in views])
-        # side by side, so that the bars can be told apart
+        # offset, so that the bars do not overlap
         x = np.array(views) + (row - len(policies) / 2) * 0.05
         _curve(axes, x, shares, policy, look_of(policy, tables))
     axes.set_xticks(views)
@@ -168,7 +168,7 @@ def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> F
     for k, name in enumerate(names):
         rows = table[table["policy"] == name].sort_values("threshold")
         shares = rows[["value", "low", "high"]].to_numpy(np.float64)
-        # side by side, so that the bars can be told apart
+        # offset, so that the bars do not overlap
         x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04
         _curve(axes, x, shares, name, look_of(name, results.tables))
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
@@ -208,12 +208,12 @@ def budget_curve(results: ClassResults, budget: str) -> Figure:
 def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
     """Draw the differences of all policies from the reference.
 
-    Lines are 95 % intervals; dots are filled where Holm's p is below 0.05.
+    Lines are 95 % intervals; dots are filled if Holm's p is below 0.05.
 
     Args:
         tables: of the benchmark.
         tests: of one measure, in one set or in two.
-        what: the measure, in words.
+        what: description of the measure.
     """
     policies = list(tests["policy"].unique())[::-1]
     sets = list(tests["set"].unique())
@@ -242,7 +242,7 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
 
 
 def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Figure:
-    """Draw the percentage of each true class that was taken for each class (figure 12).
+    """Draw the percentage of answers for each true class (figure 12).
 
     Args:
         counts: by true class (rows) and answer (columns), (C, C).
@@ -316,7 +316,7 @@ def reliability_diagram(
 ) -> Figure:
     """Draw the reliability of the confidence at which the episodes stopped.
 
-    Bins of fewer than 20 episodes are left out.
+    Bins with fewer than 20 episodes are left out.
 
     Args:
         results: of the benchmark.
@@ -466,7 +466,7 @@ def fusion_curve(e: Evaluation) -> Figure:
 def evaluated_reliability(e: Evaluation) -> Figure:
     """Draw the reliability after one view and more, in random order.
 
-    Bins of fewer than 20 answers are left out.
+    Bins with fewer than 20 answers are left out.
     """
     errors = e.fusion.set_index("n_views")["calibration_error"]
     curves = {}

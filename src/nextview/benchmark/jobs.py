@@ -1,9 +1,9 @@
-"""Episodes of a benchmark as jobs: in parallel, each with a record of its own, resumable.
+"""Run the episodes of a benchmark as parallel, resumable jobs, each with its own record.
 
-A folder of results holds ``runs``, what each policy made of each episode, a small file for each;
-``episodes.json``, how the episodes are shown; the record ``benchmark.json``, which says how it was
-run; and the tables and figures, which every run writes anew. Workers import this module, and so
-neither pandas nor matplotlib.
+A folder of results contains ``runs``, a small file with the runs of all policies in each episode;
+``episodes.json``, the conditions of the episodes; ``benchmark.json``, the settings; and the tables
+and figures, which every run rewrites. Workers import this module, so it imports neither pandas nor
+matplotlib.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from nextview.data.progress import TrackProgress
 from nextview.errors import ResultsError
 from nextview.files import check_new, read_record, write_record
 
-EPISODES_FILE = "episodes.json"  # how the episodes of a folder are shown
+EPISODES_FILE = "episodes.json"  # conditions of the episodes in a folder
 
 
 Runs = TypeVar("Runs", bound=msgspec.Struct)
@@ -27,7 +27,7 @@ OneJob = TypeVar("OneJob", bound="Job")
 
 @dataclass(frozen=True)
 class Job:
-    """One episode, and the policies that are run in it.
+    """One episode, and the policies to run in it.
 
     Attributes:
         settings: of the benchmark.
@@ -43,14 +43,14 @@ class Job:
 
     @property
     def runs_file(self) -> Path:
-        """Where its record is written."""
+        """Path of its record."""
         return self.out / "runs" / f"{self.name}.json"
 
     def earlier(self, kind: type[Runs]) -> Runs | None:
-        """Its record; None if it was not begun.
+        """Read its record; None if there is none.
 
         Args:
-            kind: of the record.
+            kind: type of the record.
 
         Raises:
             ResultsError: the file is damaged.
@@ -60,16 +60,18 @@ class Job:
         return read_record(self.runs_file, kind, "runs", ResultsError)
 
     def write(self, runs: msgspec.Struct) -> None:
-        """Write its record, in the place of an earlier one."""
+        """Write its record, replacing an earlier one."""
         self.runs_file.parent.mkdir(parents=True, exist_ok=True)
         write_record(self.runs_file, runs, overwrite=True)
 
     def left(self: OneJob, kind: type[Runs], anew: bool = False) -> OneJob | None:
-        """The job with the policies that are not done; None if all are. Your own are done anew.
+        """Return the job with the unfinished policies; None if all are done.
+
+        Custom policies always run again.
 
         Args:
-            kind: of its record.
-            anew: whether all are done anew.
+            kind: type of its record.
+            anew: whether to run all policies again.
         """
         done: Any = self.earlier(kind)
         if done is None or anew:
@@ -86,15 +88,15 @@ def run_jobs(
     track: TrackProgress,
     anew: bool = False,
 ) -> list[Runs]:
-    """Run what is left of some jobs.
+    """Run the unfinished policies of some jobs.
 
     Args:
         work: runs a job, and writes its record.
         jobs: all of them.
-        kind: of their records.
-        workers: number of processes; None for one on each core, 0 for this process.
-        track: follows the work.
-        anew: whether all are done anew.
+        kind: type of their records.
+        workers: number of processes; None for one per core, 0 for this process.
+        track: callable that shows progress.
+        anew: whether to run all of them again.
 
     Returns:
         The records of all jobs.
@@ -107,14 +109,14 @@ def run_jobs(
 
 
 def check_place(out: Path, own: str = EPISODES_FILE) -> None:
-    """See that a folder is new, or holds results of this benchmark.
+    """Check that a folder is new, or contains results of this benchmark.
 
     Args:
         out: the folder.
-        own: a folder or file that is there before the first episode is.
+        own: a folder or file that exists before the first episode is finished.
 
     Raises:
-        ResultsError: it holds something else.
+        ResultsError: it contains something else.
     """
     check_new(out, overwrite=True, folder=True)
     if not out.is_dir() or any((out / name).exists() for name in (EPISODES_FILE, own)):
@@ -127,14 +129,16 @@ def check_place(out: Path, own: str = EPISODES_FILE) -> None:
 
 
 def check_same(out: Path, made: dict[str, Any]) -> None:
-    """See that the episodes of a folder are shown as those of this run; note it in a new folder.
+    """Check that the conditions of a folder's episodes are those of this run.
+
+    In a new folder they are written down.
 
     Args:
         out: folder of the results.
-        made: how they are shown, by what is set.
+        made: conditions, by setting.
 
     Raises:
-        ResultsError: they are shown in another way.
+        ResultsError: they differ.
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / EPISODES_FILE

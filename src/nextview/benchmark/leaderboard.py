@@ -1,4 +1,4 @@
-"""Leaderboard of classes: at one threshold, after numbers of views, and what follows from it."""
+"""Leaderboard of classes: at one threshold, after numbers of views, and conclusions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,13 +13,13 @@ from nextview.checks import extras
 with extras():
     import pandas as pd
 
-# with fewer objects, or wider intervals of differences in accuracy, little can be told
+# with fewer objects, or wider intervals of differences in accuracy, a warning is given
 FEW_OBJECTS = 200
 WIDE_INTERVAL = 0.03
 
 
 def headline_threshold(thresholds: Sequence[float]) -> float:
-    """The threshold that reports speak of: 0.97, the library's default, or the one next to it."""
+    """Return the threshold used in reports: 0.97, the library's default, or the closest one."""
     return min(thresholds, key=lambda t: abs(t - 0.97))
 
 
@@ -51,22 +51,22 @@ def leaderboard(tables: ClassTables, threshold: float) -> list[Any]:
 
 
 def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]:
-    """What became of promised error rates, for the policies that a robot could follow.
+    """Compare guaranteed error rates with actual ones, for realisable policies.
 
     Args:
         tables: of the benchmark.
-        risks: thresholds by the error rates that they promise.
+        risks: thresholds by guaranteed error rate.
 
     Returns:
         Rows with policy, risk, threshold, error among the episodes that reached the threshold, its
-        interval (low, high), the share of these episodes (confident), and whether the promise is
-        broken beyond chance (broken).
+        interval (low, high), the share of these episodes (confident), and whether the guarantee is
+        violated significantly (broken).
     """
     rows = []
     for risk, threshold in risks.items():
         values = values_of(tables, ALL, threshold)
         for policy in dict.fromkeys(policy for policy, _, _ in values):
-            # the upper end of accuracy is the lower of error
+            # the upper limit of the accuracy is the lower limit of the error
             right, high, low = values[policy, "confident_accuracy", 0]
             share = values[policy, "confident", 0][0]
             row = (policy, float(risk), threshold, 1 - right, 1 - low, 1 - high, share)
@@ -79,11 +79,11 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
 
 
 def levels_in(tables: Tables) -> dict[str, dict[str, Any]]:
-    """What is known of scenes after numbers of views, by level of clutter.
+    """Return the results in scenes after numbers of views, by clutter level.
 
     Returns:
-        Of each level "views"; "policies", those that no robot could follow last; "values", see
-        ``values_of``; and "tests" by policy and number of views.
+        For each level "views"; "policies", realisable ones first; "values", see ``values_of``; and
+        "tests" by policy and number of views.
     """
     found = {}
     after = tables.measures.query("set != @ALL and views > 0")
@@ -106,7 +106,7 @@ def level_differences(tables: ClassTables, reference: str) -> str | None:
         reference: name of the reference policy.
 
     Returns:
-        The sentence; None if no policy of a robot differs.
+        The sentence; None if no realisable policy differs.
     """
     tests = tables.tests.query("set != @ALL and p_holm < @SIGNIFICANT")
     rows = tests[["policy", "difference", "views", "set"]].to_numpy(object).tolist()
@@ -127,7 +127,7 @@ def nothing_differs(
     threshold: float,
     reference: str,
 ) -> str | None:
-    """Return a sentence if no policy of a robot differs significantly from the reference.
+    """Return a sentence if no realisable policy differs significantly from the reference.
 
     Args:
         tables: of the benchmark.
@@ -152,7 +152,7 @@ def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | Non
     Args:
         tables: of the benchmark.
         threshold: of the belief.
-        objects: how many there are.
+        objects: number of objects.
 
     Returns:
         The warning; None if there are enough.
@@ -162,7 +162,7 @@ def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | Non
         return hopeless[ALL]
 
     tests = _robot_tests(tables, threshold)
-    # NaN if nothing was compared
+    # NaN without comparisons
     half = float((tests["high"] - tests["low"]).median() / 2)
     if objects >= FEW_OBJECTS and not half > WIDE_INTERVAL:
         return None
@@ -179,7 +179,7 @@ def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | Non
 
 
 def accuracy_tests(tables: Tables, threshold: float | None = None) -> "pd.DataFrame":
-    """The tests of accuracy at one threshold; by default at all of them."""
+    """Return the tests of accuracy at one threshold; by default at all of them."""
     t = tables.tests.query("set == @ALL and views == 0 and measure == 'accuracy'")
     return t if threshold is None else t[t["threshold"] == threshold]
 
@@ -190,7 +190,7 @@ def _robot_tests(tables: Tables, threshold: float) -> "pd.DataFrame":
 
 
 def after_views_rows(tables: Tables) -> "pd.DataFrame":
-    """Policies after fixed numbers of views as a table that is read: a row a policy, all text."""
+    """Return the results after fixed numbers of views as formatted text, one row per policy."""
     after = tables.measures.query("set == @ALL and views > 0")
     tested = tables.tests.query("set == @ALL and views > 0")
     keys = ["policy", "reference", "views"]
@@ -202,9 +202,9 @@ def after_views_rows(tables: Tables) -> "pd.DataFrame":
     def difference(name: str, reference: str, k: int) -> str:
         place: Any = name, reference, k
         value, p = tests.loc[place]
-        # rounded first: no minus before a zero
+        # rounded first, to avoid a negative zero
         shown = f"{round(100 * value, 1) + 0.0:+.1f}"
-        if np.isnan(p):  # a ceiling is no rival
+        if np.isnan(p):  # upper bounds are not tested
             return shown
         return f"{shown} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
 

@@ -1,4 +1,4 @@
-"""A recogniser of your own in the place of a memory, in the benchmark of things."""
+"""Use your own recogniser instead of a memory in the benchmark of things."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from nextview.types import Float, Index
 
 @dataclass(frozen=True, eq=False)
 class OwnAnswer:
-    """What a recogniser of your own says of some views, in the parts that ``Verified`` has, too.
+    """Answer of your own recogniser, with the attributes of ``Verified`` that the benchmark uses.
 
     Attributes:
         belief: in each thing, (T,) float64.
-        things: thing of each pose, the likeliest first, (M,) int64; none where it gives no poses.
-        poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
-        cameras: by how much each view sees them displaced, (M, V, 3) float64, metres.
+        things: thing of each pose, the likeliest first, (M,) int64; empty without poses.
+        poses: from the frames of the scan files to the object frame, (M, 4, 4) float64, metres.
+        cameras: displacement of each pose in each view, (M, V, 3) float64, metres.
         p_value: share of known things that are explained as badly, () float64; NaN if it is not
             known.
     """
@@ -37,19 +37,19 @@ class OwnAnswer:
 
 
 class OwnThings:
-    """The classes of a recogniser of your own as things that are shown.
+    """The classes of your own recogniser as the things of the benchmark.
 
     Attributes:
-        recogniser: that was given.
-        names: its classes in alphabetical order, as a memory has them: things of the same names are
-            shown in the same episodes.
+        recogniser: your recogniser.
+        names: its classes in alphabetical order, like those of a memory, so that things with the
+            same names have the same episodes.
     """
 
     def __init__(self, given: str) -> None:
-        """Make the recogniser.
+        """Create the recogniser.
 
         Args:
-            given: MODULE:NAME of a recogniser, or of a class that makes one.
+            given: MODULE:NAME of a recogniser, or of a class or function that creates one.
 
         Raises:
             UsageError, ModelError: see ``own_recogniser``.
@@ -65,7 +65,7 @@ class OwnThings:
             observations: views that show the thing, in one object frame.
 
         Raises:
-            ModelError: its answer is none.
+            ModelError: its answer is invalid.
         """
         total = log_evidence_of_views(self.recogniser, observations).sum(0)
         count = len(observations)
@@ -94,16 +94,16 @@ class OwnThings:
         observations: Sequence[Observation],
         found: OwnAnswer,
     ) -> float | None:
-        """Share of known things that are explained as badly; None where it does not tell.
+        """Return the share of known things that are explained as badly; None if not known.
 
         Args:
             observations: the views.
-            found: what it said of them.
+            found: its answer.
         """
         return None if np.isnan(found.p_value) else float(found.p_value)
 
 
 @lru_cache(maxsize=1)
 def own_things(given: str) -> OwnThings:
-    """A recogniser of your own, made once in each process; see ``OwnThings``."""
+    """Create your own recogniser once per process; see ``OwnThings``."""
     return OwnThings(given)

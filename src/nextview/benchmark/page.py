@@ -1,4 +1,4 @@
-"""Pages of a benchmark and of an evaluation: formatted numbers and templates."""
+"""Format numbers and fill templates for the HTML pages of benchmarks and evaluations."""
 
 import base64
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ NONE = "\N{EN DASH}"
 
 
 class Number(NamedTuple):
-    """A number with its interval and the published one; NaN where there is none."""
+    """A number with its interval and its published value; NaN if missing."""
 
     value: float
     low: float = np.nan
@@ -32,7 +32,7 @@ class Number(NamedTuple):
 
 
 def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
-    """A long table as a mapping; a threshold that is NaN becomes None."""
+    """Convert a long table to a mapping; NaN thresholds become None."""
     names = [
         [None if key != key else key for key in row]
         for row in frame[list(keys)].to_numpy(object).tolist()
@@ -44,22 +44,22 @@ def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
 
 
 def percent(share: float) -> str:
-    """A share as it is written."""
+    """Format a share."""
     return f"{100 * share:.1f}\u00a0%"
 
 
 def points(difference: float) -> str:
-    """A difference of shares as it is written, in percentage points."""
+    """Format a difference of shares in percentage points."""
     return f"{round(100 * difference, 1) + 0.0:+.1f}"
 
 
 def words(name: str) -> str:
-    """The name of a class or measure as it is written."""
+    """Format the name of a class or measure."""
     return name.replace("_", " ")
 
 
 def render(template: str, **given: Any) -> str:
-    """A whole page by a template of this package. All that is given is text and never markup."""
+    """Fill a template of this package. All arguments are escaped as text."""
     loader = PackageLoader("nextview.benchmark", "templates")
     pages = Environment(
         loader=loader,
@@ -88,7 +88,7 @@ def render(template: str, **given: Any) -> str:
 
 
 def picture(figure: Figure) -> str:
-    """A figure as a data URI."""
+    """Return a figure as a data URI."""
     return f"data:image/svg+xml;base64,{base64.b64encode(to_svg(figure).encode()).decode()}"
 
 
@@ -102,8 +102,8 @@ def write_figures(
 
     Args:
         folder: to write.
-        figures: by the names of their files.
-        tables: by the names of their files.
+        figures: by file name.
+        tables: by file name.
         overwrite: whether to replace existing files.
     """
     with new_folder(folder, overwrite) as part:
@@ -128,14 +128,14 @@ def write_figures(
 
 
 def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the predictions, models and objects that a page is about.
+    """Return the predictions, models and objects behind a page.
 
     Args:
         p: the predictions.
         settings: of the benchmark or the evaluation.
 
     Returns:
-        Texts by their headings.
+        Texts by heading.
     """
     splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
     conflicting = [

@@ -1,4 +1,4 @@
-"""Published numbers of "Multi-View 3D Object Recognition: Selecting the Best Sequences"."""
+"""Published results of "Multi-View 3D Object Recognition: Selecting the Best Sequences"."""
 
 import csv
 from functools import cache
@@ -14,10 +14,10 @@ PUBLISHED_COLUMNS = {  # policies of tables 5, 8 to 11 under their published nam
     "random": "random",
     "furthest": "furthest",
     "unidirectional": "unidirectional",
-    "oracle-valley": "LEM10",  # the thesis takes peak or valley by the true class
+    "oracle-valley": "LEM10",  # the thesis chooses peak or valley by the true class
     f"{LCM}-peak": "LCM10",
 }
-FIVE_VIEWS = {  # fixed views of tables 3 and 12, both of a network for 40 classes
+FIVE_VIEWS = {  # fixed views of tables 3 and 12, for a network with 40 classes
     "low-entropy-5": "low_entropy",
     "high-entropy-5": "high_entropy",
     "best-5": "best",
@@ -35,7 +35,7 @@ TRAVEL = {
 
 @cache
 def read_rows(name: str) -> list[dict[str, str]]:
-    """A table that ships with the package, as it is written: a row by the names of its columns."""
+    """Read a table that ships with the package, as one dictionary per row."""
     with (files("nextview.benchmark") / "published" / f"{name}.csv").open(
         encoding="utf-8"
     ) as file:
@@ -44,7 +44,7 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 @cache
 def read_table(name: str) -> dict[str, dict[str, float]]:
-    """The same with rows by their first column, then numbers by the name of the column."""
+    """Read a table of numbers by its first column and the names of the other columns."""
     rows = [list(row.items()) for row in read_rows(name)]
     return {
         first: {column: float(value) for column, value in rest}
@@ -53,13 +53,13 @@ def read_table(name: str) -> dict[str, dict[str, float]]:
 
 
 def published_classes(classes: tuple[str, ...]) -> int | None:
-    """10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; None for others."""
+    """Return 10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; else None."""
     n = len(classes)
     return n if n in ACCURACY and set(classes) == set(read_table(ACCURACY[n])) else None
 
 
 def comparable_classes(p: Predictions) -> tuple[str, ...]:
-    """Return the classes by which published numbers are found; none for scenes."""
+    """Return the classes for which there are published results; empty for scenes."""
     return () if any(map(clutter_level, p.names)) else p.classes
 
 
@@ -79,7 +79,7 @@ def published(
     classes: tuple[str, ...],
     label: str | None = None,
 ) -> float | None:
-    """Return the published value of a cell of our tables.
+    """Return the published value for a cell of our tables.
 
     Args:
         policy: name of the policy.
@@ -128,10 +128,10 @@ def published_recognisers(
 
     Args:
         classes: names of the classes.
-        views: number of views of the data set.
+        views: number of views in the dataset.
 
     Returns:
-        Network, batch size and accuracy from one view over objects, the best first.
+        Network, batch size and single-view accuracy over objects, the best first.
     """
     n = published_classes(classes)
     rows = [
@@ -153,7 +153,7 @@ def published_map(
     Args:
         name: of the map.
         measure: name of the score.
-        classes: on which it was trained and tested.
+        classes: of the training and test data.
         label: name of one class; None for all.
 
     Returns:

@@ -1,8 +1,8 @@
 """Replay: run policies through all episodes at once, from predictions instead of a camera.
 
 A policy does not know the threshold, so every policy is run once, to the last view, through the
-same loop as live use; ``truncate`` ends the episodes where a ``Stopping`` rule does. A path ends
-early only where the belief is exactly 1.
+same loop as live use; ``truncate`` then applies a ``Stopping`` rule. A path ends early only if the
+belief is exactly 1.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,23 +23,23 @@ from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.episode import Outcome, run_episodes
 from nextview.types import Float, Index, Mask
 
-THESIS_THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
-EPISODES_TOGETHER = 4096  # episodes of fixed views that are run at once
+THESIS_THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # of the thesis (section 5.3)
+EPISODES_TOGETHER = 4096  # episodes of fixed views per batch
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where E episodes went, up to K views, and what was believed after each.
+    """Paths of E episodes with up to K views, and the belief after each view.
 
     Attributes:
         views: in order, (E, K).
-        answers: class that is most likely after each view, (E, K).
+        answers: most likely class after each view, (E, K).
         confidences: belief in it, (E, K).
         travel: grid cells until each view, (E, K).
         arc: radians until each view, (E, K).
-        seen: views so far that showed anything.
-        fixed: whether all episodes take the same moves whatever is seen.
-        beliefs: in all classes, (E, K, classes), for rules that look at more than one.
+        seen: number of views so far with a visible object.
+        fixed: whether all episodes make the same moves whatever the evidence.
+        beliefs: in all classes, (E, K, classes), for rules that need more than the largest one.
     """
 
     views: Index
@@ -55,18 +55,18 @@ class Trajectories:
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     """Create episodes with every object, from random first views.
 
-    In scenes, first views are reachable. The number of an episode is run * objects + object.
+    In scenes, first views are reachable. The index of an episode is run * objects + object.
 
     Args:
         predictions: of the N objects.
         runs: first views of each object.
-        seed: of the draw.
+        seed: of the random first views.
 
     Returns:
         The episodes.
 
     Raises:
-        UsageError: there is no run.
+        UsageError: the number of runs is below 1.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
@@ -97,8 +97,8 @@ def replay(
         name: of the entry.
         specs: the episodes.
         max_views: views of each episode.
-        seed: of the entry's draws, together with its name.
-        beliefs: whether to keep complete beliefs, for a stopping rule of your own.
+        seed: of the entry's random numbers, together with its name.
+        beliefs: whether to keep complete beliefs, for a custom stopping rule.
 
     Returns:
         The paths of the episodes.
@@ -120,7 +120,7 @@ def replay(
             rng,
             beliefs,
         )
-    # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
+    # Fixed views need no random numbers and may be many, so they run in batches to limit memory.
     parts = []
     for start in range(0, len(views), EPISODES_TOGETHER):
         part = slice(start, start + EPISODES_TOGETHER)
@@ -225,19 +225,19 @@ def replay_policy(
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
-    """End episodes by a stopping rule, as in live use.
+    """Apply a stopping rule to episodes, as in live use.
 
-    No episode ends with confidence after a view in which nothing is seen.
+    No episode ends with confidence after a view without a visible object.
 
     Args:
         paths: of the episodes.
         stopping: the rule; None takes all views.
 
     Returns:
-        How the episodes end.
+        Outcomes of the episodes.
 
     Raises:
-        UsageError: a rule of your own needs complete beliefs.
+        UsageError: a custom rule needs complete beliefs.
     """
     e = np.arange(len(paths.views))
     count = (paths.views >= 0).sum(1)
@@ -277,19 +277,18 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
 
 @dataclass(frozen=True)
 class Grid:
-    """Every entry under every threshold from the same first views, and the results.
+    """Every entry under every threshold from the same first views, with the results.
 
     Attributes:
         specs: the episodes.
         runs: episodes of each object.
-        thresholds: of the belief, at which an episode stops.
-        max_views: at most so many views are taken.
+        thresholds: of the belief.
+        max_views: largest number of views.
         seed: of the first views and of the policies.
-        threshold_decay: by which the threshold falls from view to view; None: as it is by
-            default.
-        rule: that stops episodes instead of a threshold; None: a threshold does.
-        paths: of each entry, by its name.
-        failures: why an entry has no results, by its name.
+        threshold_decay: decrease of the threshold from view to view; None for the default.
+        rule: custom stopping rule; None for a threshold.
+        paths: of each entry, by name.
+        failures: why an entry has no results, by name.
     """
 
     specs: EpisodeSpecs
@@ -303,7 +302,7 @@ class Grid:
     failures: dict[str, str] = field(default_factory=dict)
 
     def stopping(self, threshold: float) -> Stopping:
-        """The rule of a threshold."""
+        """Return the stopping rule for a threshold."""
         if self.rule is not None:
             return own_stopping(self.rule, threshold, self.max_views)
         rule = Stopping.of(
@@ -318,14 +317,14 @@ class Grid:
         )
 
     def ends(self, name: str, threshold: float | None) -> Outcome:
-        """Return how the episodes of an entry end at a threshold.
+        """Return the outcomes of an entry at a threshold.
 
         Args:
             name: of the entry.
             threshold: of the belief; None takes all views.
 
         Returns:
-            How the episodes end.
+            Outcomes of the episodes.
         """
         return truncate(
             self.paths[name],
@@ -333,25 +332,25 @@ class Grid:
         )
 
     def cells(self) -> Iterator[tuple[str, float | None, Outcome]]:
-        """Every entry under every threshold; fixed views once, with threshold None."""
+        """Iterate over every entry under every threshold; fixed views once, with threshold None."""
         for name, paths in self.paths.items():
             for threshold in (None,) if paths.fixed else self.thresholds:
                 yield name, threshold, self.ends(name, threshold)
 
     def right(self, answer: Index) -> Mask:
-        """Which answers, (E,), name the true class, (runs, N)."""
+        """Return which answers, (E,), are the true class, (runs, N)."""
         return (answer == self.specs.labels).reshape(self.runs, -1)
 
 
 def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
-    """Run all entries; an entry that fails leaves its error message.
+    """Run all entries; the error message of a failed entry is recorded.
 
     Args:
         grid: receives paths and failures.
         names: of the entries.
 
     Yields:
-        Number of entries done.
+        Number of finished entries.
     """
     for n, name in enumerate(names, 1):
         try:

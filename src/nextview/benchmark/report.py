@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML page from a folder of benchmark results."""
+"""Write a self-contained HTML report from a folder of benchmark results."""
 
 import base64
 from collections import Counter
@@ -34,8 +34,8 @@ from nextview.recognition.map_names import LEM
 with extras():
     import pandas as pd
 
-REPORT_PICTURE = 112  # side of a view's picture, pixels
-# nothing, target, others, table
+REPORT_PICTURE = 112  # side of a view's image, pixels
+# colours of background, target, other objects and table
 OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
 
 
@@ -52,14 +52,14 @@ def report(
     Args:
         results: folder of nextview benchmark classes.
         out: page to write; by default RESULTS/report.html.
-        store: view store of the objects' pictures; by default that of the predictions, if it is
-            still in its place.
+        store: view store for images of the objects; by default that of the predictions, if it still
+            exists.
         figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
         overwrite: replace an earlier page and earlier figures.
 
     Raises:
-        ResultsError: there are no results, or fixed views only; or the page cannot be written.
-        DatasetError: the store that was given cannot be read.
+        ResultsError: there are no results, or only fixed views; or the page cannot be written.
+        DatasetError: the given store cannot be read.
     """
     path = out or results / "report.html"
     check_new(path, overwrite)
@@ -95,7 +95,7 @@ def report(
 
 
 def headline_policy(results: ClassResults, threshold: float) -> str:
-    """Return the most accurate policy that a robot could follow, other than the reference.
+    """Return the most accurate realisable policy other than the reference.
 
     Args:
         results: of the benchmark.
@@ -119,8 +119,8 @@ def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
 
     Args:
         results: of the benchmark.
-        store: of the objects' pictures; None for a page without pictures.
-        why_not: why there are no pictures.
+        store: with images of the objects; None for a page without images.
+        why_not: reason for missing images.
 
     Returns:
         HTML.
@@ -241,7 +241,7 @@ def _figures(results: ClassResults, best: str, at: float) -> dict[str, Figure]:
 def _thresholds(results: ClassResults, at: float) -> dict[str, float]:
     """Return policies by class at their published thresholds (tables 8 to 11).
 
-    For scenes nothing is published.
+    Empty for scenes, for which nothing is published.
     """
     if any(levels_of(results.predictions.names)):
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
@@ -291,7 +291,7 @@ def _failures(
     at: float,
     store: ViewStore | None,
 ) -> list[dict[Any, Any]]:
-    """The worst failures of a policy, each with its most confident episode."""
+    """Return the worst failures of a policy, each with its most confident episode."""
     p = results.predictions
     episodes = results.episodes(best, at)
     names = np.asarray(episodes["object"].astype(str))
@@ -320,17 +320,17 @@ def pictures_of(
     predictions: Predictions,
     store: Path | None = None,
 ) -> tuple[ViewStore | None, str]:
-    """Open the view store of the objects' pictures.
+    """Open the view store with images of the objects.
 
     Args:
         predictions: of the objects.
-        store: path of a store; None for the one that the predictions name.
+        store: path of a store; None for the one named in the predictions.
 
     Returns:
-        The store and "", or None and why there is none.
+        The store and "", or None and the reason why there is none.
 
     Raises:
-        ResultsError: the given store holds other objects or viewpoints.
+        ResultsError: the given store has other objects or viewpoints.
     """
     if store is not None:
         given = ViewStore.open(store)
@@ -342,7 +342,7 @@ def pictures_of(
             )
         return given, ""
     try:
-        # which tells whether it is the same store
+        # raises an error for another store
         stored_rows(predictions, "measures/depth_entropy")
     except EntryError as error:
         return None, f"No pictures: {error}; give their view store with --store."
@@ -350,7 +350,7 @@ def pictures_of(
 
 
 def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Return images of views as data URIs; in scenes the target has a colour of its own."""
+    """Return images of views as data URIs; in scenes the target is highlighted."""
     row = store.names.index(name)
     images: NDArray = store.image(row)
 

@@ -1,4 +1,4 @@
-"""A folder of results: tables as CSV, Markdown and LaTeX, figures, and how it was made."""
+"""Write a folder of results: tables as CSV, Markdown and LaTeX, figures, and settings."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,11 +25,11 @@ class Column:
     """A column of a table that compares policies.
 
     Attributes:
-        heading: above it.
-        measures: shown in a cell, with commas between.
-        views: after how many; 0 for whole episodes.
-        digits: after the point.
-        short: heading in the narrow tables; "" where it is not in them.
+        heading: of the column.
+        measures: in a cell, separated by commas.
+        views: number of views; 0 for whole episodes.
+        digits: after the decimal point.
+        short: heading in narrow tables; "" if it is not part of them.
     """
 
     heading: str
@@ -44,9 +44,9 @@ class Board:
     """A table that compares policies.
 
     Attributes:
-        title: above it.
+        title: of the table.
         name: of the set of objects.
-        columns: after the one that names the policies.
+        columns: after the column of policy names.
         about: a line below the title.
     """
 
@@ -56,24 +56,24 @@ class Board:
     about: str = ""
 
     def narrow(self) -> list[Column]:
-        """The columns of the narrow tables."""
+        """Return the columns of the narrow tables."""
         return [column for column in self.columns if column.short]
 
 
 @dataclass(frozen=True)
 class ComparedTables(Tables):
-    """Tables of a benchmark that says itself how they are shown.
+    """Tables of a benchmark with their layout.
 
     Attributes:
         boards: the tables that compare policies.
-        chosen: how the reference was chosen, in a sentence; "" where it was named.
+        chosen: a sentence on how the reference was selected; "" if it was named.
     """
 
     boards: tuple[Board, ...]
     chosen: str
 
     def sentences(self) -> list[str]:
-        """What follows: how the reference was chosen, and where nothing can be told."""
+        """Return the conclusions: the selection of the reference, and sets that are too small."""
         few = [f"{name}: {sentence}" for name, sentence in too_few(self.tests).items()]
         return [*filter(None, [self.chosen]), *few]
 
@@ -86,14 +86,14 @@ def write_results(
     overwrite: bool = True,
     withdraw: bool = False,
 ) -> None:
-    """Write tables and how they were made into a folder.
+    """Write tables and settings to a folder.
 
     Args:
         out: the folder.
-        tables: what was found.
-        made: how, as JSON can hold it.
-        more: writes whatever else belongs there.
-        overwrite: whether earlier results are replaced.
+        tables: the results.
+        made: settings, as JSON-compatible values.
+        more: writes further files.
+        overwrite: whether to replace earlier results.
         withdraw: see ``files.new_folder``.
     """
     with new_folder(out, overwrite, last=RECORD, withdraw=withdraw) as part:
@@ -109,13 +109,13 @@ def board_rows(
     columns: Sequence[Column],
     marked: Iterable[tuple[str, str, int]] = (),
 ) -> Iterator[list[str]]:
-    """The rows of a board as text: the policy, then a cell for each column.
+    """Iterate over the rows of a board as text: the policy, then a cell for each column.
 
     Args:
         tables: of the benchmark.
-        board: which policies are compared on.
-        columns: those that are shown.
-        marked: policy, measure and views of the numbers that get a star.
+        board: the table.
+        columns: of the table.
+        marked: policy, measure and views of the numbers marked with a star.
 
     Yields:
         The cells of a policy.
@@ -136,7 +136,7 @@ def board_rows(
 
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """A table as Markdown.
+    """Format a table as Markdown.
 
     Args:
         head: headings.
@@ -149,7 +149,7 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
 
 
 def compared_markdown(tables: ComparedTables) -> str:
-    """The boards as Markdown, then all tests."""
+    """Format the boards, followed by all tests, as Markdown."""
     parts = []
     for board in tables.boards:
         head = ["policy", *(column.heading for column in board.columns)]
@@ -163,7 +163,7 @@ def compared_markdown(tables: ComparedTables) -> str:
 
 
 def _tests(tables: Tables) -> str:
-    """All tests as Markdown."""
+    """Format all tests as Markdown."""
     head = ["set", "policy", "measure", f"difference to {tables.reference}"]
     rows = []
     row: Any  # a named tuple
@@ -184,14 +184,14 @@ def write_compared(
     measure: str,
     what: str,
 ) -> None:
-    """Write tables and figures into a folder, in the place of earlier ones.
+    """Write tables and figures to a folder, replacing earlier ones.
 
     Args:
         out: the folder.
-        tables: what was found.
-        made: how, as JSON can hold it.
-        measure: the share that is drawn, after numbers of views.
-        what: the same in words.
+        tables: the results.
+        made: settings, as JSON-compatible values.
+        measure: the share shown in the figures, after numbers of views.
+        what: description of that share.
     """
 
     def more(part: Path) -> None:
@@ -208,7 +208,7 @@ def write_compared(
 
 
 def latex(tables: ComparedTables) -> str:
-    """The narrow columns of the boards as LaTeX tables; they need the package booktabs."""
+    """Format the narrow boards as LaTeX tables, which need the package booktabs."""
     parts = []
     for board in tables.boards:
         columns = board.narrow()

@@ -1,6 +1,6 @@
-"""Error bars and tests.
+"""Confidence intervals and significance tests.
 
-What is drawn anew is the object: the views and runs of one object are not independent.
+Objects are resampled, because the views and runs of one object are not independent.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -11,9 +11,9 @@ from nextview.data import metrics
 from nextview.simulation.scene_layout import clutter_level
 from nextview.types import Float, Index
 
-NO_SPREAD = 1e-9  # differences that are smaller are those of rounding
-EXACT_FAMILIES = 16  # of which all choices of signs are counted
-RANDOM_FLIPS = 99_999  # choices of signs that are drawn where there are more
+NO_SPREAD = 1e-9  # smaller differences are rounding errors
+EXACT_FAMILIES = 16  # largest number of families for an exact test
+RANDOM_FLIPS = 99_999  # random sign flips for more families
 FLIPS_AT_ONCE = 4096
 FLIP_SEED = 0
 
@@ -27,7 +27,7 @@ def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
         rng: source of all random numbers.
 
     Returns:
-        How often each object is drawn in each sample, (samples, n) float64; each row sums to n.
+        Number of draws of each object in each sample, (samples, n) float64; each row sums to n.
     """
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
 
@@ -37,21 +37,21 @@ def resample_families(
     samples: int,
     rng: np.random.Generator,
 ) -> Float:
-    """Draw bootstrap weights of objects whose families are drawn together.
+    """Draw bootstrap weights of objects whose families are resampled as a whole.
 
     Args:
-        families: number of each object's family, (N,) int64.
+        families: family index of each object, (N,) int64.
         samples: number of samples.
         rng: source of all random numbers.
 
     Returns:
-        How often each object is drawn in each sample, (samples, N) float64.
+        Number of draws of each object in each sample, (samples, N) float64.
     """
     return resample(int(families.max()) + 1, samples, rng)[:, families]
 
 
 def target_families(names: Sequence[str]) -> Index:
-    """Number the families of objects: scenes around one target are one, (N,) int64.
+    """Number the families of objects, where scenes around one target are one family, (N,) int64.
 
     Args:
         names: of the N objects.
@@ -64,11 +64,11 @@ def target_families(names: Sequence[str]) -> Index:
 
 
 def by_family(values: Float, families: Index) -> Float:
-    """Sum values of objects, (N, M), in each family, (F, M).
+    """Sum values of objects, (N, M), over each family, (F, M).
 
     Args:
         values: of the objects.
-        families: number of each object's family, (N,) int64.
+        families: family index of each object, (N,) int64.
     """
     sums = np.zeros((int(families.max()) + 1, values.shape[1]))
     np.add.at(sums, families, values)
@@ -76,7 +76,7 @@ def by_family(values: Float, families: Index) -> Float:
 
 
 def interval(samples: Float) -> tuple[Float, Float]:
-    """95 % percentile interval of bootstrap samples (S, M): its ends, each (M,)."""
+    """Return the 95 % percentile interval of bootstrap samples, (S, M): its limits, each (M,)."""
     empty = np.isnan(samples).all(0)
     low, high = np.nanquantile(np.where(empty, 0, samples), [0.025, 0.975], axis=0)
     return np.where(empty, np.nan, low), np.where(empty, np.nan, high)
@@ -111,15 +111,15 @@ def estimate(
 
 
 def sign_flip_p(differences: Float) -> Float:
-    """Return two-sided p-values of "no difference" between two policies.
+    """Return two-sided p-values of the hypothesis that two policies do not differ.
 
-    If there were none, the difference in each family could as well be the opposite one. p is the
-    share of all choices of signs that make the sum as large: exact where few families differ, else
-    of signs that are drawn.
+    Under this hypothesis the sign of the difference in each family is random. p is the share of all
+    sign flips whose sum is at least as large: exact for few families with a difference, else
+    estimated from random flips.
 
     Args:
-        differences: of two policies in each family, (F, M): what is drawn together, such as an
-            object with all its runs.
+        differences: of two policies in each family, (F, M), where a family is a unit of resampling,
+            such as an object with all its runs.
 
     Returns:
         p-values, (M,).
@@ -140,32 +140,32 @@ def _sums(differences: Float) -> Callable[[Float], Float]:
 
 
 def exchange_p(families: int, difference: Callable[[Float], Float]) -> Float:
-    """Return p-values of "no difference" by exchanging two policies in some of the families.
+    """Return p-values of the hypothesis that two policies do not differ, by exchanging them.
 
     Args:
         families: number F of families.
-        difference: of the two policies, (S, M), for signs of the families, (S, F) float64: where
-            a sign is -1, the policies are exchanged.
+        difference: of the two policies, (S, M), for signs of the families, (S, F) float64; a sign
+            of -1 exchanges the policies.
 
     Returns:
-        p-values, (M,): the share of differences at least as far from 0 as the true one; NaN where
-        that is not known.
+        p-values, (M,): the share of differences at least as far from 0 as the observed one; NaN if
+        that one is not known.
     """
     observed = np.abs(difference(np.ones((1, families)))[0])
     count = np.zeros(len(observed))
     total = 0
     for signs in _flips(families):
-        # One that is not known counts against the policy.
+        # Undefined differences count as extreme.
         count += (~(np.abs(difference(signs)) < observed - NO_SPREAD)).sum(0)
         total += len(signs)
-    if families > EXACT_FAMILIES:  # the true one is one of those that could be drawn
+    if families > EXACT_FAMILIES:  # the observed signs are one of the possible draws
         count += 1
         total += 1
     return np.where(np.isnan(observed), np.nan, count / total)
 
 
 def _flips(families: int) -> Iterator[Float]:
-    """All choices of signs for few families, else some that are drawn, (S, F) each."""
+    """Iterate over all sign flips of few families, else over random ones, (S, F) each."""
     if families <= EXACT_FAMILIES:
         codes = np.arange(2**families)[:, None]
         bits = (codes >> np.arange(families) & 1).astype(np.float64)
@@ -182,7 +182,7 @@ def _flips(families: int) -> Iterator[Float]:
 
 
 def holm(p: Float) -> Float:
-    """Holm's correction of p-values (M,); those that are NaN are no tests and stay NaN."""
+    """Apply Holm's correction to p-values, (M,); NaN entries are not tests and stay NaN."""
     adjusted = np.full(len(p), np.nan)
     tested = np.flatnonzero(~np.isnan(p))
     order = tested[np.argsort(p[tested])]

@@ -1,9 +1,9 @@
-"""Tables with several things each: what is found and named by frames that policies choose.
+"""Run policies on tables with several objects, and count recognised ones.
 
-On each simulated table stand 6 to 10 things in resting poses, 0 to 10 cm apart, one of them a
-stranger of the size of such things. A camera 0.6 m from the middle of the table looks through the
-wrist sensor, with errors of its poses and of the vertical. The first view is drawn, and is the same
-for all policies. Workers import this module, and so neither pandas nor matplotlib.
+Each simulated table has 6 to 10 objects in resting poses, 0 to 10 cm apart; one of them is a
+stranger of similar size. A camera with the wrist sensor, 0.6 m from the centre of the table, has
+errors of its poses and of the vertical. The first view is random and the same for all policies.
+Workers import this module, so it imports neither pandas nor matplotlib.
 """
 
 import time
@@ -34,12 +34,12 @@ from nextview.types import Float, Index
 
 TablePolicy = Literal["target", "random", "fixed"]
 TABLE_POLICIES: tuple[TablePolicy, ...] = ("target", "random", "fixed")
-"""Where the next view is: ``Scene.target``; any candidate view; a quarter of a circle on, at the
-same elevation."""
+"""Next views: ``Scene.target``; a random candidate view; the view a quarter turn ahead, at the same
+elevation."""
 FEWEST_THINGS = 6
 MOST_THINGS = 10
-MOST_DRAWN = 20  # draws of one table, until all things fit on it
-CAMERA_FROM_TABLE = 0.6  # metres between the camera and the middle of the table
+MOST_DRAWN = 20  # attempts to draw a table on which all objects fit
+CAMERA_FROM_TABLE = 0.6  # metres from the centre of the table
 VIEW_ELEVATIONS = (30.0, 60.0)  # degrees
 TABLE_CENTRE = np.array([0, 0, 0.03])  # metres
 STRANGER_RADII = (0.04, 0.10)  # metres
@@ -49,11 +49,12 @@ CLOSE_POSE = 0.1  # of the diameter
 
 
 class TableRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one policy made of one table.
+    """Results of one policy on one table.
 
     Attributes:
-        counts: by name, after each number of frames that is compared, see ``Looking.count``.
-        done: after how many frames the scene was done, one more than were taken where it was not.
+        counts: by name, after each compared number of frames, see ``Looking.count``.
+        done: number of frames after which the scene was done; one more than were taken if it was
+            not.
     """
 
     counts: list[dict[str, float]]
@@ -61,7 +62,7 @@ class TableRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TableRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What all policies made of one table.
+    """Results of all policies on one table.
 
     Attributes:
         table: its number.
@@ -77,16 +78,16 @@ class TableSettings:
     """Tables, policies and statistics.
 
     Attributes:
-        models: name or folder of the memory that knows the scans.
+        models: name or folder of the memory that was taught the scans.
         network: card of a network of nextview train segmentation; by default the bundled one.
-        tables: how many tables.
-        views: numbers of frames after which the policies are compared; so many as the last are
-            taken.
-        policies: target goes where the scene says, random to any candidate view, and fixed a
-            quarter of a circle on. Only missing results are computed.
-        reference: policy that the others are compared with; it always takes part.
+        tables: number of tables.
+        views: numbers of frames after which the policies are compared; the last one is the number
+            of frames taken.
+        policies: target uses the next view of the scene, random any candidate view, and fixed moves
+            a quarter turn ahead. Only missing results are computed.
+        reference: policy with which the others are compared; it is always included.
         samples: number of bootstrap samples.
-        seed: seed of the tables, the first views and the errors of the camera.
+        seed: seed of the tables, the first views and the camera errors.
     """
 
     models: str = "ycb"
@@ -99,10 +100,10 @@ class TableSettings:
     seed: int = 0
 
     def check(self) -> None:
-        """See that it makes sense, before any work is done.
+        """Check the settings before any work is done.
 
         Raises:
-            UsageError: a number that there is none of.
+            UsageError: a number is invalid.
         """
         whole(self.tables, "the number of tables", 1)
         whole(self.samples, "the samples of the bootstrap", 100)
@@ -113,11 +114,11 @@ class TableSettings:
 
 @dataclass(frozen=True)
 class TableJob(Job):
-    """One table, and the policies that look at it.
+    """One table, and the policies to run on it.
 
     Attributes:
         scans: folder of the scans of the things, metres.
-        strangers: folder of meshes of other things.
+        strangers: folder of meshes of other objects.
         table: number of the table.
     """
 
@@ -131,7 +132,7 @@ def opened_models(
     models: str,
     network: Path | None,
 ) -> tuple[System, Segmenter | None]:
-    """The system that knows the things, and what tells them apart; None for the bundled network.
+    """Load the system, and the segmentation; None for the bundled network.
 
     Args:
         models: name or folder of the memory.
@@ -143,7 +144,7 @@ def opened_models(
 
 @lru_cache(maxsize=2)
 def meshes_in(folder: Path) -> tuple[Path, ...]:
-    """The files in a folder and those below it, in their order.
+    """Return the mesh files in a folder and its subfolders, sorted.
 
     Raises:
         UsageError: there is none.
@@ -155,7 +156,7 @@ def meshes_in(folder: Path) -> tuple[Path, ...]:
 
 
 def work_at_table(job: TableJob) -> None:
-    """Look at a table as the policies of a job say, and write down what they found."""
+    """Run the policies of a job on its table, and write the results."""
     before = job.earlier(TableRuns)
     runs = {} if before is None else before.runs
     drawn = np.random.default_rng([job.settings.seed, job.table])
@@ -167,7 +168,7 @@ def work_at_table(job: TableJob) -> None:
 
 @lru_cache(maxsize=512)
 def mesh_of(path: Path, radius: float | None = None) -> Mesh:
-    """A scan in metres, or a mesh of no unit that gets a radius, metres."""
+    """Load a scan in metres, or a mesh without unit scaled to a radius, metres."""
     if radius is None:
         return replace(load_mesh(path, unit="m"), name=path.stem)
     return replace(
@@ -181,7 +182,7 @@ def mesh_of(path: Path, radius: float | None = None) -> Mesh:
 
 @lru_cache(maxsize=512)
 def rests_of(name: str, radius: float, path: Path) -> Float:
-    """Rotations of a mesh into its resting poses."""
+    """Return the rotations of a mesh to its resting poses."""
     mesh = mesh_of(path) if name != STRANGER else mesh_of(path, radius)
     return resting_poses(mesh)
 
@@ -191,12 +192,12 @@ def draw_table(
     strangers: Sequence[Path],
     rng: np.random.Generator,
 ) -> SimulatedTable:
-    """A table with 6 to 10 things, the last of them a stranger.
+    """Draw a table with 6 to 10 objects, the last of them a stranger.
 
-    What does not fit on the table is drawn again.
+    A table on which the objects do not fit is drawn again.
 
     Raises:
-        UsageError: MOST_DRAWN draws do not fit.
+        UsageError: MOST_DRAWN attempts failed.
     """
     for _ in range(MOST_DRAWN - 1):
         with suppress(UsageError):
@@ -225,14 +226,14 @@ def _draw(
 
 
 class Looking:
-    """A table under way: the frames so far, and what each of their pixels truly shows.
+    """A run on one table: the frames so far, with the true object of each pixel.
 
     Attributes:
-        scene: what is known of it.
-        camera: over it.
-        owners: thing of each pixel, -1 for none, (H, W) int64, by frame.
-        cameras: believed and true pose of the camera, (4, 4) each, metres, by frame.
-        seconds: of CPU for the last frame.
+        scene: estimated scene.
+        camera: over the table.
+        owners: true object of each pixel, -1 for none, (H, W) int64, by frame.
+        cameras: estimated and true pose of the camera, (4, 4) each, metres, by frame.
+        seconds: CPU time of the last frame.
     """
 
     def __init__(
@@ -241,12 +242,12 @@ class Looking:
         system: System,
         segmentation: Segmenter | None = None,
     ) -> None:
-        """Begin with no frame.
+        """Start without frames.
 
         Args:
             camera: over the table.
-            system: that knows the things.
-            segmentation: that tells them apart; None for the bundled network.
+            system: with the taught things.
+            segmentation: of the frames; None for the bundled network.
         """
         self.scene = Scene(system, segmentation=segmentation)
         self.camera = camera
@@ -268,27 +269,26 @@ class Looking:
             self.cameras.append((pose, self.camera.true_pose))
 
     def truth(self, thing: SceneObject) -> int:
-        """Which thing most pixels of an object show, -1 for none."""
+        """Return the true object of most pixels of a found object, -1 for none."""
         votes = np.zeros(len(self.camera.table.things) + 1, np.int64)
         for frame, mask in thing.pixels.items():
             votes += np.bincount(self.owners[frame][mask] + 1, minlength=len(votes))
         return int(votes.argmax()) - 1
 
     def count(self) -> dict[str, float]:
-        """What was found by now.
+        """Count the results so far.
 
         Returns:
-            How many there are of: "things", taught ones on the table; "named", objects with a name;
-            "right", things that are named right; "sure" and "sure_right", the same of confident
-            names; "close" and "close_in_camera", those named right whose ADD-S is small in the
-            world, and in the frame of the last camera that saw them; "strangers", found ones, and
-            "unknown", those of them that are called unknown. And "seconds" of CPU for the last
-            frame.
+            The numbers of: "things", taught ones on the table; "named", found objects with a name;
+            "right", correctly named things; "sure" and "sure_right", the same for confident names;
+            "close" and "close_in_camera", correctly named things with a small ADD-S in the world,
+            and in the frame of the last camera that saw them; "strangers", found strangers, and
+            "unknown", strangers called unknown. And "seconds", the CPU time of the last frame.
         """
         things = self.camera.table.things
         counts = Counter[str]()
         right: dict[int, SceneObject] = {}
-        of_stranger: set[bool] = set()  # whether it has a name
+        of_stranger: set[bool] = set()  # whether the stranger has a name
         for found in self.scene.objects:
             number = self.truth(found)
             name = things[number].name if number >= 0 else ""
@@ -313,7 +313,7 @@ class Looking:
         return {name: float(value) for name, value in {**counts, **of_all}.items()}
 
     def _add_s(self, number: int, found: SceneObject, in_camera: bool) -> float:
-        """Mean distance of the true surface's points from the found one, diameters."""
+        """Return the mean distance of the true surface to the estimated one (ADD-S), diameters."""
         thing = self.camera.table.things[number]
         points = thing.vertices[:: max(1, len(thing.vertices) // ADD_S_POINTS)]
         pose = found.pose
@@ -335,11 +335,11 @@ class Looking:
 
 
 def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun:
-    """Look at a table as one policy says.
+    """Run one policy on a table.
 
     Args:
         job: seeds and views of all policies.
-        table: with the things.
+        table: with the objects.
         policy: one of TABLE_POLICIES.
     """
     how: TableSettings = job.settings
@@ -371,7 +371,7 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
 
 
 def _view(azimuth: float, elevation: float) -> Float:
-    """The pose of a camera that looks at the middle of the table, (4, 4), metres; radians."""
+    """Return a camera pose aimed at the centre of the table, (4, 4), metres; angles in radians."""
     return poses_around(
         np.array([azimuth]), elevation, CAMERA_FROM_TABLE, TABLE_CENTRE
     )[0]

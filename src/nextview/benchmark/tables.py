@@ -1,4 +1,4 @@
-"""The benchmark of tables with several things: from scans to a folder of tables, resumable."""
+"""The benchmark of tables with several things: from scans to a folder of results, resumable."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -30,7 +30,7 @@ from nextview.errors import UsageError
 from nextview.files import command, only_one
 from nextview.things.memory import open_memory
 
-# by measure: what is counted, of what, and the heading in narrow tables
+# by measure: numerator, denominator, and heading in narrow tables
 SHARES = {
     "recall": ("right", "things", "recall"),
     "precision": ("right", "named", "precision"),
@@ -52,23 +52,24 @@ def benchmark_tables(
 ) -> ComparedTables:
     """Compare next-view policies on simulated tables with several things each.
 
-    On each table stand 6 to 10 things at true size in resting poses, one of them a stranger. The
-    tables say, after so many frames, which share of the things was found and named right (recall)
-    and which share of the names is right (precision; a name of the stranger or of a piece counts as
-    wrong); the same for confident names; how many poses of the right ones are good (ADD-S below a
-    tenth of the diameter), in the world and in the frame of the last camera; and how many strangers
-    are called unknown. An interrupted run resumes.
+    Each table has 6 to 10 objects at true size in resting poses; one of them is a stranger. The
+    results give, after each number of frames: the share of the things that was found and named
+    correctly (recall); the share of the names that is correct (precision; a name of the stranger or
+    of a fragment is wrong); the same for confident names; the share of correctly named things with
+    a good pose (ADD-S below a tenth of the diameter), in the world and in the frame of the last
+    camera; and the share of strangers called unknown. An interrupted run resumes.
 
     Args:
-        scans: folder of the scans of things that the memory knows, metres, by their names.
-        strangers: folder of meshes of other things.
+        scans: folder of the scans of things that the memory was taught, metres, with the same
+            names.
+        strangers: folder of meshes of other objects.
         out: folder of the results; an existing one is continued.
-        workers: number of processes; by default one for each core; 0 uses this process.
-        track: follows the work.
+        workers: number of processes; by default one per core; 0 uses this process.
+        track: callable that shows progress.
 
     Raises:
-        UsageError: settings that make no sense, or a folder without meshes.
-        ResultsError: OUT holds the results of other settings.
+        UsageError: settings are invalid, or a folder has no meshes.
+        ResultsError: OUT contains the results of other settings.
     """
     settings.check()
     scans, strangers, out = Path(scans), Path(strangers), Path(out)
@@ -113,11 +114,11 @@ def summarise_tables(
     policies: Sequence[str],
     settings: TableSettings,
 ) -> ComparedTables:
-    """Compare policies over all tables. One Holm correction is over all tests.
+    """Compare policies over all tables, with one Holm correction over all tests.
 
     Args:
         runs: of all tables.
-        policies: in the order of the tables.
+        policies: in the order of the results.
         settings: views, reference, samples and seed.
     """
     one = np.ones(len(runs))
@@ -158,14 +159,14 @@ def summarise_tables(
 
 
 def _is_compared(key: Key) -> bool:
-    """Whether a measure is compared with the reference's; the first view is the same."""
+    """Return True if a measure is compared with the reference; the first view is the same."""
     if key.measure == "recall":
         return key.views > 1
     return key.measure == "frames until done"
 
 
 def _columns(k: int) -> tuple[Column, ...]:
-    """What is shown of the policies after a number of frames."""
+    """Return the columns after a number of frames."""
     until = "frames until done"
     shares = [
         Column(name, (name,), k, short=short) for name, (_, _, short) in SHARES.items()

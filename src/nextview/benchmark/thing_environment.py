@@ -1,7 +1,7 @@
-"""The Gymnasium environment ``nextview/RecogniseThings-v0``: taught things of known geometry.
+"""The Gymnasium environment ``nextview/RecogniseThings-v0``: taught things with known geometry.
 
-An agent sees the joint belief over thing and pose: the leading hypotheses, and how much is believed
-of each. Importing ``nextview.benchmark.environments`` registers it.
+The observation is the joint belief over thing and pose, represented by the leading hypotheses.
+Importing ``nextview.benchmark.environments`` registers the environment.
 """
 
 from functools import lru_cache, partial
@@ -31,25 +31,24 @@ with extras():
     import gymnasium
 
 
-KEPT_EPISODES = 64  # whose views are kept in memory
-FAR_METRES = 10.0  # bound of the places of hypotheses
+KEPT_EPISODES = 64  # episodes whose views are kept in memory
+FAR_METRES = 10.0  # bound of the positions of hypotheses
 MOST_NATS = 20.0  # bound of the information of a view
-LEAST_PAID_BELIEF = 1e-12  # whose logarithm is paid for
+LEAST_PAID_BELIEF = 1e-12  # lower bound of the belief in logarithmic rewards
 
 
 class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
     """Recognise a taught thing, alone or half hidden, by few views through a sensor.
 
-    The observation is the joint belief over thing and pose. "belief" is that in each thing, (T,).
-    "hypotheses" is that in each of the leading hypotheses, (H,), 0 where there are fewer, the
-    likeliest first. "things" says whose they are, (H,), T for none, and "poses" where they are in
-    the frame of the last camera, (H, 3, 4), metres. "information" is what each action is expected
-    to tell of the thing, (V,), nats: what the policy discriminate goes by. "visited" are the
-    actions that lead to a view that was taken, (V,).
+    The observation is the joint belief over thing and pose. "belief" is the belief in each thing,
+    (T,). "hypotheses" is the belief in each of the leading hypotheses, (H,), the likeliest first,
+    padded with 0. "things" is the thing of each hypothesis, (H,), T for padding, and "poses" its
+    pose in the frame of the last camera, (H, 3, 4), metres. "information" is the expected
+    information of each action about the thing, (V,), nats, as used by the policy discriminate.
+    "visited" marks the actions that lead to a visited view, (V,).
 
-    An action is a ring, and how many azimuth steps ahead of the last view:
-    ``ring * azimuths + steps``. One that leads to a view that was taken goes to the nearest free
-    one.
+    An action is a ring and a number of azimuth steps ahead of the last view: ``ring * azimuths +
+    steps``. An action that leads to a visited view goes to the nearest free one.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
@@ -65,21 +64,21 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         unit: str = "m",
         **rules: Any,
     ) -> None:
-        """Open a memory, and find the scans of what it knows.
+        """Open a memory, and find the scans of its things.
 
         Args:
             scans: folder of the scans.
             models: name or folder of the memory.
-            sensor: what the views are taken with.
+            sensor: simulated depth camera.
             occlusion: "none", or boxes that leave "half" or, if "heavy", a third visible.
-            draws: how many episodes of each thing there are to be drawn from.
-            seed: of these, see ``thing_episodes.Setting``.
+            draws: number of episodes per thing.
+            seed: of the episodes, see ``thing_episodes.Setting``.
             unit: unit of length of the scan files.
             rules: objective, max_views, threshold and prices, see ``environments.Rules``.
 
         Raises:
             DatasetError: there is no scan of a thing.
-            UsageError: rules that make no sense.
+            UsageError: the rules are invalid.
         """
         self.rules = Rules(**rules)
         whole(self.rules.max_views, "the number of views", 2, len(EPISODE_SPHERE))
@@ -135,11 +134,11 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; its first view is not the agent's.
+        """Begin an episode; its first view is not chosen by the agent.
 
         Args:
-            seed: of what is drawn; None goes on.
-            options: "object", the number of a thing, and "draw"; drawn by default.
+            seed: of the random numbers; None to continue their sequence.
+            options: "object", the number of a thing, and "draw"; random by default.
         """
         super().reset(seed=seed)
         given = options or {}
@@ -164,7 +163,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         self,
         action: Any,
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Take a view; what is paid is the change of the objective, less the prices."""
+        """Take a view; the reward is the change of the objective minus the prices."""
         if self._episode is None or self._over:
             raise SessionError("no episode is under way; call reset")
         here = self._views[-1]
@@ -194,7 +193,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         )
 
     def _judged(self) -> float:
-        """The objective now."""
+        """Return the current objective."""
         assert self._episode is not None
         self._belief = self._episode.verified(self._views)[0].belief
         logs = np.log(np.maximum(self._belief, LEAST_PAID_BELIEF))[None]

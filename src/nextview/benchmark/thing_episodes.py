@@ -1,9 +1,9 @@
-"""Taught things that can be looked at from all viewpoints; what was computed once is kept.
+"""Episodes with taught things, with cached views and verifications.
 
-An episode is a thing at its true size on a table, alone or half hidden by boxes, before a sensor
-with errors of its own. Every view of it is sensed once, is looked at by the features once, and
-every set of views is verified once: exactly as ``Session`` would. All of it is kept in a folder of
-its own, so that another policy is replayed without sensing anything again.
+An episode is a thing at its true size on a table, alone or half hidden by boxes, in front of a
+sensor with its own errors. Every view is simulated once, its features are computed once, and every
+set of views is verified once, exactly as in ``Session``. All results are kept in a folder per
+episode, so that another policy can be replayed without simulating anything again.
 """
 
 import time
@@ -44,29 +44,30 @@ from nextview.types import Float
 Occlusion = Literal["none", "half", "heavy"]
 
 EPISODE_SPHERE = ViewSphere.named("40")
-NEAREST_SURFACE = 0.25  # metres between the camera and the surface, at least
-USUAL_DISTANCE = 0.45  # metres between the camera and the centre, at most
-RADII_AWAY = 5.0  # of the camera from the centre, between these
-# means over the viewpoints
+NEAREST_SURFACE = 0.25  # metres, least distance between the camera and the surface
+USUAL_DISTANCE = 0.45  # metres, largest distance between the camera and the centre
+RADII_AWAY = (
+    5.0  # distance of the camera from the centre, object radii, within these limits
+)
+# ranges of the visible share, averaged over the viewpoints
 VISIBLE_SHARES = {"half": (0.45, 0.65), "heavy": (0.25, 0.45)}
 FEWEST_BOXES = 3  # around a thing that is partly hidden
 MOST_BOXES = 40
-BOX_LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken
-SHARE_SIDE = 24  # rows and columns of the pictures by which a share is measured
-SHARE_EVERY = 3  # every so many viewpoints
-POSE_ERROR_POINTS = 500  # by which the error of a pose is measured
+BOX_LAYOUTS_TRIED = 60  # layouts of boxes, after which the closest one is used
+SHARE_SIDE = 24  # rows and columns of the images that measure a visible share
+SHARE_EVERY = 3  # step between the viewpoints that measure it
+POSE_ERROR_POINTS = 500  # sampled points of a surface for the pose error
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How things are shown.
+    """Conditions of the episodes.
 
     Attributes:
         sensor: NAME or NAME:STRENGTH of the sensor.
         occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave about half
-            and a third of them visible, in the mean over the viewpoints.
-        seed: decides how each thing is turned and what stands around it, the first view, and the
-            sensor's errors.
+            and a third of them visible, averaged over the viewpoints.
+        seed: of the rotation and surroundings of each thing, the first view, and the sensor errors.
     """
 
     sensor: str = "wrist"
@@ -75,7 +76,7 @@ class Setting:
 
 
 class ThingEpisode:
-    """A thing that can be looked at from all viewpoints."""
+    """A thing that can be observed from all viewpoints."""
 
     def __init__(
         self,
@@ -86,17 +87,17 @@ class ThingEpisode:
         setting: Setting,
         folder: Path | None = None,
     ) -> None:
-        """Place the thing, or go on with what was kept of it.
+        """Set up the scene, or continue with cached results.
 
         Args:
-            things: that may be believed: a memory of them, or a recogniser of your own.
-            mesh: the mesh of the thing, of known unit, which is asked for when a view has to be
-                sensed.
-            thing: its number among them.
+            things: the hypotheses: a memory of taught things, or your own recogniser.
+            mesh: returns the mesh of the thing, with a known unit; called only if a view must be
+                simulated.
+            thing: its number among the things.
             draw: number of the draw.
-            setting: how it is shown.
-            folder: where all is kept; None for nowhere. What a recogniser of your own says is not
-                kept: it may be another the next time.
+            setting: conditions of the episode.
+            folder: of the cache; None for no cache. Results of your own recogniser are not cached,
+                as it may change.
         """
         self.things = things
         self.thing = thing
@@ -114,12 +115,12 @@ class ThingEpisode:
         self.start = int(self._kept["start"])
 
     def save(self) -> None:
-        """Write down what is new."""
+        """Write new results to the cache."""
         self._kept.save()
 
     @property
     def stage(self) -> "_Stage":
-        """The thing as it stands before the camera."""
+        """Simulated scene with the thing."""
         if self._stage is None:
             self._stage = _Stage.of(
                 self._mesh(),
@@ -130,7 +131,7 @@ class ThingEpisode:
         return self._stage
 
     def _first_view(self) -> int:
-        """A view that shows the thing."""
+        """Return a view in which the thing is visible."""
         rng = np.random.default_rng((*self._seed, 3))
         for view in rng.permutation(len(EPISODE_SPHERE)):
             if self.observation(int(view)).seen:
@@ -138,7 +139,7 @@ class ThingEpisode:
         raise UsageError(f"{self.things.names[self.thing]}: shows from no viewpoint")
 
     def observation(self, view: int) -> Observation:
-        """What one viewpoint shows: the same whoever asks for it, its noise belongs to it."""
+        """Return the observation from a viewpoint. Its noise depends only on the viewpoint."""
         if view not in self._views:
             if f"{view}.depth" not in self._kept:
                 self._sense(view)
@@ -146,7 +147,7 @@ class ThingEpisode:
         return self._views[view]
 
     def _sense(self, view: int) -> None:
-        """Look from one viewpoint."""
+        """Simulate one view."""
         camera = self.stage.camera(view)
         observation = camera.observe(EPISODE_SPHERE.poses[view])
         for name, values in _arrays_of(observation).items():
@@ -157,18 +158,18 @@ class ThingEpisode:
         self._kept[f"{view}.in_camera"] = in_camera
 
     def seen(self, views: Sequence[int]) -> list[int]:
-        """Those of some views that show the thing."""
+        """Return the views in which the thing is visible."""
         return [view for view in views if self.observation(view).seen]
 
     def verified(self, views: Sequence[int]) -> tuple[Verified | OwnAnswer, float]:
-        """What is found in some views, and the seconds of CPU that it took."""
+        """Return the verification of some views, and its CPU time in seconds."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
             name = "-".join(map(str, sorted(used)))
             own = isinstance(self.things, OwnThings)
             answer: Any = OwnAnswer if own else Verified
             needed = {f.name: f"{name}.{f.name}" for f in fields(answer)}
-            # What an earlier version kept lacks parts, and was judged in another way.
+            # The cache of an earlier version is incomplete and outdated.
             if not all(
                 one in self._answers for one in (*needed.values(), f"{name}.seconds")
             ):
@@ -189,26 +190,29 @@ class ThingEpisode:
             self._answers[f"{name}.{part}"] = values
 
     def named_right(self, views: Sequence[int]) -> bool:
-        """Whether the thing is named right after some views."""
+        """Return True if the thing is named correctly after some views."""
         return int(self.verified(views)[0].belief.argmax()) == self.thing
 
     def belief_in_truth(self, views: Sequence[int]) -> float:
-        """Belief in the true thing after some views."""
+        """Return the belief in the true thing after some views."""
         return float(self.verified(views)[0].belief[self.thing])
 
     def p_value(self, views: Sequence[int]) -> float | None:
-        """Share of known things that are explained as badly, see ``TaughtThings.p_value``."""
+        """Return the share of known things that are explained as badly.
+
+        See ``TaughtThings.p_value``.
+        """
         observations = [self.observation(view) for view in sorted(self.seen(views))]
-        things: Any = self.things  # which judged them
+        things: Any = self.things
         found: float | None = things.p_value(observations, self.verified(views)[0])
         return found
 
     def pose_error(self, views: Sequence[int]) -> float | None:
-        """How far the surface is from where it is found (ADD-S), millimetres, in the last view.
+        """Return the pose error (ADD-S) in the last view, millimetres.
 
         Returns:
-            The mean distance of its points to the nearest of the true surface; None where the thing
-            is not named right.
+            The mean distance of surface points in the estimated pose to the nearest points of the
+            true surface; None if the thing is not named correctly.
         """
         found, _ = self.verified(views)
         rows = np.flatnonzero(found.things == self.thing)
@@ -235,17 +239,17 @@ class ThingEpisode:
 
     @cached_property
     def _surface(self) -> Surface:
-        """The surface of the thing, as it was taught; without a memory, that of its file."""
+        """Return the surface of the thing in the memory; without a memory, that of its file."""
         if isinstance(self.things, TaughtThings):
             return self.things.verifier.caster.surfaces[self.thing]
         return Surface.from_mesh(self._mesh(), self.things.names[self.thing])
 
     def state(self, views: Sequence[int], needs: Sequence[str]) -> EpisodeState:
-        """Where the episode stands, as a policy sees it.
+        """Return the state of the episode for a policy.
 
         Args:
-            views: that were taken, in order.
-            needs: what the policy asks for: "joint", "observations" and "outlook" are there.
+            views: in order.
+            needs: inputs of the policy: "joint", "observations" and "outlook" are available.
         """
         seen = self.seen(views)
         recogniser = self.things.recogniser
@@ -273,7 +277,7 @@ class ThingEpisode:
         )
 
     def outlook(self, views: Sequence[int]) -> Outlook:
-        """What is known when the next view is to be chosen."""
+        """Return the prediction of further views for the choice of the next view."""
         observations = [self.observation(view) for view in self.seen(views)]
         found, _ = self.verified(views)
         assert isinstance(self.things, TaughtThings)  # see ``policies_of``
@@ -283,14 +287,14 @@ class ThingEpisode:
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """A thing on its table, as it is sensed.
+    """Simulated scene with a thing on its table.
 
     Attributes:
-        standing: its mesh, turned.
+        standing: its mesh, rotated.
         around: the boxes around it; None for none.
-        sensor: what it is seen with.
-        seed: of the sensor's errors.
-        in_truth: from the file's frame into the true object frame, (4, 4), metres.
+        sensor: the simulated sensor.
+        seed: of the sensor errors.
+        in_truth: from the frame of the file to the true object frame, (4, 4), metres.
     """
 
     standing: Mesh
@@ -307,13 +311,13 @@ class _Stage:
         seed: tuple[int, ...],
         kept: "KeptArrays",
     ) -> "_Stage":
-        """Turn a thing, draw its sensor and what stands around it.
+        """Rotate a thing, and draw its sensor and its surroundings.
 
         Args:
-            mesh: the thing, of known unit, so that its lengths are metres.
+            mesh: the thing, with a known unit, so that its lengths are metres.
             setting: sensor, distance and occlusion.
-            seed: of all draws of the episode.
-            kept: where the boxes are kept: they are searched for.
+            seed: of all random numbers of the episode.
+            kept: cache of the boxes, which are slow to find.
         """
         rng = np.random.default_rng(seed)
         turn = rotation_z(rng.uniform(0, 2 * np.pi))
@@ -339,7 +343,7 @@ class _Stage:
         return cls(standing, around, sensor, (*seed, 7), in_truth)
 
     def camera(self, view: int) -> SensedCamera:
-        """The camera, with the errors of the episode's setup and the noise of one view."""
+        """Return the camera, with the setup errors of the episode and the noise of one view."""
         rng = np.random.default_rng(self.seed)
         camera = SensedCamera(self.standing, self.sensor, rng, around=self.around)
         rng.spawn(view)
@@ -351,15 +355,15 @@ def hiding_boxes(
     wanted: tuple[float, float],
     seed: tuple[int, ...],
 ) -> Mesh:
-    """Boxes around a thing that leave a wanted share of it visible.
+    """Place boxes around a thing so that a given share of it stays visible.
 
     Args:
         standing: the thing.
-        wanted: least and largest share of its pixels that show, in the mean over the viewpoints.
-        seed: decides the boxes.
+        wanted: least and largest visible share of its pixels, averaged over the viewpoints.
+        seed: of the boxes.
 
     Returns:
-        The first layout in this range, or else the one that comes nearest to it.
+        The first layout in this range, or else the closest one.
     """
     rng = np.random.default_rng(seed)
     poses = EPISODE_SPHERE.poses[::SHARE_EVERY]
@@ -389,7 +393,7 @@ def hiding_boxes(
 
 
 def _arrays_of(observation: Observation) -> dict[str, NDArray[Any]]:
-    """An observation as arrays; "scene" holds nothing where it has none."""
+    """Return an observation as arrays; "scene" is empty if there is none."""
     scene = observation.scene
     radius = np.nan if observation.radius is None else observation.radius
     numbers = [
@@ -406,7 +410,7 @@ def _arrays_of(observation: Observation) -> dict[str, NDArray[Any]]:
 
 
 def _observation(kept: "KeptArrays", view: int) -> Observation:
-    """The observation that some arrays hold."""
+    """Restore an observation from arrays."""
     numbers = kept[f"{view}.numbers"]
     scene = None
     if f"{view}.scene" in kept:
@@ -430,16 +434,16 @@ def _observation(kept: "KeptArrays", view: int) -> Observation:
 
 
 class KeptArrays:
-    """Arrays by name that are kept in a folder: a file for each time that new ones were written.
+    """Named arrays in a folder, with one more file for each save.
 
-    The files have the layout of ``numpy.savez``. What is not asked for is not unpacked.
+    The files have the layout of ``numpy.savez``. Arrays are decompressed on demand.
     """
 
     def __init__(self, folder: Path | None) -> None:
-        """Look what is there.
+        """Index the existing files.
 
         Args:
-            folder: that need not be there yet; None to keep nothing.
+            folder: that may not exist yet; None to keep nothing on disk.
 
         Raises:
             ResultsError: a file is damaged.
@@ -459,11 +463,11 @@ class KeptArrays:
             self._packed |= dict.fromkeys(archive.files, (file, archive))
 
     def __contains__(self, name: str) -> bool:
-        """Whether there is an array of this name."""
+        """Return True if there is an array of this name."""
         return name in self._known or name in self._packed
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """The array of this name."""
+        """Return the array of this name."""
         if name not in self._known:
             file, archive = self._packed[name]
             with _unpacked(file):
@@ -471,14 +475,14 @@ class KeptArrays:
         return self._known[name]
 
     def __setitem__(self, name: str, values: NDArray[Any]) -> None:
-        """Keep an array."""
+        """Store an array."""
         self._known[name] = np.asanyarray(values)
         self._new.add(name)
 
     def save(self) -> None:
-        """Write what is new into one more file, whole or not at all.
+        """Write new arrays to one more file, completely or not at all.
 
-        Depth images are mostly empty, so that the fastest compression is nearly as good as any.
+        Depth images are mostly empty, so the fastest compression is almost as good as any.
         """
         if self._folder is None or not self._new:
             return
@@ -501,7 +505,7 @@ class KeptArrays:
 
 @contextmanager
 def _unpacked(file: Path) -> Iterator[None]:
-    """Say in one sentence that a file is damaged."""
+    """Turn errors of a damaged file into one sentence."""
     try:
         yield
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:

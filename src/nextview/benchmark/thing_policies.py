@@ -1,4 +1,4 @@
-"""Who takes part in the benchmark of things: policies, blind rules, and a ceiling."""
+"""Policies of the benchmark of things, including blind rules and an upper bound."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,26 +28,26 @@ THING_POLICIES = (
     "pose",
     "ceiling",
 )
-CEILINGS = ("ceiling",)  # it knows what no robot does
-# they ignore the images
+CEILINGS = ("ceiling",)  # upper bound with access to the ground truth
+# rules that ignore the images
 BLIND_RULES = ("random", "spread", "furthest", "fixed", "ring")
-BEST_BLIND = "best-blind"  # the one of them that is best on other episodes
-# they go by the hypotheses of a memory of taught things
+BEST_BLIND = "best-blind"  # the blind rule that is best on other episodes
+# policies that use the hypotheses of a memory of taught things
 OF_MEMORIES = ("picture", "geometry", "pose")
-# azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
+# azimuth steps of the fixed sequence, which reaches all 8 views of a ring
 TURN_AHEAD = 3
-# belief in the truth: where it is reached, a view that keeps it is good enough for the ceiling
+# belief in the truth from which the upper bound accepts any view that keeps it
 SETTLED_BELIEF = 0.97
 
 
 @dataclass(frozen=True)
 class RingSteps:
-    """Goes round the ring of the first view by equal steps, whatever is believed.
+    """Moves around the ring of the first view in equal steps, whatever the belief.
 
     Attributes:
         sphere: of the views.
         ahead: azimuth steps to the next view.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -55,11 +55,11 @@ class RingSteps:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """The free view that comes next, of each episode.
+        """Return the next free view of each episode.
 
         Args:
             state: of the episodes.
-            rng: draws among equals.
+            rng: for ties.
         """
         azimuths = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, azimuths)
@@ -72,27 +72,27 @@ class RingSteps:
 
 @dataclass(frozen=True, eq=False)
 class TruthCeiling:
-    """Goes where the truth comes out best, by the very views that are to come, noise included.
+    """Chooses the view with the best true outcome, simulated with its actual noise.
 
-    Every free view is judged: one after which the thing is named right comes before one after which
-    it is not, then the belief in the truth decides. No choice of one view names more things right,
-    so that nothing is above it after two views. It looks one view ahead: of several views there may
-    be a better sequence.
+    Every free view is evaluated: views after which the thing is named correctly come first, then
+    the belief in the truth decides. No choice of a single view names more things correctly, so this
+    is an upper bound after two views. It looks one view ahead; there may be better sequences of
+    several views.
 
     Attributes:
-        episode: whose views it knows.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        episode: with the true views.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     episode: ThingEpisode
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """The free view after which the truth is named and believed most.
+        """Return the free view with the best true outcome.
 
         Args:
             state: of the episodes.
-            rng: draws among equals.
+            rng: for ties.
         """
         views = np.flatnonzero(state.visited[0]).tolist()
         if state.step > 1 and self._worth(views) >= 1 + SETTLED_BELIEF:
@@ -105,7 +105,7 @@ class TruthCeiling:
         return best_view(EPISODE_SPHERE, state, values)
 
     def _worth(self, views: list[int]) -> float:
-        """Belief in the truth after some views; 1 more where it is the answer."""
+        """Return the belief in the truth after some views, plus 1 if it is the answer."""
         right = self.episode.named_right(views)
         return float(right) + self.episode.belief_in_truth(views)
 
@@ -114,17 +114,17 @@ def policies_of(
     names: tuple[str, ...],
     things: TaughtThings | OwnThings,
 ) -> dict[str, Callable[[ThingEpisode], Policy]]:
-    """Policies by name, each made for an episode.
+    """Return functions that create the named policies for an episode.
 
     Args:
-        names: of THING_POLICIES, or MODULE:CLASS for one of your own, which is made with the
+        names: of THING_POLICIES, or MODULE:CLASS for your own, which is created with the
             viewpoints.
-        things: the things, for the one that goes by remembered pictures.
+        things: the things, for the policy that uses stored images.
 
     Raises:
-        UsageError: there is no policy of one of these names, or it goes by the hypotheses of a
-            memory where there is none.
-        PolicyError: one cannot be made.
+        UsageError: there is no policy with one of these names, or it needs the hypotheses of a
+            memory and there is none.
+        PolicyError: a policy cannot be created.
     """
     geometry = DiscriminateGeometry(EPISODE_SPHERE)
     known: dict[str, Callable[[ThingEpisode], Policy]] = {
@@ -164,7 +164,7 @@ def _refuse_needs(
     needs: tuple[str, ...],
     things: TaughtThings | OwnThings,
 ) -> None:
-    """Say that a policy goes by the hypotheses of a memory, where there are none; UsageError."""
+    """Reject a policy that needs the hypotheses of a memory if there is none; UsageError."""
     lacking = sorted({"joint", "outlook"} & set(needs))
     if lacking and isinstance(things, OwnThings):
         raise UsageError(
@@ -174,5 +174,5 @@ def _refuse_needs(
 
 
 def _always(policy: Policy) -> Callable[[ThingEpisode], Policy]:
-    """The same policy for all episodes."""
+    """Use the same policy for all episodes."""
     return lambda _: policy

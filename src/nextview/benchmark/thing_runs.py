@@ -1,6 +1,6 @@
-"""What policies make of one episode of the benchmark of things, and the job that replays them.
+"""Run policies in one episode of the benchmark of things.
 
-Workers import this module, and so neither pandas nor matplotlib.
+Workers import this module, so it imports neither pandas nor matplotlib.
 """
 
 import time
@@ -38,22 +38,22 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 
-SCAN_APART = 0.2  # radii that a scan and what was taught of it may lie apart
+SCAN_APART = 0.2  # radii, largest distance between a scan and the taught surface
 
 
 class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one policy made of one episode.
+    """Results of one policy in one episode.
 
     Attributes:
-        views: that it took.
-        right: whether the thing is named right after each.
-        confidence: belief in the answer after each.
-        p_value: share of known things that are explained as badly after each; None where that was
+        views: in order.
+        right: whether the thing is named correctly after each view.
+        confidence: belief in the answer after each view.
+        p_value: share of known things that are explained as badly after each view; None if it was
             not fitted.
-        decision: seconds of CPU of each choice.
-        verification: seconds of CPU of each verification.
-        pose_error: mean distance of the surface (ADD-S), millimetres, after each; None where the
-            thing is not named right.
+        decision: CPU time of each choice, seconds.
+        verification: CPU time of each verification, seconds.
+        pose_error: mean distance of the surface (ADD-S), millimetres, after each view; None if the
+            thing is not named correctly.
     """
 
     views: list[int]
@@ -66,7 +66,7 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class EpisodeRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What all policies made of one episode: each one run, "random" several.
+    """Results of all policies in one episode: one run each, several for "random".
 
     Attributes:
         thing: its name.
@@ -85,16 +85,16 @@ def run(
     count: int,
     rng: np.random.Generator,
 ) -> ThingRun:
-    """Take some views as a policy says.
+    """Take some views with a policy.
 
     Args:
         episode: the thing.
         policy: chooses all views but the first.
-        count: how many views.
-        rng: for policies that draw.
+        count: number of views.
+        rng: for random policies.
 
     Returns:
-        What was believed after each.
+        The results after each view.
     """
     views = [episode.start]
     made: dict[str, list[Any]] = {
@@ -112,7 +112,7 @@ def run(
             return ThingRun(views=views, **made)
 
         begun = time.process_time()
-        # what is foreseen counts as its time
+        # the CPU time of a choice includes the prediction of views
         state = episode.state(views, policy.needs)
         view = int(policy.next_views(state, rng)[0])
         made["decision"].append(time.process_time() - begun)
@@ -122,7 +122,7 @@ def run(
 
 
 def policies_in(runs: Sequence[EpisodeRuns]) -> tuple[str, ...]:
-    """The policies that all episodes were replayed with: the package's own first."""
+    """Return the policies that were run in all episodes, those of the package first."""
     there = set.intersection(*(set(each.runs) for each in runs))
     own = sorted(there - set(THING_POLICIES))
     return (*(name for name in THING_POLICIES if name in there), *own)
@@ -133,27 +133,29 @@ class ThingSettings:
     """Conditions, policies and statistics.
 
     Attributes:
-        models: name or folder of the memory that knows the scans; by default they are taught first,
-            into OUT/memory.
-        sensor: simulated depth camera, NAME or NAME:STRENGTH, see nextview render --help.
+        models: name or folder of the memory that was taught the scans; by default they are taught
+            first, into OUT/memory.
+        sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md).
         occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave half and a
             third of them visible.
         draws: episodes per thing, each with another rotation and first view.
-        views: numbers of views after which the policies are compared; episodes have the largest.
-        policies: names, or MODULE:CLASS for your own; by default all that the recogniser
-            allows. Only missing results are computed; your own policies always run again.
-        reference: policy that the others are compared with; it always takes part. "best-blind" is
+        views: numbers of views after which the policies are compared; the largest is the length of
+            the episodes.
+        policies: names, or MODULE:CLASS for your own; by default all that the recogniser supports.
+            Only missing results are computed; your own policies always run again.
+        reference: policy with which the others are compared; it is always included. "best-blind" is
             the rule that ignores the images (random, spread, furthest, fixed or ring) and is best
             after the first view in other episodes of the same things.
         choose_seed: seed of these other episodes.
-        recogniser: MODULE:NAME of your own in the place of the memory; its classes are the things,
-            and nothing is taught. Policies that go by a memory's hypotheses do not take part.
+        recogniser: MODULE:NAME of your own recogniser, which replaces the memory; its classes are
+            the things, and nothing is taught. Policies that need the hypotheses of a memory are not
+            included.
         threshold: belief from which an answer counts as confident, unless the thing is explained
-            worse than nine in ten known ones: then a session goes on, too.
+            worse than nine in ten known ones; a session would continue in that case, too.
         repeats: runs of the policy random in each episode.
         unit: unit of length of the scan files.
-        families: things whose names are equal up to the first _, such as variants of one scan,
-            count as one in intervals and p-values.
+        families: count things whose names are equal up to the first _, such as variants of one
+            scan, as one in intervals and p-values.
         samples: number of bootstrap samples.
         seed: seed of rotations, boxes, first views, noise and random policies.
     """
@@ -175,10 +177,10 @@ class ThingSettings:
     seed: int = 0
 
     def check(self) -> None:
-        """See that it makes sense, before any work is done.
+        """Check the settings before any work is done.
 
         Raises:
-            UsageError: a number, a unit or a sensor that there is none of.
+            UsageError: a number, a unit or a sensor is invalid.
         """
         for value, what in ((self.draws, "draws"), (self.repeats, "repeats")):
             whole(value, f"the number of {what}", 1)
@@ -206,7 +208,7 @@ class ThingSettings:
 
 @dataclass(frozen=True)
 class ThingJob(Job):
-    """One episode, and the policies that are replayed in it.
+    """One episode, and the policies to run in it.
 
     Attributes:
         models: name or folder of the memory.
@@ -223,10 +225,10 @@ class ThingJob(Job):
 
 @lru_cache(maxsize=1)
 def opened(models: str) -> TaughtThings:
-    """The things of a memory whose geometry is known.
+    """Open the things with known geometry of a memory.
 
     Raises:
-        UsageError: it knows the geometry of none.
+        UsageError: there are none.
     """
     recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
     things = TaughtThings.of(recogniser)
@@ -238,7 +240,7 @@ def opened(models: str) -> TaughtThings:
 
 
 def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
-    """The things of a recogniser of your own, or else of a memory.
+    """Open the things of your own recogniser, or else of a memory.
 
     Args:
         models: folder or name of the memory.
@@ -248,7 +250,7 @@ def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
 
 
 def work(job: ThingJob) -> None:
-    """Replay the policies of a job, and write down what they made of it."""
+    """Run the policies of a job, and write the results."""
     how: ThingSettings = job.settings
     things = things_of(job.models, how.recogniser)
     chosen = policies_of(job.policies, things)
@@ -262,7 +264,7 @@ def work(job: ThingJob) -> None:
     )
     before = job.earlier(EpisodeRuns)
     runs: dict[str, list[ThingRun]] = {} if before is None else before.runs
-    # The ceiling verifies what others need, too.
+    # The upper bound comes first, as it verifies views that the others use.
     for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
         runs[name] = replayed(episode, name, chosen[name], job)
     episode.save()
@@ -275,17 +277,17 @@ def scan_of(
     file: Path,
     unit: str,
 ) -> Mesh:
-    """The scan of a thing; of a taught one only if it is what was taught.
+    """Load the scan of a thing, and check that it is the taught one.
 
     Args:
-        things: that are known.
+        things: known things.
         thing: its number among them.
         file: the scan.
         unit: of its lengths.
 
     Raises:
-        DatasetError: it lies elsewhere than the surface that was taught, so that its size or its
-            pose would be those of another thing.
+        DatasetError: its position or size differs from the taught surface, so that the poses would
+            not be comparable.
     """
     mesh = load_mesh(file, unit=unit)
     if isinstance(things, OwnThings):
@@ -307,7 +309,7 @@ def scan_of(
 
 
 def _apart(mesh: Mesh, surface: Surface) -> float:
-    """How far the corners of two bounding boxes are apart, radii of the surface."""
+    """Return the distance between the corners of two bounding boxes, radii of the surface."""
     ours = mesh.vertices * mesh.radius + mesh.centre
     boxes = [np.stack([one.min(0), one.max(0)]) for one in (ours, surface.vertices)]
     return float(np.abs(boxes[0] - boxes[1]).max() / surface.radius)
@@ -319,13 +321,13 @@ def replayed(
     make: Callable[[ThingEpisode], Policy],
     job: ThingJob,
 ) -> list[ThingRun]:
-    """The runs of one policy in one episode.
+    """Return the runs of one policy in one episode.
 
     Args:
-        episode: what is sensed and verified.
+        episode: with cached views and verifications.
         name: of the policy.
-        make: the policy for an episode.
-        job: starts, views and rules of all episodes.
+        make: creates the policy for an episode.
+        job: first views and rules of all episodes.
     """
     rng = np.random.default_rng(
         (job.settings.seed, job.thing, job.draw, crc32(name.encode()))

@@ -1,4 +1,4 @@
-"""What the policies of a benchmark of things come to: measures, intervals and tests."""
+"""Summarise the benchmark of things: measures, intervals and tests."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,20 +35,20 @@ with extras():
 
 CONFUSABLE = "confusable half"
 TITLES = {ALL: "All things", CONFUSABLE: "The confusable half"}
-FAR_END = 0.95  # quantile of the error of the pose
+FAR_END = 0.95  # quantile of the pose error
 FAR_POSE = "pose error, 95 %"
-POSE_AFTER = 2  # views, after which the error of the pose is tested
+POSE_AFTER = 2  # number of views after which the pose error is tested
 
 
 @dataclass(frozen=True)
 class ThingTables(ComparedTables):
-    """The tables of a benchmark of things. The sets are ``all`` and the ``confusable half``.
+    """The tables of a benchmark of things.
 
-    One Holm correction is over all tests.
+    The sets are ``all`` and the ``confusable half``. One Holm correction is applied to all tests.
 
     Attributes:
         things: the things: "thing", "most_alike", "distance" (radii), "confusable".
-        episodes: how many there are of all things.
+        episodes: total number of episodes.
     """
 
     things: "pd.DataFrame"
@@ -60,17 +60,17 @@ class _Runs:
     """The runs of one policy.
 
     Attributes:
-        things: whose they are, (R,) int64.
-        weight: of each: together 1 for each thing, (R,).
+        things: thing of each run, (R,) int64.
+        weight: of each run, 1 in total for each thing, (R,).
         right: after each view, (R, K) float64.
-        sure: whether it was ever confident, as a session without ``Recognition.doubt`` is: it
-            believes, and the residual is no worse than that of known things, (R,) float64.
+        sure: whether it was ever confident, like a session without ``Recognition.doubt``: the
+            belief reached the threshold, and the residual is not suspicious, (R,) float64.
         wrong: whether it was confident and wrong, (R,) float64.
-        until: views until it was confident; all if it never was, (R,).
+        until: number of views until it was confident; all of them if it never was, (R,).
         travel: radians on the sphere up to each view, (R, K).
-        pose: error, millimetres, (R, K); NaN where the thing was not named right.
-        decision: seconds of each choice.
-        verification: seconds of each verification of all views.
+        pose: error, millimetres, (R, K); NaN if the thing was not named correctly.
+        decision: seconds per choice.
+        verification: seconds per verification of all views.
     """
 
     things: Index
@@ -86,17 +86,17 @@ class _Runs:
 
     @classmethod
     def of(cls, runs: Sequence[tuple[int, ThingRun]], threshold: float) -> "_Runs":
-        """Put runs side by side, each with the number of its thing.
+        """Combine runs, each with the number of its thing.
 
         Args:
             runs: pairs of a thing's number and a run.
-            threshold: belief from which on a run is confident.
+            threshold: belief from which a run is confident.
         """
         things = np.array([thing for thing, _ in runs])
         right = np.array([each.right for _, each in runs], np.float64)
         believed = np.array([each.confidence for _, each in runs], np.float64)
         explained = np.array([each.p_value for _, each in runs], np.float64)
-        # False where it is not known
+        # False if it is not known
         suspicious = explained < SUSPICIOUS * UNKNOWN_ALPHA
         sure = (believed >= threshold) & ~suspicious
         ever = sure.any(1)
@@ -119,7 +119,7 @@ class _Runs:
         )
 
     def mean(self, values: Float) -> Float:
-        """Mean over the runs of each thing of a value of each run, (T,).
+        """Return the mean of a value over the runs of each thing, (T,).
 
         Args:
             values: of each run, (R,).
@@ -127,12 +127,12 @@ class _Runs:
         return np.bincount(self.things, values * self.weight).astype(np.float64)
 
     def quantile(self, values: Float, drawn: Float, share: float) -> Float:
-        """Quantile of the known values of runs, in each sample of things, (S,).
+        """Return the quantile of the valid values in each bootstrap sample of things, (S,).
 
         Args:
-            values: of each run, (R,); NaN where it is not known.
-            drawn: how often each sample holds each thing, (S, things).
-            share: of the runs that lie below, 0 to 1.
+            values: of each run, (R,); NaN if not known.
+            drawn: bootstrap weight of each thing in each sample, (S, things).
+            share: level of the quantile, 0 to 1.
         """
         known = ~np.isnan(values)
         if not known.any():
@@ -144,7 +144,7 @@ class _Runs:
 
 
 def _sums(runs: _Runs, policy: str, views: tuple[int, ...]) -> dict[Key, tuple]:
-    """The measures of one policy that are means over things, as sums of each thing."""
+    """Return the measures of one policy that are means over things, as sums for each thing."""
     right = {k: runs.mean(runs.right[:, k - 1]) for k in views}
     one = np.ones(len(right[views[0]]))
     found = {Key(policy, None, k, "accuracy"): (right[k], one) for k in views}
@@ -165,7 +165,7 @@ def _sums(runs: _Runs, policy: str, views: tuple[int, ...]) -> dict[Key, tuple]:
 
 
 def _far(runs: _Runs, views: tuple[int, ...], drawn: Float) -> dict[tuple, Float]:
-    """Quantiles of the error of the pose in samples of the things, (S, T): each (S,)."""
+    """Return quantiles of the pose error in bootstrap samples of the things, (S, T): each (S,)."""
     return {
         (f"pose error, {name}", k): runs.quantile(runs.pose[:, k - 1], drawn, share)
         for k in views
@@ -183,9 +183,9 @@ def summarise_things(
 
     Args:
         runs: of all episodes.
-        alike: which things are most alike.
+        alike: similarity of the things.
         how: views, threshold, families, samples and reference.
-        chosen: how the reference was chosen, in a sentence; "" where it was named.
+        chosen: a sentence on how the reference was selected; "" if it was named.
 
     Returns:
         The tables.
@@ -237,14 +237,14 @@ def summarise_things(
 
 
 def _by_policy(parts: list["pd.DataFrame"], policies: list[str]) -> "pd.DataFrame":
-    """Rows of one set, policy by policy."""
+    """Sort the rows of one set by policy."""
     table = pd.concat(parts, ignore_index=True)
     place = table["policy"].map(policies.index)
     return table.iloc[np.argsort(place.to_numpy(), kind="stable")]
 
 
 def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
-    """What is shown of the policies."""
+    """Return the columns of the tables."""
     last = views[-1]
     right = [Column(f"right after {k}", ("accuracy",), k, short=f"{k}") for k in views]
     poses = [
@@ -274,13 +274,13 @@ def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
 
 
 def _families(names: Sequence[str], how: ThingSettings) -> Index:
-    """The number of the family of each thing, (T,) int64."""
+    """Return the family index of each thing, (T,) int64."""
     bodies = [name.partition("_")[0] if how.families else name for name in names]
     return np.asarray(np.unique(np.array(bodies), return_inverse=True)[1])
 
 
 def _times(name: str, runs: dict[str, _Runs]) -> "pd.DataFrame":
-    """The times of all policies, milliseconds, without intervals."""
+    """Return the run times of all policies, milliseconds, without intervals."""
     quantiles: list[tuple[str, Callable[[Float], float]]] = [
         ("median", lambda times: float(np.median(times))),
         ("95 %", lambda times: float(np.quantile(times, FAR_END))),
@@ -305,16 +305,16 @@ def _poses(
     weights: Float,
     how: ThingSettings,
 ) -> tuple["pd.DataFrame", "pd.DataFrame"]:
-    """Measures and tests of the errors of the pose, which are quantiles and no means.
+    """Return measures and tests of the pose error, which are quantiles instead of means.
 
     Args:
         name: of the set of things.
         runs: of all policies.
         family: of each thing, (T,).
-        weights: how often each sample holds each thing, (S, T).
-        how: what is compared.
+        weights: bootstrap weight of each thing in each sample, (S, T).
+        how: settings of the comparison.
     """
-    # the first sample is the things themselves
+    # the first sample is the original set
     drawn = np.concatenate([np.ones((1, len(family))), weights])
     found = {policy: _far(own, how.views, drawn) for policy, own in runs.items()}
     rows = [
@@ -338,20 +338,20 @@ def _poses(
 
 
 def _ends(values: Float) -> tuple[float, float]:
-    """The interval of samples, of which the first is none."""
+    """Return the interval of samples, without the first one."""
     low, high = interval(values[1:, None])
     return float(low[0]), float(high[0])
 
 
 def _is_tested(key: Key) -> bool:
-    """Whether a measure is compared with the reference's; the first view is the same."""
+    """Return True if a measure is compared with the reference; the first view is the same."""
     if key.measure == "accuracy":
         return key.views > 1
     return key.measure == "views until confident"
 
 
 def _pose_p(own: _Runs, reference: _Runs, family: Index) -> float:
-    """The p-value of the difference of the far ends of the errors of the pose."""
+    """Return the p-value of the difference in the quantile of the pose error."""
     errors = np.concatenate([one.pose[:, POSE_AFTER - 1] for one in (own, reference)])
     weights = np.concatenate([own.weight, reference.weight])
     order = np.argsort(errors)[: np.count_nonzero(~np.isnan(errors))]

@@ -1,7 +1,7 @@
-"""The benchmark of next views of taught things: from scans to a folder of tables, resumable.
+"""The benchmark of next views of taught things: from scans to a folder of results, resumable.
 
-Beside what ``jobs`` says of it, a folder of results holds ``episodes``: all that was sensed and
-verified, a folder for each episode.
+In addition to the files described in ``jobs``, a folder of results contains ``episodes`` with the
+cached views and verifications, one folder per episode.
 """
 
 from collections.abc import Sequence
@@ -41,9 +41,9 @@ from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 
-ALIKE_FILE = "alike.json"  # how alike the things of the memory are
-CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is chosen
-MEMORY = "memory"  # folder of what is taught, where no models are given
+ALIKE_FILE = "alike.json"  # similarity of the things in the memory
+CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is selected
+MEMORY = "memory"  # folder of the taught memory, if no models are given
 
 
 def benchmark_things(
@@ -58,22 +58,22 @@ def benchmark_things(
     The scans are taught first, unless --models names a memory that contains them. Each thing is
     shown at its true size through a simulated sensor, and all policies continue from the same first
     view. Each view is rendered once and each set of views is verified once. Both are stored in OUT:
-    an interrupted run resumes, and one more policy is replayed in seconds.
+    an interrupted run resumes, and a further policy is replayed in seconds.
 
-    A policy of your own, MODULE:CLASS, is made with the viewpoints. With needs = ("outlook",) it
+    A policy of your own, MODULE:CLASS, is created with the viewpoints. With needs = ("outlook",) it
     receives the leading hypotheses (things in poses), their beliefs and their surfaces; with
-    "joint", the belief by features in things and azimuths.
+    "joint", the belief from features over things and azimuths.
 
     Args:
         scans: folder of the scans.
         out: folder of the results; an existing one is continued.
-        workers: number of processes; by default one for each core; 0 uses this process.
-        track: follows the work.
+        workers: number of processes; by default one per core; 0 uses this process.
+        track: callable that shows progress.
 
     Raises:
-        UsageError: settings that make no sense.
+        UsageError: settings are invalid.
         DatasetError: there is no scan of a thing.
-        ResultsError: OUT holds the results of other settings.
+        ResultsError: OUT contains the results of other settings.
     """
     settings.check()
     asked = settings
@@ -89,7 +89,7 @@ def benchmark_things(
             knows = settings.recogniser or models
             raise DatasetError(f"{scans}: holds no scan of anything that {knows} knows")
         settings = replace(settings, policies=_allowed(settings, things))
-        policies_of(settings.policies, things)  # says what is wrong with a name
+        policies_of(settings.policies, things)  # raises an error for an invalid name
 
         chosen = ""
         if settings.reference == BEST_BLIND:
@@ -126,7 +126,7 @@ def _allowed(
     settings: ThingSettings,
     things: TaughtThings | OwnThings,
 ) -> tuple[str, ...]:
-    """The policies that take part: the reference if it has a name, and what was asked for."""
+    """Return the included policies: the reference, and the requested ones."""
     own = isinstance(things, OwnThings)
     all_of_them = [name for name in THING_POLICIES if not (own and name in OF_MEMORIES)]
     first = [] if settings.reference == BEST_BLIND else [settings.reference]
@@ -140,7 +140,7 @@ def _replayed(
     workers: int | None,
     track: TrackProgress,
 ) -> list[EpisodeRuns]:
-    """The runs of all episodes, of which those that are not there are replayed."""
+    """Return the runs of all episodes; missing ones are computed."""
     made = {
         "memory_sha256": ""
         if isinstance(things, OwnThings)
@@ -161,14 +161,14 @@ def best_blind(
     runs: Sequence[EpisodeRuns],
     settings: ThingSettings,
 ) -> tuple[str, str]:
-    """The blind rule that names most right after the first view.
+    """Return the blind rule that names most things correctly after the first view.
 
     Args:
-        runs: of other episodes than those that it is compared in.
+        runs: of other episodes than those of the comparison.
         settings: with the numbers of views.
 
     Returns:
-        The rule, of equals the one that is named first in BLIND_RULES, and a sentence about it.
+        The rule, with ties in the order of BLIND_RULES, and a sentence about it.
     """
     later = [k - 1 for k in settings.views if k > 1]
     shares = {
@@ -191,7 +191,7 @@ def _surfaces(
     scans: dict[str, Path],
     settings: ThingSettings,
 ) -> list[Surface]:
-    """The surfaces of all things that are known, or else of those that are shown."""
+    """Return the surfaces of all taught things, or else of the scans."""
     if isinstance(things, TaughtThings):
         return list(things.verifier.caster.surfaces)
     return [
@@ -208,7 +208,7 @@ def _taught(
     workers: int | None,
     track: TrackProgress,
 ) -> str:
-    """The memory of the scans, taught if it is not there; "" if none is needed."""
+    """Return the memory of the scans, taught if it does not exist; "" if none is needed."""
     if settings.recogniser is not None:
         return ""
     if settings.models is not None:
@@ -221,10 +221,10 @@ def _taught(
 
 
 class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How alike the things of a memory are, see ``Alikeness``.
+    """Similarity of the things in a memory, see ``Alikeness``.
 
     Attributes:
-        nearest: name of the thing that is most like each.
+        nearest: name of the most similar other thing.
         distance: of the two surfaces; None for infinity.
     """
 
@@ -233,7 +233,7 @@ class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _alike(out: Path, surfaces: Sequence[Surface]) -> Alikeness:
-    """How alike the things are. It takes seconds, and is the same for all runs of a folder."""
+    """Return the similarity of the things, which takes seconds and is cached in the folder."""
     file = out / ALIKE_FILE
     if not file.exists():
         found = how_alike(surfaces)
@@ -258,7 +258,7 @@ def _jobs(
     settings: ThingSettings,
     things: TaughtThings | OwnThings,
 ) -> list[ThingJob]:
-    """All episodes of a run."""
+    """Return all episodes of a run."""
     return [
         ThingJob(
             settings,

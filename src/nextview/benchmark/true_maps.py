@@ -12,7 +12,7 @@ from nextview.errors import DatasetError, EntryError
 from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 from nextview.types import Float32
 
-TRUE = "true-"  # how the names of true maps begin
+TRUE = "true-"  # prefix of the names of true maps
 IN_PREDICTIONS: dict[
     str,
     Callable[[Predictions], NDArray],
@@ -44,7 +44,7 @@ def true_map(p: Predictions, name: str) -> Float32:
 
 
 def known_maps(p: Predictions) -> tuple[str, ...]:
-    """Names of the maps whose truth is known."""
+    """Return the names of the maps whose true values are known."""
     try:
         stored = tuple(ViewStore.open(p.store).measures) if p.store else ()
     except DatasetError:
@@ -63,7 +63,7 @@ def true_measure(p: Predictions, measure: str) -> Float32:
         Values, (N, V) float32.
 
     Raises:
-        EntryError: the view store is missing, or is another one.
+        EntryError: the view store is missing or does not match.
     """
     return (
         p.depth_entropy
@@ -83,7 +83,7 @@ def stored_rows(p: Predictions, name: str) -> NDArray:
         Its rows, (N, ...).
 
     Raises:
-        EntryError: the view store is missing, or is another one.
+        EntryError: the view store is missing or does not match.
     """
     if not p.store:
         raise EntryError(

@@ -1,1 +1,1 @@
-"""Folders of real depth frames with camera poses: readers, checks, turntables."""
+"""Captured depth frames with camera poses: readers, consistency checks, turntables."""

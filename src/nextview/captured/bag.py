@@ -1,7 +1,7 @@
-"""Depth images of a ROS 2 bag, with the poses that its tf gives them.
+"""Read depth images from a ROS 2 bag, with camera poses from its tf messages.
 
-A bag is a folder with ``metadata.yaml``, or one file of it (.mcap, .db3). It is read image by
-image; of a long one only a sample is used.
+A bag is a folder with ``metadata.yaml``, or a single file of it (.mcap, .db3). Images are read one
+by one; a long bag is sampled.
 """
 
 import io
@@ -50,28 +50,31 @@ if TYPE_CHECKING:
 ENDINGS = (".mcap", ".db3")
 OLD_ENDING = ".bag"  # of ROS 1
 METADATA = "metadata.yaml"
-MOST_FRAMES = 120  # of a recording that are used, evenly spread in time
+MOST_FRAMES = 120  # largest number of frames used, evenly spread in time
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
-# the end of the name of the topic of transforms that never change
+# suffix of the topic of static transforms
 STATIC_TRANSFORMS = "tf_static"
 NANOSECONDS = 1e-9
-# in place of the encoding of a topic whose messages are announced and missing
+# replaces the encoding of a topic whose announced messages are missing
 NOT_THERE = "announced, and none is there"
 LARGEST_METADATA = 2**24  # bytes of metadata.yaml
-# bytes of a chunk of a file, or of one message, once they are decompressed: recorders fill chunks
-# of a few megabytes, and one image or cloud of a message takes less than a hundred
+# bytes, largest decompressed size of a chunk or a message. Recorders write chunks of a few
+# megabytes, and the largest images and point clouds are below a hundred
 LARGEST_BAG_CHUNK = 2**28
-# nanoseconds before a moment in which its last image is looked for; then twice as many
+# nanoseconds, first interval in which the last image is searched; doubled until one is found
 FIRST_REACH = 1_000_000_000
-# which image of a camera that stands still: seconds since the bag's first message
+# image of a static camera: first, last, or seconds after the bag's first message
 At = Literal["first", "last"] | float | None
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag, or a file of one; also one of ROS 1, which ``read_bag`` refuses."""
+    """Return True if a path is a bag or a file of one.
+
+    ROS 1 bags are included; ``read_bag`` rejects them.
+    """
     if path.is_dir():
         return (path / METADATA).exists() or bool(_storage_files(path))
     return path.suffix.lower() in (*ENDINGS, OLD_ENDING) and path.is_file()
@@ -84,21 +87,20 @@ def read_bag(
     world_frame: str | None = None,
     at: At = None,
 ) -> LayoutViews:
-    """Find the depth images of a bag, the intrinsics of their camera and its poses.
+    """Find the depth images of a bag, the camera intrinsics and the camera poses.
 
     Args:
-        path: which ``is_bag``.
-        intrinsics: pinhole matrix, (3, 3), pixels, if not that of camera_info.
-        depth_topic: where the depth images are, if there are several such topics.
-        world_frame: the frame that is the world, z up; by default the root of the tree that the
-            camera hangs in.
-        at: which image is used of a camera that stands still, as its frames cannot be told apart
-            from frames of a scene that changes: the first, the last, or the first one from a
-            moment on, seconds since the bag's first message. The first by default.
+        path: of a bag, see ``is_bag``.
+        intrinsics: pinhole matrix, (3, 3), pixels; by default from camera_info.
+        depth_topic: topic of the depth images, if there are several.
+        world_frame: tf frame of the world, z up; by default the root of the camera's tf tree.
+        at: image to use if the camera is static, as frames of a static camera cannot be
+            distinguished from frames of a changing scene: the first, the last, or the first one
+            after a number of seconds since the bag's first message. The first by default.
 
     Raises:
         DatasetError: the bag is damaged, or lacks depth images, camera_info or transforms.
-        UsageError: ``at`` is given, and the camera moves.
+        UsageError: ``at`` is given, but the camera moves.
         MissingExtraError: rosbags is not installed.
     """
     bag = Bag(path)
@@ -138,7 +140,7 @@ def read_bag(
         intrinsics, source = _intrinsics(bag, topic.topic, first)
         notes.append(f"intrinsics of {source}")
 
-    # a frame that only carries the camera tells nothing of the vertical
+    # a root frame fixed to the camera has no known vertical
     views = LayoutViews(
         [],
         notes,
@@ -156,16 +158,16 @@ def read_bag(
 
 
 class Bag:
-    """An open bag; it is closed when nothing uses it any more.
+    """An open bag; it is closed when it is no longer used.
 
     Args:
         path: of a bag, or a file of one.
 
     Attributes:
         path: the same.
-        connections: what was recorded, a topic and its type each; without those of no message.
-        start: nanoseconds, of the first message.
-        end: nanoseconds, after the last message.
+        connections: recorded topics with their types, without empty ones.
+        start: time of the first message, nanoseconds.
+        end: time after the last message, nanoseconds.
 
     Raises:
         DatasetError: it cannot be read.
@@ -186,21 +188,21 @@ class Bag:
             self.connections = _connections(self._reader)
             self.start = int(self._reader.start_time)
             self.end = int(self._reader.end_time)
-            # what rosbags would decompress whole, whatever its size, is decompressed here
+            # decompressed here within limits; rosbags would decompress any size
             self._packed = self._reader.compression_mode == "message"
             storage: Any = self._reader.storage
             if self._packed:
                 storage.metadata = storage.metadata._replace(compression_mode=None)
-        # rows that are still being read: the file cannot be closed before they are
+        # unfinished iterators, which must be closed before the file
         self._unread: set[Generator[Any, None, None]] = set()
         weakref.finalize(self, _close, self._reader, self._unread)
 
     def first(self, connection: "Connection") -> Any:
-        """The first message of a topic; None if there is none, whatever the bag announces."""
+        """Return the first message of a topic; None if there is none, despite its index."""
         return next((message for _, _, message in self.messages([connection])), None)
 
     def of_type(self, *kinds: str) -> list["Connection"]:
-        """What was recorded of some types of messages, sorted by topic."""
+        """Return the recorded connections of some message types, sorted by topic."""
         found = [each for each in self.connections if each.msgtype in kinds]
         return sorted(found, key=lambda each: each.topic)
 
@@ -213,12 +215,12 @@ class Bag:
         """Read messages one by one.
 
         Args:
-            connections: of which topics.
-            start: nanoseconds, of the first one.
-            stop: nanoseconds, before which the last one was recorded.
+            connections: topics to read.
+            start: of the interval, nanoseconds.
+            stop: end of the interval, exclusive, nanoseconds.
 
         Yields:
-            Topic, nanoseconds at which it was recorded, and the message.
+            Topic, time of recording in nanoseconds, and the message.
         """
         found = self._reader.messages(connections, start, stop)
         self._unread.add(found)
@@ -244,14 +246,14 @@ class RecordedImage:
     """A depth image in a bag.
 
     Attributes:
-        bag: an open one.
+        bag: an open bag.
         connection: of the topic.
-        time: nanoseconds, when it was recorded.
-        stamp: seconds, of its header.
-        frame: the tf frame that it is in.
-        encoding: one of ``messages.ENCODINGS``, if it holds depth.
-        size: width and height, pixels; 0 where it is damaged.
-        damage: what is wrong with it; "" if nothing is known to be.
+        time: of recording, nanoseconds.
+        stamp: of its header, seconds.
+        frame: tf frame of the image.
+        encoding: one of ``messages.ENCODINGS``, if it contains depth.
+        size: width and height, pixels; 0 if it is damaged.
+        damage: description of the damage; "" if none is known.
     """
 
     bag: Bag
@@ -268,7 +270,7 @@ class RecordedImage:
 
         Raises:
             DatasetError: the bag is damaged.
-            ObservationError: it is no depth image.
+            ObservationError: it is not a depth image.
         """
         here = self.bag.messages([self.connection], self.time, self.time + 1)
         for _, _, message in here:
@@ -278,7 +280,7 @@ class RecordedImage:
 
     @property
     def name(self) -> str:
-        """Seconds since the bag's first message."""
+        """Seconds since the bag's first message, as text."""
         return f"{(self.time - self.bag.start) * NANOSECONDS:.3f}"
 
     def __str__(self) -> str:
@@ -286,10 +288,10 @@ class RecordedImage:
 
 
 class _BoundedFile(io.BufferedReader):
-    """A file of which no more is asked for than it holds, whatever length a record claims."""
+    """A file from which no more bytes are read than it has, whatever length a record claims."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read at most so many bytes."""
+        """Read at most this many bytes."""
         if size is not None and size > io.DEFAULT_BUFFER_SIZE:
             left = os.fstat(self.fileno()).st_size - self.tell()
             size = max(0, min(size, left))
@@ -297,7 +299,7 @@ class _BoundedFile(io.BufferedReader):
 
 
 class _BoundedPath(type(Path())):  # type: ignore[misc]
-    """A path whose files are opened as ``_BoundedFile`` where bytes are read."""
+    """A path whose files are opened as ``_BoundedFile`` in binary mode."""
 
     def open(self, mode: str = "r", *how: Any, **named: Any) -> Any:
         """Open the file."""
@@ -307,7 +309,7 @@ class _BoundedPath(type(Path())):  # type: ignore[misc]
 
 
 def _check_metadata(path: Path) -> None:
-    """See that metadata.yaml does not repeat itself beyond measure; rosbags reads it anew."""
+    """Check that the aliases in metadata.yaml do not expand too far; rosbags reads it again."""
     file = path / METADATA
     if path.is_dir() and file.exists():
         regular_file(file, "what describes a bag", DatasetError, LARGEST_METADATA)
@@ -318,10 +320,10 @@ def _check_metadata(path: Path) -> None:
 
 
 def _connections(reader: "Reader") -> list["Connection"]:
-    """The topics of an open bag that have messages, as far as it says.
+    """Return the topics of an open bag that have messages according to its index.
 
     Raises:
-        TypeError: their names or numbers are none.
+        TypeError: names or counts have the wrong type.
     """
     for each in reader.connections:
         if not isinstance(each.topic, str) or not isinstance(each.msgtype, str):
@@ -331,10 +333,10 @@ def _connections(reader: "Reader") -> list["Connection"]:
 
 @cache
 def _bound_chunks() -> None:
-    """Have rosbags decompress no more of a chunk than the chunk says it holds.
+    """Patch rosbags to decompress no more of a chunk than its declared size.
 
-    Of its own it decompresses all, and compares the size then: ten bytes on the disk can be
-    gigabytes.
+    By default it decompresses everything before comparing the size, and ten bytes on the disk can
+    expand to gigabytes.
     """
     with extras():
         from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
@@ -343,10 +345,10 @@ def _bound_chunks() -> None:
 
 
 def _bounded_zstd(data: bytes, size: int = LARGEST_BAG_CHUNK) -> bytes:
-    """Decompress what says that it holds so many bytes, and no more of it.
+    """Decompress zstd data up to its declared size.
 
     Raises:
-        ValueError: it holds more, or claims more than ``LARGEST_BAG_CHUNK``.
+        ValueError: it is larger, or declares more than ``LARGEST_BAG_CHUNK``.
     """
     with extras():
         from rosbags.rosbag2.storage_mcap import zstd
@@ -357,7 +359,7 @@ def _bounded_zstd(data: bytes, size: int = LARGEST_BAG_CHUNK) -> bytes:
 
 
 def _bounded_lz4(data: bytes, size: int) -> bytes:
-    """The same of the other way to compress a chunk."""
+    """Decompress lz4 data up to its declared size."""
     with extras():
         from lz4.frame import LZ4FrameDecompressor
     _check_chunk(size, size)
@@ -367,7 +369,7 @@ def _bounded_lz4(data: bytes, size: int) -> bytes:
 
 
 def _check_chunk(length: int, claimed: int) -> None:
-    """Refuse a chunk of some bytes; a ValueError."""
+    """Check the size of a chunk; raises ValueError."""
     if claimed > LARGEST_BAG_CHUNK:
         raise ValueError(f"a chunk of {claimed} bytes, {LARGEST_BAG_CHUNK} are most")
     if length > claimed:
@@ -375,14 +377,14 @@ def _check_chunk(length: int, claimed: int) -> None:
 
 
 def _close(reader: "Reader", unread: set[Generator[Any, None, None]]) -> None:
-    """Close a bag, also if reading it was broken off."""
+    """Close a bag, even if reading was interrupted."""
     for rows in list(unread):
         rows.close()
     reader.close()
 
 
 def _opened(path: Path) -> Path:
-    """What rosbags shall open for a bag; of one without metadata its only file."""
+    """Return the path to open: the bag, or the only file of one without metadata."""
     if path.suffix.lower() == OLD_ENDING:
         raise DatasetError(
             f"{path}: is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes"
@@ -400,13 +402,13 @@ def _opened(path: Path) -> Path:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """The files of a bag in a folder."""
+    """Return the data files of a bag folder."""
     return sorted(path for ending in ENDINGS for path in folder.glob(f"*{ending}"))
 
 
 @cache
 def _damage() -> tuple[type[Exception], ...]:
-    """What rosbags raises for a damaged file, and the libraries that it reads with."""
+    """Return the exceptions that rosbags and its libraries raise for damaged files."""
     with extras():
         from rosbags.rosbag2 import ReaderError
         from rosbags.rosbag2.storage_mcap import zstd
@@ -424,7 +426,7 @@ def _damage() -> tuple[type[Exception], ...]:
 
 @contextmanager
 def _damage_named(path: Path) -> Iterator[None]:
-    """Stands around calls of rosbags: what it raises for a damaged file becomes one sentence."""
+    """Turn exceptions of rosbags for damaged files into a DatasetError."""
     try:
         yield
     except NextviewError:
@@ -437,7 +439,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
-    """The topic of the depth images: the one that is asked for, or the only one there is."""
+    """Return the topic of the depth images: the requested one, or the only one."""
     topics = bag.of_type(RAW, COMPRESSED)
     encodings = {each.topic: _encoding(bag, each) for each in topics}
     if asked is not None:
@@ -460,7 +462,7 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
 
     deep = [each for each in topics if encodings[each.topic] in ENCODINGS]
     raw = {each.topic for each in deep if each.msgtype == RAW}
-    # the same images as those of another topic
+    # leave out compressed copies of another topic
     deep = [
         each for each in deep if each.msgtype == RAW or _base(each.topic) not in raw
     ]
@@ -480,7 +482,7 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
 
 
 def _encoding(bag: Bag, connection: "Connection") -> str:
-    """That of the first image of a topic; in words where there is none."""
+    """Return the encoding of the first image of a topic, or the reason why there is none."""
     message = bag.first(connection)
     if message is None:
         return NOT_THERE
@@ -492,19 +494,19 @@ def _encoding(bag: Bag, connection: "Connection") -> str:
 
 
 def _base(topic: str) -> str:
-    """The topic of the raw images that those of a topic were compressed from."""
+    """Return the topic of raw images to which a compressed topic belongs."""
     return topic.rpartition("/")[0]
 
 
 def _sample(bag: Bag, topic: "Connection") -> list[RecordedImage]:
-    """Images of a topic, evenly spread in time, at most ``MOST_FRAMES``, in the order of stamps."""
+    """Return at most ``MOST_FRAMES`` images of a topic, evenly spread in time, ordered by stamp."""
     if topic.msgcount <= MOST_FRAMES:
         found = [
             _recorded(bag, topic, time, image)
             for _, time, image in bag.messages([topic])
         ]
     else:
-        # the first image of each of so many parts of the recording
+        # the first image of each of MOST_FRAMES intervals
         found = []
         length = bag.end - bag.start
         edges = [
@@ -527,17 +529,17 @@ def _image_at(
     images: list[RecordedImage],
     at: At,
 ) -> RecordedImage:
-    """The image of a topic at a moment, see ``read_bag``.
+    """Return the image of a topic at a time, see ``read_bag``.
 
     Args:
-        bag: an open one.
+        bag: an open bag.
         topic: of the images.
-        images: those that were sampled, in order.
-        at: the moment.
+        images: sampled images, in order.
+        at: the requested time.
 
     Raises:
-        DatasetError: there is none from that moment on.
-        UsageError: it is no moment.
+        DatasetError: there is no image from that time on.
+        UsageError: the time is invalid.
     """
     if at is None or at == "first":
         return images[0]
@@ -559,7 +561,7 @@ def _last_image(
     topic: "Connection",
     images: list[RecordedImage],
 ) -> RecordedImage:
-    """The last image of a topic, of which some were sampled."""
+    """Return the last image of a topic from which some images were sampled."""
     if topic.msgcount <= MOST_FRAMES:
         return images[-1]
     reach = FIRST_REACH
@@ -576,7 +578,7 @@ def _last_image(
 
 
 def _which_image(image: RecordedImage, topic: "Connection", at: At) -> str:
-    """A note of which image is used of a camera that stands still."""
+    """Return a note that names the image used for a static camera."""
     said = f"tf does not move the camera: its image at {image.name} s is used"
     if topic.msgcount == 1 or at is not None:
         return said
@@ -584,7 +586,7 @@ def _which_image(image: RecordedImage, topic: "Connection", at: At) -> str:
 
 
 def _recorded(bag: Bag, topic: "Connection", time: int, message: Any) -> RecordedImage:
-    """What is kept of an image until it is read."""
+    """Return the metadata of an image, which is read later."""
     damage = ""
     size = 0, 0
     try:
@@ -614,7 +616,7 @@ def _pixels(message: Any, kind: str) -> NDArray[Any]:
 
 
 def _transforms(bag: Bag) -> TransformTree:
-    """All that tf says in a bag."""
+    """Read all tf messages of a bag."""
     tree = TransformTree()
     topics = bag.of_type(TF)
     said = (
@@ -644,7 +646,7 @@ def _transforms(bag: Bag) -> TransformTree:
 
 
 def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]:
-    """The pinhole matrix of a bag's depth camera, and the topic that says it."""
+    """Return the pinhole matrix of a bag's depth camera, and the topic of its camera_info."""
     infos = bag.of_type(CAMERA_INFO)
     places = {f"{_base(topic)}/camera_info", f"{_base(_base(topic))}/camera_info"}
     found = [each for each in infos if each.topic in places]
@@ -674,7 +676,7 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
 
 
 def _fits(info: Any, image: RecordedImage) -> bool:
-    """Whether a camera_info is of the frame and the size of an image."""
+    """Return True if a camera_info has the frame and the size of an image."""
     if info is None:
         return False
     same = info.header.frame_id.lstrip("/") == image.frame
@@ -689,7 +691,7 @@ def _add_frames(
     k: Float,
     size: tuple[int, int],
 ) -> int:
-    """Add frames with the poses of images of one size; returns how many have none."""
+    """Add frames with the poses of images of one size; returns the number without a pose."""
     lost = 0
     for image in images:
         try:
@@ -715,6 +717,6 @@ def _add_frames(
 
 
 def _listed(names: Sequence[str], most: int = 8) -> str:
-    """Names in a sentence."""
+    """Join names for a sentence."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return (", ".join(names[:most]) or "none") + more

@@ -1,6 +1,6 @@
-"""The bundled recording of a table: simulated depth frames, and the ground truth.
+"""The bundled recording of a table: simulated depth frames with ground truth.
 
-``benchmarks/demo_table.py`` made it.
+It was created by ``benchmarks/demo_table.py``.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,9 +22,9 @@ class TableTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         attribution: of the scans.
-        seed: of the draw.
-        places: middle of each thing in the world, metres, by its name.
-        poses: rows of the pose of each thing's scan in the world, metres, by its name.
+        seed: of the random draw.
+        places: centre of each thing in the world, metres, by name.
+        poses: rows of the pose of each thing's scan in the world, metres, by name.
     """
 
     attribution: str
@@ -40,11 +40,11 @@ def table_truth() -> TableTruth:
 
 @dataclass(frozen=True, eq=False)
 class NamedPlace:
-    """An object that was found.
+    """A recognised object with its position.
 
     Attributes:
-        name: None where it is unknown.
-        confident: whether the name may be acted on.
+        name: None if it is unknown.
+        confident: whether the name is confident.
         place: in the world, (3,), metres.
     """
 
@@ -57,10 +57,10 @@ def compared_with_truth(
     found: Sequence[NamedPlace],
     known: Collection[str],
 ) -> list[str]:
-    """Say how many things of the bundled table are named correctly.
+    """Describe how many things of the bundled table are named correctly.
 
-    An object is compared with the true thing nearest to it; of several objects at one thing the
-    nearest counts.
+    Each object is compared with the nearest true thing; of several objects at one thing the nearest
+    counts.
 
     Args:
         found: the objects.

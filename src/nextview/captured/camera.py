@@ -1,4 +1,4 @@
-"""A camera that has been everywhere already: the nearest captured view answers a request."""
+"""A camera that answers requests with the nearest captured view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.observed_object import ObservedObject
 from nextview.types import Float
 
-# the axes of a world that may be called up by name
+# up axes by name
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-# pixels around the object's centre that tell whether it is hidden
+# pixels around the object's centre that are tested for occlusion
 PIXELS_AROUND_CENTRE = 3
-# object radii before its centre from which something else hides it
+# object radii, least distance of an occluder in front of the centre
 HIDING_DISTANCE = 1.5
 
 
 @dataclass(frozen=True)
 class TakenView:
-    """A captured view that answered a request, and its angular distance from it.
+    """A captured view that answered a request.
 
     Attributes:
         frame: the captured view.
@@ -42,35 +42,35 @@ class TakenView:
 
 
 class CapturedCamera:
-    """Answers each request with the nearest captured view, as seen from the object, that is unused.
+    """Camera that answers each request with the unused captured view of the nearest direction.
 
-    The object is found by the masks of the folder, unless a point or a box is given. Views whose
-    picture does not hold its centre come last. A view that does not show the object is left out,
-    and the next nearest answers.
+    The object is located by the masks of the folder, unless a point or a box is given. Views whose
+    image does not contain its centre come last. A view that does not show the object is skipped,
+    and the next nearest one answers.
 
     Args:
-        capture: is checked first, see ``check_capture``.
-        up: against gravity, world, (3,); by default by the layout, or the normal of the support
+        capture: captured views, which are checked first, see ``check_capture``.
+        up: against gravity, world, (3,); by default from the layout, or the normal of the support
             plane.
-        point: near the object, world, metres, (3,), if not the largest thing on the support plane
-            is meant.
-        box: upright, into which the object just fits.
+        point: near the object, world, metres, (3,); by default the largest object on the support
+            plane is used.
+        box: upright bounding box of the object.
         denoise: as for ``ObservedObject``.
         life_size: as for ``ObservedObject``.
 
     Attributes:
-        capture: the views that can be used.
+        capture: the usable views.
         taken: the views that answered, in order.
-        left_out: why views were left out, by name.
-        misses: those of them that should show the object: they cannot be read, contradict the
-            others, or look at it and do not show it.
+        left_out: reasons for the unused views, by name.
+        misses: those of them that should show the object: unreadable views, views that contradict
+            the others, and views aimed at the object in which it was not found.
 
     Raises:
-        DatasetError: more than a tenth of the views cannot be used, or their poses cannot be right.
-        ObservationError: the object is found in none of the views.
+        DatasetError: more than a tenth of the views cannot be used, or their poses must be wrong.
+        ObservationError: the object is not found in any view.
     """
 
-    # the camera stood there when the frames were captured; see ``session.FrameCamera``
+    # the captured poses were reachable; see ``session.FrameCamera``
     knows_reach = True
 
     def __init__(
@@ -109,11 +109,11 @@ class CapturedCamera:
 
     @property
     def object_frame(self) -> ObjectFrame:
-        """Where the object is, as far as the views so far tell."""
+        """Object frame estimated from the views so far."""
         return self.object.object_frame if self.object.sightings else self._about
 
     def observe(self, pose: Float) -> Frame:
-        """The nearest unused view to a pose.
+        """Return the nearest unused view to a pose.
 
         Args:
             pose: (4, 4), object frame, object radii.
@@ -147,11 +147,11 @@ class CapturedCamera:
         )
 
     def refused(self, error: ObservationError) -> None:
-        """Say that the last view that answered does not show the object."""
+        """Report that the object was not found in the last view."""
         self.left_out[self.taken.pop().frame.name] = str(error)
 
     def take_all(self, pose: Float) -> ObservedObject:
-        """Look at the object from all views, those nearest to a pose first.
+        """Observe the object in all views, those nearest to a pose first.
 
         Args:
             pose: (4, 4), object frame, object radii.
@@ -160,7 +160,7 @@ class CapturedCamera:
             The object with the observations of all views that show it.
 
         Raises:
-            DatasetError: the object is not found in more than a tenth of the views that look at it.
+            DatasetError: the object is not found in more than a tenth of the views aimed at it.
         """
         while True:
             try:
@@ -178,7 +178,7 @@ class CapturedCamera:
         return self.object
 
     def _looks_at_it(self, captured: CapturedFrame, frame: Frame) -> bool:
-        """Whether the object's centre is in the picture, and nothing hides it."""
+        """Return True if the object's centre is inside the image and not occluded."""
         found = self.object_frame
         column, row, depth = _projected(captured, found.centre)
         height, width = frame.shape
@@ -191,7 +191,7 @@ class CapturedCamera:
         )
 
     def _find(self, up: ArrayLike | None, point: ArrayLike | None) -> ObjectFrame:
-        """About where the object is."""
+        """Locate the object approximately."""
         reason = ""
         for frame in self.capture.frames:
             thing = ObservedObject(up, point, parting=ALONE)
@@ -216,7 +216,7 @@ class CapturedCamera:
 
 
 def _degrees_off(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:
-    """Between the direction asked for and the camera's, from the object."""
+    """Return the angle between the requested direction and that of the camera, from the object."""
     return float(
         np.degrees(
             angle_between(asked, found.axes @ (frame.pose[:3, 3] - found.centre))
@@ -225,14 +225,14 @@ def _degrees_off(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> floa
 
 
 def _projected(captured: CapturedFrame, point: Float) -> tuple[float, float, float]:
-    """Column and row in which a point, world, (3,), is seen, and its depth, metres."""
+    """Project a point, world, (3,), to column, row and depth, metres."""
     pose = captured.pose
     x, y, z = captured.intrinsics @ (pose[:3, :3].T @ (point - pose[:3, 3]))
     return (x / z, y / z, z) if z > 0 else (-1.0, -1.0, z)
 
 
 def _near(at: float, size: int) -> slice:
-    """Rows or columns around one of them."""
+    """Return the rows or columns around one of them."""
     return slice(
         max(0, int(at) - PIXELS_AROUND_CENTRE),
         min(size, int(at) + PIXELS_AROUND_CENTRE + 1),
@@ -240,7 +240,7 @@ def _near(at: float, size: int) -> slice:
 
 
 def _cost(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:
-    """Degrees off; 180 more where the object's centre is outside the picture."""
+    """Return the angle off; 180 degrees more if the object's centre is outside the image."""
     column, row, depth = _projected(frame, found.centre)
     inside = depth > 0 and 0 <= column < frame.size[0] and 0 <= row < frame.size[1]
     return _degrees_off(frame, asked, found) + (0 if inside else 180)
@@ -254,15 +254,15 @@ def camera_of(
     denoise: bool = True,
     life_size: bool = True,
 ) -> CapturedCamera:
-    """Create the camera of a capture from what a user says of the object.
+    """Create the camera of a capture from user input.
 
     Args:
         capture: the captured views.
-        up: "y", "z", or a direction in the world, (3,); by default by the layout, or the normal of
-            the support plane.
+        up: "y", "z", or a direction in the world, (3,); by default from the layout, or the normal
+            of the support plane.
         point: near the object, world, metres, (3,).
-        box: upright box that just contains the object: its low and its high corner along ``up``,
-            metres, (6,), or a JSON file with low, high and axes.
+        box: upright bounding box of the object: its low and its high corner along ``up``, metres,
+            (6,), or a JSON file with low, high and axes.
         denoise: as for ``ObservedObject``.
         life_size: as for ``ObservedObject``.
 
@@ -270,7 +270,7 @@ def camera_of(
         The camera.
 
     Raises:
-        UsageError: a box is given by its corners, and the vertical is not known.
+        UsageError: a box is given by its corners, but the vertical is not known.
     """
     vertical = UP[up] if isinstance(up, str) else up
     around = None

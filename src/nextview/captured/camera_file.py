@@ -1,8 +1,9 @@
-"""Intrinsics of a depth camera in the files that cameras and their tools write.
+"""Read the intrinsics of a depth camera from the files of common tools.
 
-``camera_info`` of ROS (``ros2 topic echo --once``, or of its calibration), the intrinsics of
-librealsense, of Open3D (its recorder's, and ``PinholeCameraParameters``), of BOP's ``camera.json``,
-of Zivid and of OpenCV; JSON or YAML. A text file (.txt) holds the pinhole matrix alone.
+Supported are ``camera_info`` of ROS (``ros2 topic echo --once``, or from its calibration), the
+intrinsics of librealsense, Open3D (its recorder's, and ``PinholeCameraParameters``), BOP's
+``camera.json``, Zivid and OpenCV, as JSON or YAML. A text file (.txt) contains only the pinhole
+matrix.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,32 +23,36 @@ from nextview.geometry.pinhole import pinhole_matrix
 from nextview.types import Float
 
 LARGEST_FILE = 2**20  # bytes
-MOST_MATRIX_NUMBERS = 100  # in a list of a camera: nine, or up to 14 coefficients
-# names of fields, compared without regard to capitals
+MOST_MATRIX_NUMBERS = (
+    100  # more than the nine of a matrix or the 14 coefficients of a distortion
+)
+# names of fields, case-insensitive
 MATRICES = ("k", "cam_k", "camera_matrix", "cameramatrix", "intrinsic_matrix")
 PRINCIPAL_POINTS = (("cx", "cy"), ("ppx", "ppy"))
 DISTORTIONS = ("d", "coeffs", "distortion_coefficients", "distcoeffs", "distortion")
 WIDTHS = ("width", "image_width")
 HEIGHTS = ("height", "image_height")
 SCALES = ("depth_scale", "depth_units")
-# where a file holds several cameras, or one with other things; the depth camera's before those of
-# the file itself, which may be the colour camera's
+# fields that contain the depth camera; searched before the top level, which may be the colour
+# camera's
 INSIDE_FIRST = ("depth", "depth_intrinsics")
 INSIDE = ("intrinsics", "intrinsic", "camera_info", "cameraintrinsics")
-# What a depth scale is counted in: the tools do not agree, their values lie far apart.
-METRES_BELOW = 0.02  # librealsense: metres that a step stands for, 0.001
-STEPS_FROM = 50.0  # Open3D: steps a metre, 1000; between them BOP's millimetres that a step is, 0.1
+# Tools define the depth scale differently, but the values are far apart.
+METRES_BELOW = 0.02  # librealsense: metres per unit, such as 0.001
+STEPS_FROM = (
+    50.0  # Open3D: units per metre, such as 1000; in between, BOP: millimetres per unit
+)
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file says of a depth camera.
+    """Contents of a camera file.
 
     Attributes:
         intrinsics: pinhole matrix, (3, 3) float64, pixels, first pixel's centre at 0.
         size: width and height of its images, pixels, if the file has them.
-        scale: metres that one step of its depth images stands for, if the file has it.
-        file: its path; "" of what was given by hand.
+        scale: metres per unit of its depth images, if the file has it.
+        file: its path; "" for intrinsics passed in by the user.
     """
 
     intrinsics: Float
@@ -57,13 +62,13 @@ class CameraFile:
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read the intrinsics, and whatever else a file says of a depth camera.
+    """Read the intrinsics and other properties of a depth camera from a file.
 
     Args:
         path: JSON or YAML, or the pinhole matrix in a text file.
 
     Raises:
-        DatasetError: it cannot be read, holds no intrinsics, or those of images that are distorted.
+        DatasetError: it cannot be read, has no intrinsics, or those of distorted images.
     """
     if path.suffix.lower() == ".txt":
         matrix = read_table(path, "the pinhole matrix", 3)
@@ -97,14 +102,14 @@ def read_camera_file(path: Path) -> CameraFile:
 
 
 def check_size(camera: CameraFile, depth: DepthImage) -> None:
-    """Refuse intrinsics of images of another size.
+    """Check that intrinsics belong to images of this size.
 
     Args:
-        camera: what a file says.
-        depth: an image that is taken for one of that camera.
+        camera: contents of a camera file.
+        depth: an image of that camera.
 
     Raises:
-        DatasetError: the file is of images of another size.
+        DatasetError: the file is for images of another size.
     """
     if camera.size is not None and camera.size != depth.size:
         wanted = "{} x {}".format(*camera.size)
@@ -116,7 +121,7 @@ def check_size(camera: CameraFile, depth: DepthImage) -> None:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """The fields of a JSON or YAML file; of the first document, where it has several."""
+    """Return the fields of a JSON or YAML file; of the first document if there are several."""
     what = "the intrinsics of a camera"
     regular_file(path, what, DatasetError, LARGEST_FILE)
     try:
@@ -138,12 +143,12 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _fields(content: Mapping[Any, Any]) -> dict[str, Any]:
-    """Fields by their names in small letters."""
+    """Convert field names to lower case."""
     return {str(name).lower(): value for name, value in content.items()}
 
 
 def _depth_camera(content: dict[str, Any]) -> dict[str, Any] | None:
-    """The fields of the depth camera, wherever a file has them; None if it has none."""
+    """Return the fields of the depth camera at any supported place; None if there is none."""
 
     def inside(names: Sequence[str]) -> list[dict[str, Any]]:
         return [
@@ -157,20 +162,20 @@ def _depth_camera(content: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _has_intrinsics(camera: dict[str, Any]) -> bool:
-    """Whether fields hold the intrinsics of a camera."""
+    """Return True if fields contain the intrinsics of a camera."""
     focal = "fx" in camera and "fy" in camera
     points = any(cx in camera and cy in camera for cx, cy in PRINCIPAL_POINTS)
     return _first(camera, MATRICES) is not None or (focal and points)
 
 
 def _intrinsics(camera: dict[str, Any]) -> Float:
-    """The pinhole matrix of a camera, (3, 3)."""
+    """Return the pinhole matrix of a camera, (3, 3)."""
     given = _first(camera, MATRICES)
     if isinstance(given, Mapping) and _has_intrinsics(_fields(given)):
         return _intrinsics(_fields(given))  # Zivid: FX, FY, CX, CY inside
     if given is not None:
         matrix = _numbers(given).reshape(3, 3)
-        # Open3D writes it column by column
+        # Open3D writes the matrix in column-major order
         by_columns = not matrix[:2, 2].any() and matrix[2, :2].any()
         return matrix.T.copy() if by_columns else matrix
     cx, cy = next(names for names in PRINCIPAL_POINTS if names[0] in camera)
@@ -178,13 +183,13 @@ def _intrinsics(camera: dict[str, Any]) -> Float:
 
 
 def _part_of_sensor(camera: dict[str, Any]) -> tuple[Float, tuple[int, int] | None]:
-    """Where the images begin on the sensor, (2,), pixels, and their size, if it is told.
+    """Return the offset of the images on the sensor, (2,), pixels, and their size, if known.
 
-    A camera that is read out in part says where: fields x_offset and y_offset of its own, or in
-    ROS's ``roi``, whose width and height are then those of the images (0: all).
+    A cropped camera has fields x_offset and y_offset of its own, or in the ``roi`` of ROS, whose
+    width and height are then those of the images (0: all).
 
     Raises:
-        ValueError: pixels are put together.
+        ValueError: the images are binned.
     """
     if any(float(camera.get(f"binning_{axis}") or 1) > 1 for axis in "xy"):
         raise ValueError("it puts pixels together: give the intrinsics of its images")
@@ -201,8 +206,8 @@ def _part_of_sensor(camera: dict[str, Any]) -> tuple[Float, tuple[int, int] | No
 
 
 def _coefficients(values: Any) -> Float:
-    """The coefficients of a distortion, (N,): a list, or fields as Zivid has them (K1, P1)."""
-    if values is None or isinstance(values, str):  # the name of its model
+    """Return the distortion coefficients, (N,), from a list or from fields (K1, P1; Zivid)."""
+    if values is None or isinstance(values, str):  # the name of a distortion model
         return np.zeros(0)
     if isinstance(values, Mapping) and "data" not in _fields(values):
         values = [each for each in values.values() if not isinstance(each, str)]
@@ -210,13 +215,13 @@ def _coefficients(values: Any) -> Float:
 
 
 def _numbers(values: Any) -> Float:
-    """The numbers of a list as a row, (N,).
+    """Return the numbers of a list as an array, (N,).
 
-    It may be a list of rows, or in a field "data", as ROS calibrations and OpenCV have it.
+    The list may contain rows, or be in a field "data", as in ROS calibrations and OpenCV files.
 
     Raises:
         ValueError: there are more than a camera has.
-        TypeError: they are no numbers.
+        TypeError: they are not numbers.
     """
     if isinstance(values, Mapping):
         values = _fields(values).get("data", [])
@@ -230,12 +235,12 @@ def _numbers(values: Any) -> Float:
 
 
 def _first(fields: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """The value of the first of some names that is there, or None."""
+    """Return the value of the first of some names that exists, or None."""
     return next((fields[name] for name in names if name in fields), None)
 
 
 def _scale(value: Any) -> float | None:
-    """The depth scale in metres that a step stands for; None if there is none."""
+    """Return the depth scale in metres per unit; None if there is none."""
     if value is None:
         return None
     number = float(value)

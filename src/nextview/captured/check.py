@@ -1,4 +1,4 @@
-"""Check captured frames: leave out unusable ones, and refuse wrong poses."""
+"""Check captured frames: leave out unusable ones, and reject wrong poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,18 +19,18 @@ from nextview.sensing.mistakes import (
     fitted_mistakes,
 )
 
-# frames of a capture that are compared with each other, evenly spread
+# largest number of frames compared with each other, evenly spread
 MOST_COMPARED_FRAMES = 60
-MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
-# A frame contradicts the others if more of it is contradicted than this share, ...
+MOST_REFUSED = 0.1  # largest share of frames left out; a single one is always allowed
+# A frame contradicts the others if more than this share of its points is contradicted, ...
 MUCH_CONTRADICTED = 0.5
-# ... or than this one, if that is also so many times what is usual.
+# ... or more than this share, if that is also this multiple of the usual share.
 UNUSUALLY_CONTRADICTED = 0.3
 TIMES_USUAL = 4.0
-# share of what stands on the plane that is contradicted where frames disagree altogether
+# contradicted share of the points above the plane if all frames are inconsistent
 CONTRADICTED_IN_ALL = 0.3
-FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
-NAMED_FRAMES = 3  # frames that are named in a sentence; of others the number is told
+FEWEST_TO_BLAME = 5  # least number of frames for single ones to be left out
+NAMED_FRAMES = 3  # frames named in a message; the others are counted
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
     "TUM RGB-D": "this layout, 5000 per metre",
@@ -43,24 +43,24 @@ def check_capture(
     capture: Capture,
     masked: bool = True,
 ) -> tuple[Capture, dict[str, str]]:
-    """Find out which frames of a capture can be used, and whether their poses fit together.
+    """Find the usable frames of a capture, and check that their poses are consistent.
 
     Args:
         capture: its images are read.
         masked: whether the masks of the folder will be used.
 
     Returns:
-        The capture with the frames that can be used, and why the others cannot, by name.
+        The capture with the usable frames, and the reasons for the others, by name.
 
     Raises:
-        DatasetError: more than a tenth of the frames cannot be used, or what they show does not
-            agree about one rigid scene: what it looks like, in one sentence.
+        DatasetError: more than a tenth of the frames cannot be used, or they are inconsistent with
+            one rigid scene; the message names the likely mistake.
     """
     refused = dict(capture.unreadable)
     compared, frames = _read_some(capture, masked, refused)
     refuse_many(capture, refused, len(capture.frames) + len(capture.unreadable))
 
-    if capture.object_is_world:  # then only masks tell what does not move
+    if capture.object_is_world:  # then only the masked pixels are static
         with_mask = [i for i, frame in enumerate(frames) if frame.mask is not None]
         compared = compared[with_mask]
         frames = [frames[i] for i in with_mask]
@@ -73,15 +73,15 @@ def check_capture(
 
 
 def refuse_many(capture: Capture, refused: Mapping[str, str], total: int) -> None:
-    """Refuse a capture of which too many frames cannot be used.
+    """Reject a capture with too many unusable frames.
 
     Args:
         capture: the capture.
-        refused: reasons by the names of the frames.
+        refused: reasons by frame name.
         total: number of all frames.
 
     Raises:
-        DatasetError: they are more than one and more than a tenth.
+        DatasetError: more than one frame and more than a tenth are unusable.
     """
     if len(refused) == total or len(refused) > max(1, MOST_REFUSED * total):
         what = f"{len(refused)} of {total} frames cannot be used"
@@ -89,7 +89,7 @@ def refuse_many(capture: Capture, refused: Mapping[str, str], total: int) -> Non
 
 
 def summary(refused: Mapping[str, str]) -> str:
-    """Which frames are refused and why, in one phrase; of many reasons the commonest."""
+    """Summarise the unusable frames and the most frequent reason in one phrase."""
     reasons = list(refused.values())
     commonest = max(reasons, key=reasons.count)
     names = [name for name, reason in refused.items() if reason == commonest]
@@ -107,7 +107,7 @@ def _read_some(
     masked: bool,
     refused: dict[str, str],
 ) -> tuple[np.ndarray, list[Frame]]:
-    """Read frames that are spread evenly; those that cannot be read are added to ``refused``."""
+    """Read evenly spread frames; unreadable ones are added to ``refused``."""
     count = len(capture.frames)
     spread = np.unique(
         np.linspace(0, count - 1, min(count, MOST_COMPARED_FRAMES)).astype(int)
@@ -130,7 +130,7 @@ def _read_some(
 
 
 def _read(captured: CapturedFrame, masked: bool) -> Frame | None:
-    """A frame; None if its mask is empty: then it does not show the object, which is no mistake."""
+    """Read a frame; None if its mask is empty, which means that the object is not visible."""
     try:
         return captured.read(masked)
     except ObservationError:
@@ -145,7 +145,7 @@ def _contradicting(
     compared: np.ndarray,
     frames: list[Frame],
 ) -> dict[str, str]:
-    """Frames that contradict the others and why; DatasetError if it is not only a few."""
+    """Return frames that contradict the others, with reasons; DatasetError if they are many."""
     rng = np.random.default_rng(0)
     views = [surface_view(frame, rng) for frame in frames]
     poses = np.stack([frame.pose for frame in capture.frames])
@@ -192,7 +192,7 @@ def _contradicting(
 
 
 def _stored(capture: Capture) -> Stored:
-    """How the layout of a capture stores its frames."""
+    """Return the storage conventions of a capture's layout."""
     of_bop = capture.layout == "BOP"
     return Stored(
         to_world=not of_bop,
@@ -207,18 +207,18 @@ def _stored(capture: Capture) -> Stored:
 
 
 def _disagree(capture: Capture, looks: str) -> DatasetError:
-    """The error where a mistake explains what the frames contradict."""
+    """Return the error for contradictions that a mistake explains."""
     problem = "its frames do not agree about one rigid object, and without this mistake they would"
     return DatasetError(f"{capture.folder}: {problem}: {looks}")
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """Agreement of N frames, by what is judged.
+    """Agreement of N frames.
 
     Attributes:
         all: of all points.
-        standing: of the points that stand out of the largest plane.
+        standing: of the points above the largest plane.
     """
 
     all: Agreement
@@ -226,10 +226,10 @@ class PoseEvidence:
 
     @classmethod
     def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "PoseEvidence":
-        """Compare frames under some poses.
+        """Compare frames with given poses.
 
         Args:
-            views: surfaces that the frames show.
+            views: surfaces of the frames.
             poses: camera-to-world, (N, 4, 4).
 
         Returns:
@@ -262,15 +262,15 @@ def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
 
 
 def _enough_judged(agreement: Agreement) -> np.ndarray:
-    """The confirmed share of each frame, (N,); 1 where too few of its points could be judged."""
+    """Return the confirmed share of each frame, (N,); 1 if too few points were judged."""
     share, judged = agreement.of_each()
     return np.where(judged >= LEAST_EXPLAINED, share, 1.0)
 
 
 def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
-    """Return whether the remaining frames contradict each other about the object.
+    """Return True if the remaining frames contradict each other about the object.
 
-    All of them do, or those from one frame on contradict those before.
+    Either all of them do, or those from some frame on contradict the earlier ones.
     """
     standing = evidence.standing.of_frames(left)
     if standing.judged >= LEAST_EXPLAINED and 1 - standing.share > CONTRADICTED_IN_ALL:
@@ -284,7 +284,7 @@ def _unexplained(
     compared: np.ndarray,
     evidence: PoseEvidence,
 ) -> DatasetError:
-    """The error where the frames contradict each other, and no usual mistake explains it."""
+    """Return the error for contradictions that no usual mistake explains."""
     contradicted = 1 - min(evidence.all.share, evidence.standing.share)
     problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "
     problem += "show in common is contradicted), and no usual mistake explains it"
@@ -323,7 +323,7 @@ def _break(agreement: Agreement) -> int:
 
 
 def _across(agreement: Agreement, first: int) -> Agreement:
-    """That of the frames from one on with those before."""
+    """Return the agreement of the frames from one on with the earlier ones."""
     later = np.arange(len(agreement.confirmed)) >= first
     return agreement.among(later[:, None] != later)
 
@@ -333,7 +333,7 @@ def _late_frames(
     compared: np.ndarray,
     shifts: Sequence[Shift],
 ) -> dict[str, str]:
-    """Return frames with the poses of others, and why they are left out."""
+    """Return frames that have the poses of other frames, and why they are left out."""
     refused = {}
     for shift in shifts:
         reason = f"its pose is {_frames_late(shift)}"
@@ -343,7 +343,7 @@ def _late_frames(
 
 
 def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str:
-    """From which frame on the poses are late, or up to which."""
+    """Describe the frame from which, or up to which, poses are late."""
     first = capture.frames[compared[shift.first]].name
     last = capture.frames[compared[shift.end - 1]].name
     late = f"the poses are {_frames_late(shift)}"
@@ -356,7 +356,7 @@ def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str
 
 
 def _frames_late(shift: Shift) -> str:
-    """Return by how many frames poses are late, in words."""
+    """Describe by how many frames poses are late."""
     many = "one frame" if abs(shift.frames) == 1 else f"{abs(shift.frames)} frames"
     if shift.frames > 0:
         return f"{many} late: each frame has the pose of an earlier one"

@@ -1,8 +1,8 @@
-"""Depth images in a folder beside the intrinsics of their camera, as RealSense tools write them.
+"""Read a folder of depth images with camera intrinsics, as written by RealSense tools.
 
-``depth/NAME.png``; the intrinsics in one of ``CAMERA_FILES``; if there, ``color/NAME.png`` or
-.jpg of the same size, ``masks/NAME.png``, and the poses, camera-to-world, in metres: a file
-``poses/NAME.txt`` for each image, ``poses.json`` (matrices by name, or a list of them in the
+Depth images are ``depth/NAME.png``; the intrinsics are in one of ``CAMERA_FILES``. Optional are
+``color/NAME.png`` or .jpg of the same size, ``masks/NAME.png``, and camera-to-world poses in
+metres: a file ``poses/NAME.txt`` for each image, ``poses.json`` (matrices by name, or a list in the
 order of the images), or ``trajectory.log`` (Open3D).
 """
 
@@ -40,12 +40,14 @@ CAMERA_FILES = (
     "camera_intrinsic.json",
     "camera.json",
 )
-CAMERA_TABLES = ("cam_K.txt", "intrinsics.txt")  # a pinhole matrix alone
+CAMERA_TABLES = ("cam_K.txt", "intrinsics.txt")  # contain only a pinhole matrix
 POSES = ("poses", "pose")
 MASKS = ("masks", "mask")
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
-LINES_OF_A_POSE = 5  # in Open3D's log: three numbers, and the rows of the matrix
+LINES_OF_A_POSE = (
+    5  # in Open3D's log: a line of three numbers, and the rows of the matrix
+)
 ASK_FOR_SCALE = (
     "nothing says what one step of the depth images stands for: give --depth-scale, in metres"
     " (0.001 if they are in millimetres)"
@@ -53,9 +55,9 @@ ASK_FOR_SCALE = (
 
 
 def is_depth_folder(folder: Path) -> bool:
-    """Whether a folder holds depth images in ``depth/``, and is not BOP's without its cameras.
+    """Return True if a folder has depth images in ``depth/`` and is not an incomplete BOP folder.
 
-    BOP's has ``mask_visib/`` too; without ``scene_camera.json`` it was not written to its end.
+    A BOP folder also has ``mask_visib/``; without ``scene_camera.json`` it is incomplete.
     """
     if (folder / "mask_visib").is_dir():
         return False
@@ -70,13 +72,13 @@ def read_depth_folder(
     """Read the poses and the intrinsics of a folder of depth images.
 
     Args:
-        folder: which ``is_depth_folder``.
-        given: its camera, if not that of the folder.
-        scale: metres that one step of the images stands for, if not that of the folder.
+        folder: see ``is_depth_folder``.
+        given: camera that replaces that of the folder.
+        scale: metres per unit of the images, which replaces that of the folder.
 
     Raises:
-        DatasetError: intrinsics or depth scale are missing; there are no poses, and more than one
-            image; or a file is damaged.
+        DatasetError: intrinsics or depth scale are missing; there are several images without poses;
+            or a file is damaged.
     """
     camera, notes = _camera(folder, given)
     if scale is None and camera.scale is not None:
@@ -88,7 +90,7 @@ def read_depth_folder(
     images = sorted(folder.glob("depth/*.png"))
     poses, unreadable, of_poses = _poses(folder, [path.stem for path in images])
 
-    # Which way is up in its world, no file says.
+    # No file defines the up direction of the world.
     views = LayoutViews([], [*notes, of_poses], unreadable, z_is_up=False)
     for path in images:
         depth = DepthFile(path)
@@ -119,12 +121,12 @@ def read_depth_image(
     camera: CameraFile | None,
     scale: float | None,
 ) -> LayoutViews:
-    """A single depth image: its camera is the world.
+    """Read a single depth image, whose camera frame is the world frame.
 
     Args:
-        path: grey PNG of 16 bits.
-        camera: that took it.
-        scale: metres that one step stands for; None if the camera's file says it.
+        path: 16-bit grey PNG.
+        camera: of the image.
+        scale: metres per unit; None if the camera file has it.
 
     Raises:
         DatasetError: intrinsics or depth scale are missing.
@@ -143,7 +145,7 @@ def read_depth_image(
 
 
 def _camera(folder: Path, given: CameraFile | None) -> tuple[CameraFile, list[str]]:
-    """The camera of a folder, and a note of where it is described, if it was not given."""
+    """Return the camera of a folder, and a note of its source if it was not given."""
     described = [folder / name for name in CAMERA_FILES if (folder / name).exists()]
     tables = [folder / name for name in CAMERA_TABLES if (folder / name).exists()]
     if described:
@@ -175,7 +177,7 @@ def _poses(
     folder: Path,
     names: list[str],
 ) -> tuple[dict[str, Float], dict[str, str], str]:
-    """Poses of images by their names, why others cannot be read, and a note of where they are."""
+    """Return poses by image name, reasons for unreadable ones, and a note of their source."""
     for inside in POSES:
         if next(folder.glob(f"{inside}/*.txt"), None):
             poses, unreadable = _pose_files(folder / inside, names)
@@ -200,7 +202,7 @@ def _pose_files(
     folder: Path,
     names: list[str],
 ) -> tuple[dict[str, Float], dict[str, str]]:
-    """Poses of a file for each image."""
+    """Read poses from one file per image."""
     poses = {}
     unreadable = {}
     for name in names:
@@ -213,7 +215,7 @@ def _pose_files(
 
 
 def _pose_list(path: Path, names: list[str]) -> tuple[dict[str, Float], dict[str, str]]:
-    """Poses of one JSON file, by name or in order."""
+    """Read poses from one JSON file, by name or in order."""
     Matrix = list[list[float]]
     found = read_record(path, dict[str, Matrix] | list[Matrix], "poses", DatasetError)  # type: ignore[arg-type]
     if isinstance(found, list):
@@ -231,14 +233,14 @@ def _pose_list(path: Path, names: list[str]) -> tuple[dict[str, Float], dict[str
 
 
 def _matrix(rows: list[list[float]], path: Path) -> Float:
-    """A pose as it stands in a file, (4, 4)."""
+    """Return a pose from the rows of a file, (4, 4)."""
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
         raise DatasetError(f"{path}: a pose is 4 rows of 4 numbers")
     return np.array(rows, np.float64)
 
 
 def _log(path: Path) -> list[Any]:
-    """The matrices of an Open3D log, in order."""
+    """Return the matrices of an Open3D log, in order."""
     regular_file(path, "a log of poses", DatasetError, LARGEST_TEXT)
     try:
         lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
@@ -260,7 +262,7 @@ def _in_order(
     matrices: list[Any],
     names: list[str],
 ) -> tuple[dict[str, Float], dict[str, str]]:
-    """Poses that stand in the order of the images."""
+    """Assign poses in the order of the images."""
     if len(matrices) != len(names):
         raise DatasetError(
             f"{path}: holds {len(matrices)} poses for {len(names)} depth images"
@@ -276,7 +278,7 @@ def _in_order(
 
 
 def _beside(folder: Path, inside: tuple[str, ...], name: str) -> Path | None:
-    """The picture of an image's name in one of some folders, if there is one."""
+    """Return the image of the same name in one of some folders, if there is one."""
     paths = (
         folder / each / f"{name}{ending}" for each in inside for ending in IMAGE_ENDINGS
     )

@@ -1,4 +1,4 @@
-"""Captured objects: depth images with poses, in folders of several layouts and in ROS 2 bags.
+"""Read captures: depth images with poses, in folders of several layouts and in ROS 2 bags.
 
 BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shotton et al., CVPR
 2013.
@@ -42,15 +42,15 @@ from nextview.geometry.pinhole import pinhole_matrix
 from nextview.sensing.object_frame import Box
 from nextview.types import Float
 
-# the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
+# pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
 INTRINSICS = "camera-intrinsics.txt"
-TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
-# seconds that an image and its pose, or depth and colour, may be apart
+TUM_STEP = 1 / 5000  # metres per unit of TUM's depth images
+# seconds, largest time difference of an image and its pose, or of depth and colour
 STAMP_DIFFERENCE = 0.02
-MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
-# fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
+MOST_LOST = 0.1  # largest share of the lines of a trajectory without a valid pose
+# fx, fy, cx, cy of the depth camera in all scenes of 7-Scenes
 KINECT = (585.0, 585.0, 320.0, 240.0)
-# metres that a step of a depth image may stand for; a float image has 1
+# metres, largest unit of an integer depth image; a float image has 1
 LARGEST_SCALE = 0.05
 # as given by hand, see ``read_capture``
 Intrinsics = tuple[float, float, float, float] | str | Path | None
@@ -58,17 +58,16 @@ Intrinsics = tuple[float, float, float, float] | str | Path | None
 
 @dataclass(frozen=True)
 class Reading:
-    """What is said of captured frames by hand; None where their files are believed.
+    """Options for reading captured frames; None for the values in their files.
 
     Attributes:
         intrinsics: fx, fy, cx, cy, pixels, first pixel's centre at 0, or a file with them, see
             ``camera_file``.
-        object_id: which object of a BOP scene with several.
-        depth_scale: metres that one step of the depth images stands for; 0.001 for millimetres.
-        depth_topic: of a ROS 2 bag with several of depth.
-        world_frame: of a ROS 2 bag: the frame of its tf that is the world, z up; the root of the
-            tree, if not given.
-        at: of a ROS 2 bag of a camera that stands still: which image; see ``read_bag``.
+        object_id: number of the object in a BOP scene with several.
+        depth_scale: metres per unit of the depth images; 0.001 for millimetres.
+        depth_topic: of a ROS 2 bag with several depth topics.
+        world_frame: of a ROS 2 bag: tf frame of the world, z up; by default the root of the tree.
+        at: of a ROS 2 bag of a static camera: image to use; see ``read_bag``.
     """
 
     intrinsics: Intrinsics = None
@@ -88,14 +87,14 @@ def read_capture(
     world_frame: str | None = None,
     at: At = None,
 ) -> Capture:
-    """Read the poses and intrinsics of captured frames, whatever layout they have.
+    """Read the poses and intrinsics of captured frames in any supported layout.
 
     The images are read when they are used.
 
     Args:
         path: a folder of one of ``FOLDER_LAYOUTS``, a ROS 2 bag (a folder, or its .mcap or .db3
-            file), or one depth image (.png).
-        intrinsics: see ``Reading``, as all others.
+            file), or a single depth image (.png).
+        intrinsics: see ``Reading``, like all others.
         object_id: of a BOP scene.
         depth_scale: metres.
         depth_topic: of a bag.
@@ -103,9 +102,9 @@ def read_capture(
         at: of a bag.
 
     Raises:
-        DatasetError: what is missing or wrong, and in which file.
-        UsageError: an option is for another layout, or makes no sense.
-        MissingExtraError: bags are read by the extra "bags".
+        DatasetError: something is missing or wrong; the message names the file.
+        UsageError: an option is for another layout, or invalid.
+        MissingExtraError: bags need the extra "bags".
     """
     path = Path(path)
     if depth_scale is not None:
@@ -140,7 +139,7 @@ def read_capture(
 
 
 def _check_sizes(camera: CameraFile, views: LayoutViews) -> None:
-    """See that images have the size of their camera's; damaged ones become unreadable."""
+    """Check that images have the size of their camera; damaged ones become unreadable."""
     for frame in list(views.frames):
         try:
             frame.size  # noqa: B018  # reads the header of a file
@@ -152,14 +151,14 @@ def _check_sizes(camera: CameraFile, views: LayoutViews) -> None:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a folder, or a file of a bag, holds captured frames of one of the layouts."""
+    """Return True if a folder or a bag file contains captured frames in one of the layouts."""
     if path.is_dir():
         return bool(_layouts_in(path)) or is_bag(path) or is_depth_folder(path)
     return is_bag(path)
 
 
 def _layout_of(path: Path) -> str:
-    """The layout of a folder or file; a DatasetError where it has none, or two."""
+    """Return the layout of a folder or file; DatasetError if there is none, or if there are two."""
     if is_bag(path):
         return BAG
     if path.is_file() and path.suffix.lower() == ".png":
@@ -186,7 +185,7 @@ def _layout_of(path: Path) -> str:
 
 
 def _layouts_in(folder: Path) -> list[str]:
-    """The layouts whose marks a folder has."""
+    """Return the layouts whose marker files a folder has."""
     return [
         layout
         for layout, files in LAYOUT_MARKS.items()
@@ -195,10 +194,10 @@ def _layouts_in(folder: Path) -> list[str]:
 
 
 def _check_scale(scale: float) -> None:
-    """Refuse a depth scale that is no length of a step.
+    """Check that a depth scale is a plausible unit.
 
     Raises:
-        UsageError: it may be steps a metre.
+        UsageError: it may be units per metre.
     """
     number(scale, "the depth scale, in metres,", above=0)
     if scale > LARGEST_SCALE and scale != 1:
@@ -214,7 +213,7 @@ def _check_scale(scale: float) -> None:
 
 
 def _check_options(path: Path, layout: str, how: Reading) -> None:
-    """Refuse options that are for another layout."""
+    """Reject options that are for another layout."""
     if how.object_id is not None and layout != "BOP":
         raise UsageError(
             f"objects have numbers in BOP's layout only, and {path} has the layout of {layout}"
@@ -227,10 +226,10 @@ def _check_options(path: Path, layout: str, how: Reading) -> None:
 
 
 def _check_links(folder: Path) -> None:
-    """See that a capture from elsewhere reads no other files of this machine."""
+    """Check that links in a downloaded capture do not lead to other files of this machine."""
     inside = os.path.realpath(folder)
     for path in folder.rglob("*"):
-        # Not Path.resolve, which raises where links go round in a circle.
+        # Path.resolve raises an error for circular links.
         if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(
             inside
         ):
@@ -240,7 +239,7 @@ def _check_links(folder: Path) -> None:
 
 
 def _given_camera(path: Path, given: Intrinsics) -> tuple[CameraFile | None, list[str]]:
-    """The camera that was given or lies in the folder, if any, and a note of it."""
+    """Return the camera from the options or the folder, if any, and a note of its source."""
     if isinstance(given, tuple):
         camera = CameraFile(pinhole_matrix(*given), None, None)
         return camera, ["intrinsics as given"]
@@ -251,12 +250,12 @@ def _given_camera(path: Path, given: Intrinsics) -> tuple[CameraFile | None, lis
 
 
 def _matrix(camera: CameraFile | None) -> Float | None:
-    """The pinhole matrix of a camera, (3, 3), if there is one."""
+    """Return the pinhole matrix of a camera, (3, 3), if there is one."""
     return None if camera is None else camera.intrinsics
 
 
 def _no_capture(folder: Path) -> str:
-    """Why a folder is no capture: it may be one of meshes."""
+    """Explain why a folder is not a capture, for example because it contains meshes."""
     if mesh := next(
         (f for f in islice(folder.rglob("*"), 1000) if f.suffix.lower() in FORMATS),
         None,
@@ -290,7 +289,7 @@ def read_box(path: Path) -> Box:
 
 
 def _read_tum(folder: Path, camera: CameraFile | None, _: Reading) -> LayoutViews:
-    """Read views by depth.txt and groundtruth.txt, with images and masks if there are any."""
+    """Read views from depth.txt and groundtruth.txt, with images and masks if there are any."""
     intrinsics = _matrix(camera)
     if intrinsics is None:
         raise DatasetError(
@@ -352,9 +351,9 @@ def _read_seven_scenes(
     camera: CameraFile | None,
     _: Reading,
 ) -> LayoutViews:
-    """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png.
+    """Read views from frame-*.depth.png and .pose.txt, with masks from .mask.png.
 
-    The colour images are not registered.
+    The colour images are not registered to the depth.
     """
     notes = []
     intrinsics = _matrix(camera)
@@ -364,7 +363,7 @@ def _read_seven_scenes(
             "there is no camera-intrinsics.txt: the Kinect's fx = fy = 585, cx = 320, cy = 240 are"
             " assumed"
         )
-    # its world is that of its first camera
+    # the world frame is the first camera frame
     views = LayoutViews([], notes, z_is_up=False)
     for depth in sorted(folder.glob("frame-*.depth.png")):
         name = depth.name.removeprefix("frame-").removesuffix(".depth.png")
@@ -382,7 +381,7 @@ def _read_seven_scenes(
     return views
 
 
-LAYOUT_MARKS = {  # a file that tells each layout
+LAYOUT_MARKS = {  # a file that identifies each layout
     "BOP": "scene_camera.json",
     "TUM RGB-D": "depth.txt",
     "7-Scenes": "frame-*.depth.png",
@@ -393,7 +392,7 @@ BAG = "ROS 2 bag"
 
 
 def _nearest(time: float, others: Float) -> int | None:
-    """Return which of other times, (N,) seconds, is nearest, if it is near enough."""
+    """Return the index of the nearest of other times, (N,) seconds, if it is close enough."""
     gaps = np.abs(others - time)
     return (
         int(gaps.argmin())
@@ -403,7 +402,7 @@ def _nearest(time: float, others: Float) -> int | None:
 
 
 def _images(path: Path) -> tuple[Float, list[Path]]:
-    """Times, (N,) seconds, and the images beside the list."""
+    """Return times, (N,) seconds, and image paths from a list."""
     lines = lines_of(path, 2, "times and names of images")
     for outside in (
         word
@@ -424,7 +423,7 @@ def _trajectory(path: Path) -> tuple[Float, Float, int]:
     good = np.isfinite(values).all(1) & (np.abs(length - 1) <= 0.01)
 
     if np.mean(~good) > MOST_LOST:
-        values = numbers_of(path, words)  # says where NaN is the reason
+        values = numbers_of(path, words)  # raises an error that names NaN
         worst = max(length, key=lambda n: abs(n - 1))
         raise DatasetError(f"{path}: a quaternion has the length {worst:.3g}, not 1")
     values = values[good]
@@ -459,4 +458,4 @@ FOLDER_LAYOUTS: dict[
         how.at,
     ),
 }
-"""What reads the views of each layout."""
+"""Reader of each layout."""

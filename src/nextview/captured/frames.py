@@ -1,4 +1,4 @@
-"""Captured frames as they lie on the disk, and what all layouts of them are read with."""
+"""Captured frames on disk, and helpers for all layouts."""
 
 import warnings
 from collections.abc import Iterator
@@ -18,18 +18,20 @@ from nextview.files import regular_file
 from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
 from nextview.types import Float, Float32
 
-NO_DEPTH = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
+NO_DEPTH = np.iinfo(
+    np.uint16
+).max  # marks invalid depth in some sensors, in addition to 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
 GREY_MODES = ("1", "L", "LA", "La")  # its names of grey images of 8 bits or fewer
 LARGEST_TEXT = 2**26  # bytes of a list of images or poses
-# of a depth image or a picture beside it: 4096 x 4096. A PNG of some hundred kilobytes can claim,
-# and hold, a thousand times as much
+# of a depth or colour image: 4096 x 4096. A PNG of some hundred kilobytes can declare, and contain,
+# a thousand times as many
 MOST_PIXELS = 2**24
 MILLIMETRES = 0.001
 
 
 class DepthImage(Protocol):
-    """Where the depth of a captured frame is kept; ``str`` names it in errors."""
+    """Source of the depth of a captured frame; ``str`` names it in errors."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -37,11 +39,11 @@ class DepthImage(Protocol):
         ...
 
     def read(self) -> NDArray[np.uint16] | Float32:
-        """Read the image, (H, W): uint16 steps, of which 0 and 65535 mean nothing, or float32.
+        """Read the image, (H, W): uint16 units, where 0 and 65535 are invalid, or float32.
 
         Raises:
             DatasetError: it is damaged.
-            ObservationError: it is no depth image.
+            ObservationError: it is not a depth image.
         """
         ...
 
@@ -51,14 +53,14 @@ class DepthFile:
     """A depth image in a file.
 
     Attributes:
-        path: grey PNG of 16 bits.
+        path: 16-bit grey PNG.
     """
 
     path: Path
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """Width and height, pixels, from the file's header alone."""
+        """Width and height, pixels, from the file header."""
         regular_file(self.path, "an image", DatasetError)
         try:
             return png_size(self.path)
@@ -66,7 +68,7 @@ class DepthFile:
             raise DatasetError(f"{self.path}: {error}") from None
 
     def read(self) -> NDArray[np.uint16]:
-        """Read the steps of the image, (H, W).
+        """Read the depth in units of the file, (H, W).
 
         Raises:
             DatasetError: it is damaged, or has 8 bits.
@@ -83,16 +85,16 @@ class DepthFile:
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """A captured view, as yet unread.
+    """A captured view, read on demand.
 
     Attributes:
         name: in the folder.
         depth: image of distances along the optical axis.
-        scale: metres that one step of the depth image stands for.
+        scale: metres per unit of the depth image.
         intrinsics: pinhole matrix, (3, 3) float64, pixels, first pixel's centre at 0 (OpenCV).
         pose: camera-to-world, (4, 4) float64, metres, OpenCV axes.
-        mask: picture that is not black where the object is, if there is one.
-        image: grey or colour picture registered to the depth, if there is one.
+        mask: image that is not black on the object, if there is one.
+        image: grey or colour image registered to the depth, if there is one.
     """
 
     name: str
@@ -112,7 +114,7 @@ class CapturedFrame:
         """Read the images.
 
         Args:
-            masked: whether the mask is read.
+            masked: whether to read the mask.
 
         Raises:
             DatasetError: an image is damaged.
@@ -130,7 +132,7 @@ class CapturedFrame:
         return Frame(depth, self.intrinsics, self.pose, mask, image)
 
     def _check_scale(self, depth: Float32) -> None:
-        """Refuse depth that no camera measures: ``Frame`` would speak of other mistakes."""
+        """Reject implausible depth with a message about the scale, before ``Frame`` does."""
         measured = depth[depth > 0]
         middle = float(np.median(measured)) if len(measured) else NEAREST_MEDIAN
         if not NEAREST_MEDIAN <= middle <= LARGEST_MEDIAN:
@@ -143,14 +145,14 @@ class CapturedFrame:
 
 @dataclass
 class LayoutViews:
-    """What a layout's reader finds.
+    """Views found by the reader of a layout.
 
     Attributes:
         frames: as in ``Capture``, like all but the last.
         notes: a phrase each.
         unreadable: reasons by name.
-        object_is_world: see there.
-        z_is_up: whether the z axis of the world is against gravity; else that is not known.
+        object_is_world: as in ``Capture``.
+        z_is_up: whether the z axis of the world points up; otherwise the direction is not known.
     """
 
     frames: list[CapturedFrame]
@@ -165,14 +167,14 @@ class Capture:
     """Captured views of one scene.
 
     Attributes:
-        folder: or the file that they were read from.
+        folder: or file from which they were read.
         layout: one of ``captured.LAYOUTS``.
         frames: in the folder's order, at least one.
-        up: direction against gravity in its world; None if the layout says nothing.
-        notes: what was assumed or left out, a phrase each.
+        up: direction against gravity in the world; None if the layout does not define it.
+        notes: assumptions and omissions, a phrase each.
         unreadable: frames without a usable pose: name and reason.
-        object_is_world: the poses are relative to the object: what is around it may move.
-        scale_given: the depth scale was given by hand.
+        object_is_world: the poses are relative to the object, and its surroundings may move.
+        scale_given: the depth scale was set by the user.
     """
 
     folder: Path
@@ -209,7 +211,7 @@ def rigid(pose: ArrayLike, where: str) -> Float:
 
 
 def lines_of(path: Path, columns: int, what: str) -> list[list[str]]:
-    """Read the words of each line that is no comment.
+    """Read the words of each line that is not a comment.
 
     Args:
         path: of the file.
@@ -248,7 +250,7 @@ def numbers_of(path: Path, words: list[list[str]], finite: bool = True) -> Float
     Args:
         path: of the file, for messages.
         words: of each line.
-        finite: whether all have to be finite.
+        finite: whether all must be finite.
 
     Returns:
         The numbers.
@@ -288,18 +290,18 @@ def read_table(path: Path, what: str, side: int) -> Float:
 
 
 def _as_grey(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A mask, (H, W) uint8 (ITU-R BT.601)."""
+    """Read a mask, (H, W) uint8 (ITU-R BT.601)."""
     return np.asarray(_opened_as(path, shape).convert("L"))
 
 
 def _picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A picture, (H, W) uint8 if it is grey, else (H, W, 3) uint8, RGB."""
+    """Read an image, (H, W) uint8 if it is grey, else (H, W, 3) uint8, RGB."""
     image = _opened_as(path, shape)
     return np.asarray(image.convert("L" if image.mode in GREY_MODES else "RGB"))
 
 
 def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:
-    """An image of 8 bits and of the depth image's shape; else a DatasetError."""
+    """Open an 8-bit image of the depth image's size; raises DatasetError otherwise."""
     regular_file(path, "an image", DatasetError)
     try:
         with opened_image(path, ("PNG", "JPEG")) as image:
@@ -313,13 +315,13 @@ def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:
                     "has 16 bits where 8 are expected; is it a depth image?"
                 )
             image.load()
-            return image  # its file is closed, its pixels stay
+            return image  # loaded, although the file is closed
     except ObservationError as error:
         raise DatasetError(f"{path}: {error}") from None
 
 
 def png_size(file: Path | BinaryIO) -> tuple[int, int]:
-    """Width and height of a PNG, pixels, from its header alone.
+    """Return width and height of a PNG, pixels, from its header.
 
     Args:
         file: or its path.
@@ -332,7 +334,7 @@ def png_size(file: Path | BinaryIO) -> tuple[int, int]:
 
 
 def steps_of(file: Path | BinaryIO) -> NDArray[np.uint16]:
-    """The steps of a grey PNG of 16 bits, (H, W).
+    """Return the values of a 16-bit grey PNG, (H, W).
 
     Args:
         file: or its path.
@@ -353,18 +355,18 @@ def opened_image(
     file: Path | BinaryIO,
     formats: tuple[str, ...],
 ) -> Iterator[Image.Image]:
-    """Open an image whose pixels fit into memory, as yet unread.
+    """Open an image of limited size without reading its pixels.
 
     Args:
         file: or its path.
-        formats: as Pillow names them.
+        formats: as named by Pillow.
 
     Raises:
         ObservationError: it is damaged, or larger than ``MOST_PIXELS``.
     """
     try:
         with warnings.catch_warnings():
-            # of Pillow's own limit, which lies higher
+            # Pillow's own limit is higher
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(file, formats=formats)
         with image:

@@ -1,9 +1,9 @@
-"""Find the frames of a capture whose poses are those of frames before or after them.
+"""Detect frames of a capture that have the poses of earlier or later frames.
 
-A camera that drops an image, or a recorder that drops a pose, leaves all later frames with the pose
-of a neighbour. Within each part the frames still fit together, and between the parts they do not. A
-turn about the normal of the table leaves the table where it is, so only what stands on it is
-judged.
+If a camera drops an image, or a recorder drops a pose, all later frames have the pose of a
+neighbour. Frames within each part are still consistent, but those of different parts are not. A
+rotation about the normal of the table does not change the table, so only points above it are
+compared.
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,26 @@ from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.mistakes import LEAST_EXPLAINED, explains, relative_change
 from nextview.types import Float, Index, Mask
 
-FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
-MOST_SHIFTED = 4  # frames by which poses may be late after several parts
-# parts that are searched for, one inside the other or one after the other
+FRAME_SHIFTS = (1, -1, 2, -2)  # possible delays of the poses of a part, frames
+MOST_SHIFTED = 4  # largest total delay of several parts, frames
+# largest number of parts, nested or consecutive
 MOST_PARTS = 3
-LEAST_OF_ALL = 0.1  # part of all contradictions that each further part has to explain
-SAME_EXPLAINED = 1e-3  # contradictions that one more frame in a part has to explain
-# part of what parts explain that the same parts explain where the first frames are taken to be
-# right
+LEAST_OF_ALL = 0.1  # least share of all contradictions that a further part explains
+SAME_EXPLAINED = (
+    1e-3  # least number of contradictions that a further frame in a part explains
+)
+# the first frames are taken as correct if the parts then still explain this share
 AS_GOOD = 0.5
 
 
 @dataclass(frozen=True)
 class Shift:
-    """Neighbouring frames, among those that are compared, whose poses are late.
+    """A range of the compared frames whose poses are late.
 
     Attributes:
         first: the first of these frames.
         end: the first frame after them; the number of frames if there is none.
-        frames: by how many frames their poses are late; negative where they are early.
+        frames: delay of their poses in frames; negative if they are early.
     """
 
     first: int
@@ -44,11 +45,11 @@ class Shift:
 
 @dataclass(frozen=True)
 class Shifted:
-    """Agreement of frames when some have the poses of their neighbours.
+    """Agreement of frames if some have the poses of their neighbours.
 
     Attributes:
-        views: N frames, with the points that are judged.
-        indices: which of all frames of the capture they are, (N,).
+        views: N frames, with the compared points.
+        indices: of these frames in the capture, (N,).
         poses: of all frames, camera-to-world, (M, 4, 4).
     """
 
@@ -58,11 +59,11 @@ class Shifted:
     _known: dict[tuple[int, int], Agreement] = field(default_factory=dict)
 
     def agreement(self, late: Index, late_there: Index) -> Agreement:
-        """Return the agreement of frames whose poses or pictures are late.
+        """Return the agreement of frames with late poses or images.
 
         Args:
-            late: by how many frames the pose of each frame is late, by row, (N,).
-            late_there: the same of the frames that it is compared with, by column, (N,).
+            late: delay of the pose of each frame, by row, in frames, (N,).
+            late_there: the same for the frames that it is compared with, by column, (N,).
 
         Returns:
             The agreement.
@@ -79,16 +80,16 @@ class Shifted:
         return Agreement(confirmed, contradicted)
 
     def poses_of(self, late: Index) -> Float:
-        """Return the right poses, (N, 4, 4), if those of the capture are late."""
+        """Return the correct poses, (N, 4, 4), if those of the capture are late."""
         return self.poses[np.clip(self.indices + late, 0, len(self.poses) - 1)]
 
     def has_pose(self, late: Index) -> Mask:
-        """Which frames still have a pose if those in the capture are late, (N,)."""
+        """Return which frames still have a pose if those in the capture are late, (N,)."""
         where = self.indices + late
         return (where >= 0) & (where < len(self.poses))
 
     def _all_late(self, here: int, there: int) -> Agreement:
-        """As ``agreement``, with the same shift for all."""
+        """Return ``agreement`` with the same delay for all frames."""
         if (here, there) not in self._known:
             late = np.full(len(self.views), here)
             late_there = np.full(len(self.views), there)
@@ -108,17 +109,17 @@ def find_shifts(
     indices: Index,
     poses: Float,
 ) -> list[Shift]:
-    """Find parts of a capture whose poses are late or early.
+    """Find ranges of a capture whose poses are late or early.
 
-    Parts are added one by one, each where it explains most contradictions.
+    Ranges are added one by one, each where it explains most contradictions.
 
     Args:
         views: N frames, in the order of the capture.
-        indices: which of all frames of the capture they are, (N,).
+        indices: of these frames in the capture, (N,).
         poses: of all frames, camera-to-world, as read, (M, 4, 4).
 
     Returns:
-        The parts in the order of their first frames, which do not overlap.
+        The ranges, ordered by their first frames, without overlap.
     """
     standing = [view.some(view.standing) for view in views]
     shifted = Shifted(standing, indices, poses)
@@ -136,8 +137,8 @@ def find_shifts(
         late = late.copy()
         late[found.first : found.end] += found.frames
 
-    # On a steady way around a thing only differences between shifts show. Then the first frames are
-    # taken to be right.
+    # On a uniform path around an object only differences between delays are observable. Then the
+    # first frames are taken as correct.
     others = late - late[1]
     others[0] = min(others[0], 0, key=abs)
     if _explained(shifted, as_read, others) >= AS_GOOD * _explained(
@@ -150,7 +151,7 @@ def find_shifts(
 
 
 def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
-    """Return the part that explains most contradictions with later poses; or None."""
+    """Return the range that explains most contradictions with later poses; or None."""
     best = None
     most_explained = least
     for frames in FRAME_SHIFTS:
@@ -173,9 +174,9 @@ def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
 
 
 def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
-    """Count the contradictions that vanish with later poses, by first and last frame.
+    """Count the contradictions that are resolved by later poses, by first and last frame.
 
-    Frames that have no later pose explain nothing.
+    Frames without a later pose explain nothing.
     """
     before = shifted.agreement(late, late).contradicted
     usable = shifted.has_pose(later)
@@ -183,7 +184,7 @@ def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
     leaving = shifted.agreement(later, late).contradicted
     entering = shifted.agreement(late, later).contradicted
 
-    # A frame without a pose is left out of the part: what it contradicts stays as it was.
+    # A frame without a pose is left out of the range, and keeps its contradictions.
     row = usable[:, None]
     column = usable[None]
     within_part = np.where(row & column, before - inside, 0)
@@ -205,19 +206,19 @@ def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
                 + _sum(sums_into, slice(0, count), part)
                 - _sum(sums_into, part, part)
             )
-    # Of parts that explain the same, the shortest is right.
+    # Of ranges that explain the same, the shortest is preferred.
     length = np.arange(count)[None] - np.arange(count)[:, None]
     found -= SAME_EXPLAINED * np.maximum(length, 0)
     return found
 
 
 def _corner_sums(values: Float) -> Float:
-    """Sums of (N, N) over all rows and columns before each, (N + 1, N + 1)."""
+    """Return sums of (N, N) over all rows and columns before each element, (N + 1, N + 1)."""
     return np.pad(values.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
 
 
 def _sum(sums: Float, rows: slice, columns: slice) -> float:
-    """Sum over some rows and columns, from what ``_corner_sums`` gives."""
+    """Return the sum over some rows and columns, from ``_corner_sums``."""
     low = rows.start
     high = rows.stop
     left = columns.start
@@ -228,7 +229,7 @@ def _sum(sums: Float, rows: slice, columns: slice) -> float:
 
 
 def _explained(shifted: Shifted, late: Index, later: Index) -> float:
-    """Count the contradictions that vanish with later poses."""
+    """Count the contradictions that are resolved by later poses."""
     usable = shifted.has_pose(later)
     pairs = usable[:, None] & usable
     before = shifted.agreement(late, late).contradicted[pairs]
@@ -237,7 +238,7 @@ def _explained(shifted: Shifted, late: Index, later: Index) -> float:
 
 
 def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
-    """Return whether frames contradict each other much less with later poses."""
+    """Return True if frames contradict each other much less with later poses."""
     usable = shifted.has_pose(late)
     changed = relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
     changed &= usable[:, None] & usable
@@ -246,7 +247,7 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
 
 
 def _parts(late: Index) -> list[Shift]:
-    """Neighbouring frames with the same shift, but for those without one."""
+    """Return ranges of frames with the same delay, ignoring those without one."""
     ends = [0, *(np.flatnonzero(np.diff(late)) + 1), len(late)]
     found = []
     for first, end in pairwise(ends):

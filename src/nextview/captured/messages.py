@@ -1,9 +1,8 @@
 """Convert ROS messages of a depth camera to arrays.
 
-Nothing here needs ROS: only the fields of the messages count.
-
-Depth images are as REP 118 has them (16UC1 millimetres, 32FC1 metres), optical frames as REP 103 (z
-forward, x right, y down), which are nextview's own axes.
+This module does not need ROS: only the fields of the messages are used. Depth images follow REP 118
+(16UC1 millimetres, 32FC1 metres), and optical frames REP 103 (z forward, x right, y down), which is
+also nextview's convention.
 """
 
 import io
@@ -23,11 +22,11 @@ ENCODINGS: dict[str, np.dtype[Any]] = {
     "mono16": np.dtype(np.uint16),
     "32FC1": np.dtype(np.float32),
 }
-"""How a pixel is stored, by the encoding of a depth image."""
+"""Data type of a pixel, by encoding of a depth image."""
 ENCODING_STEPS = {"16UC1": MILLIMETRES, "mono16": MILLIMETRES, "32FC1": 1.0}
-"""Metres that one step stands for, by the encoding."""
+"""Metres per unit, by encoding."""
 PNG = b"\x89PNG\r\n\x1a\n"
-# of compressed_depth_image_transport, before the PNG: what is compressed, and two parameters of it
+# header of compressed_depth_image_transport before the PNG: format and two parameters
 DEPTH_HEADER = struct.Struct("<iff")
 
 
@@ -37,7 +36,7 @@ def depth_of(image: Any) -> NDArray[Any]:
     They are uint16 millimetres or float32 metres.
 
     Raises:
-        ObservationError: it is no depth image, or shorter than it says.
+        ObservationError: it is not a depth image, or shorter than declared.
     """
     check_encoding(image.encoding)
     kind = ENCODINGS[image.encoding].newbyteorder(">" if image.is_bigendian else "<")
@@ -59,7 +58,7 @@ def depth_of(image: Any) -> NDArray[Any]:
 
 
 def check_encoding(encoding: str) -> None:
-    """Refuse an image that holds no depth; an ObservationError names its encoding."""
+    """Reject an image without depth; an ObservationError names its encoding."""
     if encoding not in ENCODINGS:
         raise ObservationError(
             f"a depth image is {', '.join(ENCODINGS)}, not {encoding!r}: a colour topic?"
@@ -67,7 +66,7 @@ def check_encoding(encoding: str) -> None:
 
 
 def compressed_encoding(message: Any) -> str:
-    """The encoding of the image in a ``sensor_msgs/CompressedImage``; "" if it is not told.
+    """Return the encoding of a ``sensor_msgs/CompressedImage``; "" if it is not given.
 
     Its format is "16UC1; compressedDepth png", or "16UC1; png compressed".
     """
@@ -76,14 +75,14 @@ def compressed_encoding(message: Any) -> str:
 
 
 def depth_of_compressed(message: Any) -> NDArray[Any]:
-    """The pixels of a compressed depth image, as ``depth_of`` has them.
+    """Return the pixels of a compressed depth image, like ``depth_of``.
 
     Args:
         message: ``sensor_msgs/CompressedImage`` of ``compressed_depth_image_transport``, in PNG.
-            Floats are kept there as 16 bits of inverse depth.
+            Floats are stored as 16-bit inverse depth.
 
     Raises:
-        ObservationError: it is no depth image, is compressed otherwise, or is damaged.
+        ObservationError: it is not a depth image, has another compression, or is damaged.
     """
     encoding = compressed_encoding(message)
     check_encoding(encoding)
@@ -107,20 +106,20 @@ def depth_of_compressed(message: Any) -> NDArray[Any]:
 
 
 def compressed_size(message: Any) -> tuple[int, int]:
-    """Width and height of a compressed depth image, pixels, from the header of its PNG alone.
+    """Return width and height of a compressed depth image, pixels, from the header of its PNG.
 
     Args:
         message: see ``depth_of_compressed``.
 
     Raises:
-        ObservationError: it is no depth image, is compressed otherwise, or is damaged.
+        ObservationError: it is not a depth image, has another compression, or is damaged.
     """
     check_encoding(compressed_encoding(message))
     return png_size(_png_in(message)[1])
 
 
 def _png_in(message: Any) -> tuple[int, io.BytesIO]:
-    """Where the PNG of a compressed depth image begins, bytes, and the PNG."""
+    """Return the offset of the PNG in a compressed depth image, bytes, and the PNG."""
     data = bytes(message.data)
     start = data.find(PNG, 0, DEPTH_HEADER.size + len(PNG))
     if start < 0:
@@ -137,11 +136,12 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Float:
 
     Args:
         info: the message.
-        rectified: whether the images are: then ``p`` counts, and the distortion ``d`` is undone
-            already.
+        rectified: whether the images are rectified: then ``p`` is used, and the distortion ``d`` is
+            already removed.
 
     Raises:
-        ObservationError: the camera is not calibrated, distorts, or gives binned or cropped images.
+        ObservationError: the camera is not calibrated, has distortion, or its images are binned or
+            cropped.
     """
     binned = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     if binned != (1, 1) or info.roi.x_offset or info.roi.y_offset:
@@ -168,16 +168,16 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Float:
 def pose_of(transform: Any) -> Float:
     """Return a ``geometry_msgs/TransformStamped`` as a matrix, (4, 4).
 
-    It maps the frame of its child into the frame of its header.
+    It maps the child frame to the frame of the header.
 
     Raises:
-        ObservationError: the quaternion is none of a rotation.
+        ObservationError: the quaternion is not a unit quaternion.
     """
     return matrix_of(*parts_of(transform.transform))
 
 
 def parts_of(transform: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Position, (3,), and quaternion (x, y, z, w) of a ``geometry_msgs/Transform`` or ``Pose``."""
+    """Return position and quaternion (x, y, z, w) of a ``geometry_msgs/Transform`` or ``Pose``."""
     is_pose = hasattr(transform, "position")
     t = transform.position if is_pose else transform.translation
     q = transform.orientation if is_pose else transform.rotation
@@ -185,14 +185,14 @@ def parts_of(transform: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def matrix_of(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Float:
-    """A position, (3,), and a quaternion (x, y, z, w) as a pose, (4, 4).
+    """Convert a position and a quaternion to a pose, (4, 4).
 
     Args:
         position: (3,), metres.
         quaternion: (4,), x, y, z, w.
 
     Raises:
-        ObservationError: the quaternion is none of a rotation.
+        ObservationError: the quaternion is not a unit quaternion.
     """
     if not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise ObservationError(
@@ -205,5 +205,5 @@ def matrix_of(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Flo
 
 
 def seconds(stamp: Any) -> float:
-    """A ``builtin_interfaces/Time`` in seconds."""
+    """Convert a ``builtin_interfaces/Time`` to seconds."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)

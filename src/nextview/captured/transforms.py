@@ -1,4 +1,4 @@
-"""A tree of frames that move against each other, as tf records it: where one is in another, when.
+"""A tree of moving coordinate frames, as recorded by tf, with interpolation in time.
 
 Foote, "tf: The transform library", TePRA 2013.
 """
@@ -12,32 +12,32 @@ from nextview.captured.messages import matrix_of
 from nextview.errors import DatasetError
 from nextview.types import Float
 
-# seconds between two transforms from which a pose between them is interpolated
+# seconds, largest gap between two transforms that is interpolated
 LONGEST_GAP = 0.5
-# frames between one and the root that it hangs on; a robot with two arms and hands has some forty
+# largest depth of the tree; a robot with two arms and hands has about forty
 LONGEST_CHAIN = 200
-NAMED_IN_CIRCLE = 8  # frames that a sentence names of a circle
-BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for
+NAMED_IN_CIRCLE = 8  # frames of a cycle that are named in a message
+BEYOND = 0.02  # seconds, extrapolation before the first and after the last transform
 
 
 class TransformError(DatasetError):
-    """Frames that make no tree."""
+    """Frames that do not form a tree."""
 
 
 class NoTransformError(DatasetError):
-    """A frame has no place in another at some time."""
+    """The pose of a frame in another one is not known at some time."""
 
 
 @dataclass
 class _Link:
-    """How one frame lies in its parent's.
+    """Transforms of a frame to its parent.
 
     Attributes:
-        parent: name of that frame.
+        parent: name of the parent frame.
         stamps: seconds, N.
         positions: (3,) each, metres.
         quaternions: x, y, z, w each.
-        fixed: it never changes: then there is one, whose stamp does not count.
+        fixed: static: then there is only one transform, and its stamp is ignored.
     """
 
     parent: str
@@ -47,7 +47,7 @@ class _Link:
     quaternions: list[tuple[float, ...]] = field(default_factory=list)
 
     def sorted(self) -> "_Link":
-        """The same in the order of time; of several at one time the last."""
+        """Return the link sorted by time; of several transforms at one time the last is kept."""
         stamps, last = np.unique(np.array(self.stamps)[::-1], return_index=True)
         order = len(self.stamps) - 1 - last
         return _Link(
@@ -59,7 +59,7 @@ class _Link:
         )
 
     def at(self, time: float) -> Float | None:
-        """From the frame into its parent's, (4, 4); None if nothing is known of that time."""
+        """Return the transform to the parent at a time, (4, 4); None if it is not known."""
         if self.fixed:
             return matrix_of(self.positions[-1], self.quaternions[-1])
         after = int(np.searchsorted(self.stamps, time))
@@ -84,11 +84,10 @@ class _Link:
 
 
 class TransformTree:
-    """Which frame hangs on which, and how they move.
+    """Tree of coordinate frames that move over time.
 
     Args:
-        kept: how many transforms of each frame are remembered at least, the last ones; all of them
-            if it is None.
+        kept: least number of latest transforms that are kept for each frame; None for all.
     """
 
     def __init__(self, kept: int | None = None) -> None:
@@ -104,18 +103,18 @@ class TransformTree:
         quaternion: tuple[float, ...],
         fixed: bool = False,
     ) -> None:
-        """Take in where a frame was in another.
+        """Add a transform of a frame to its parent.
 
         Args:
             child: the frame.
-            parent: the frame that it hangs on.
+            parent: its parent frame.
             stamp: seconds.
             position: of its origin in the parent's frame, (3,), metres.
             quaternion: of its axes there, x, y, z, w.
-            fixed: it never changes.
+            fixed: whether it is static.
 
         Raises:
-            TransformError: the frame hung on another one before.
+            TransformError: the frame had another parent before.
         """
         link = self._links.setdefault(child, _Link(parent, fixed))
         if link.parent != parent:
@@ -130,10 +129,10 @@ class TransformTree:
                 del values[: -self._kept]
 
     def sort(self) -> None:
-        """Put what was taken in into the order of time, once all of it was.
+        """Sort all transforms by time, after all of them were added.
 
         Raises:
-            TransformError: frames hang on each other in a circle, or in too long a chain.
+            TransformError: frames form a cycle, or a chain that is too long.
         """
         self._links = {child: link.sorted() for child, link in self._links.items()}
         for child in self._links:
@@ -146,15 +145,15 @@ class TransformTree:
         return tuple(sorted(parents | set(self._links)))
 
     def root(self, frame: str) -> str:
-        """The frame that hangs on no other, above a frame."""
+        """Return the root above a frame."""
         return self._above(frame)[-1]
 
     def moves(self, frame: str, world: str) -> bool:
-        """Whether a frame moves in another, as far as transforms say.
+        """Return True if a frame moves relative to another one according to the transforms.
 
         Args:
             frame: name of the frame that may move.
-            world: name of the frame that stands still.
+            world: name of the reference frame.
         """
         links = self._between(frame, world)
         return any(not self._links[child].fixed for child in links)
@@ -163,7 +162,7 @@ class TransformTree:
         """Return the pose of one frame in another at a time, (4, 4).
 
         Args:
-            frame: name of the frame whose pose is asked for.
+            frame: name of the frame.
             world: name of the frame in which the pose is expressed.
             time: seconds, of the clock of the transforms.
 
@@ -191,7 +190,7 @@ class TransformTree:
         return np.asarray(np.linalg.inv(ways[1]) @ ways[0])
 
     def _above(self, frame: str) -> list[str]:
-        """A frame and those that it hangs on, up to the root."""
+        """Return a frame and its ancestors up to the root."""
         chain = [frame]
         met = {frame}
         while chain[-1] in self._links:
@@ -210,5 +209,5 @@ class TransformTree:
         return chain
 
     def _between(self, frame: str, world: str) -> set[str]:
-        """The frames whose links are on the way from a frame to another."""
+        """Return the frames whose links connect a frame to another."""
         return set(self._above(frame)[:-1]) ^ set(self._above(world)[:-1])

@@ -1,4 +1,4 @@
-"""Poses of frames of a thing on a turntable, from its even steps."""
+"""Poses of frames of an object on a turntable that rotates in even steps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,19 +25,19 @@ from nextview.sensing.choosing import ALONE
 from nextview.sensing.object_frame import smallest_circle
 from nextview.types import Float
 
-# of the fit; points of a frame; share of them that counts, the nearest
+# rounds of the fit; points per frame; share of the nearest points that is used
 ROUNDS = 40
 TURN_POINTS = 800
 CLOSEST_TURN = 0.7
-# a sixth of a circle, or one step, lies between two frames that are compared
+# compared frames are a sixth of a turn, or one step, apart
 TURN_PARTS = 6
-# how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
+# largest distance of this share of the frames, relative to the object radius, in addition to noise
 AGREE = 0.008
 AGREEING_SHARE = 0.8
 
 
 def is_turntable(folder: Path) -> bool:
-    """Whether a folder holds depth images and intrinsics, and no poses."""
+    """Return True if a folder contains depth images and intrinsics, but no poses."""
     return (
         (folder / INTRINSICS).exists()
         and next(folder.glob("*.png"), None) is not None
@@ -46,10 +46,10 @@ def is_turntable(folder: Path) -> bool:
 
 
 def read_turntable(folder: Path, turn: str) -> Capture:
-    """Read the frames of a thing on a turntable that made one full turn in even steps.
+    """Read the frames of an object on a turntable that made one full turn in even steps.
 
-    The axis is the normal of the support plane at the place where the surfaces of neighbouring
-    frames agree best; its foot becomes the world's origin.
+    The axis is the normal of the support plane at the position where the surfaces of neighbouring
+    frames agree best; its foot is the origin of the world frame.
 
     Args:
         folder: depth images in millimetres, in the order of their names, and the pinhole matrix.
@@ -59,7 +59,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         The frames with their poses.
 
     Raises:
-        DatasetError: the frames do not agree, or one does not show a thing on a plane.
+        DatasetError: the frames do not agree, or one does not show an object on a plane.
     """
     k = read_table(folder / INTRINSICS, "the pinhole matrix", 3)
     way = 1 if turn == "ccw" else -1
@@ -99,7 +99,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     )
     z = float(np.median([np.median(s.facets.points[:, 2]) for s in shown]))
     noise = float(np.median([s.noise.at(z) for s in shown])) * z**2
-    # the last and the first, too: a full circle
+    # includes the pair of the last and the first frame
     worst = max(np.quantile(apart, AGREEING_SHARE), apart[-1] / 3)
     if worst > AGREE * radius + noise:
         what = f"what a frame and the next show does not agree ({1000 * worst:.1f} mm apart)"
@@ -125,10 +125,10 @@ def read_turntable(folder: Path, turn: str) -> Capture:
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
-    """Return the axis in the plane, (2,), and the distance of neighbouring frames, (N,).
+    """Return the axis position in the plane, (2,), and distances of neighbouring frames, (N,).
 
-    By points and planes, upright: each point comes to lie on the plane of its nearest neighbour,
-    least squares.
+    Point-to-plane least squares with an upright axis: each point is moved onto the plane of its
+    nearest neighbour.
     """
     n = len(clouds)
     axis = smallest_circle(np.concatenate([points[::7, :2] for points, _ in clouds]))[0]

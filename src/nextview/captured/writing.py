@@ -19,11 +19,11 @@ from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, look_at_or
 from nextview.simulation.scene import square
 from nextview.types import Float32
 
-# a Kinect's as ROS has it by default; first pixel's centre at 0
+# default intrinsics of a Kinect in ROS; first pixel's centre at 0
 PINHOLE = pinhole_matrix(525.0, 525.0, 319.5, 239.5)
 SHAPE = 480, 640
 TABLE_HALF_SIDE = 2.0  # half the side of the table, object radii
-DEPTH_STEP = 0.0001  # metres that one step of the depth images stands for
+DEPTH_STEP = 0.0001  # metres per unit of the depth images
 
 
 def write_capture(
@@ -35,22 +35,22 @@ def write_capture(
     masks: bool = True,
     overwrite: bool = False,
 ) -> Iterator[int]:
-    """Write a folder of captured views and box.json, the object's upright box.
+    """Write a folder of captured views and box.json, the object's upright bounding box.
 
-    The world, metres, has z up and the axes of the mesh. Its origin is below the object's centre,
-    at its lowest point.
+    The world frame, in metres, has z up and the axes of the mesh. Its origin is below the object's
+    centre, at the height of its lowest point.
 
     Args:
         mesh: the object.
         folder: to write.
         sphere: viewpoints of the views.
         radius: of the object, metres.
-        table: whether the object stands on a table that is visible too.
+        table: whether the object stands on a visible table.
         masks: whether to write masks of the object.
         overwrite: whether to replace an earlier capture.
 
     Yields:
-        Number of views done.
+        Number of finished views.
     """
     number(radius, "the object radius, in metres,", above=0)
     _check_others(folder, len(sphere), masks)
@@ -69,10 +69,10 @@ def write_capture(
         pinhole_matrix(525.0, 525.0, 320.0, 240.0),
         SHAPE,
     ).rays.reshape(-1, 3)
-    # The box has an inside, even that of a flat mesh.
+    # The margin gives the box a volume, even for a flat mesh.
     low = vertices.min(0) - 1e-6 * radius
     high = vertices.max(0) + 1e-6 * radius
-    # The object is number 1, its model the mesh as in its file but in mm.
+    # The object has number 1; its model is the mesh of the file in millimetres.
     model = [0, 0, height] - radius / mesh.radius * mesh.centre
     x, y, z = sphere.directions.T
     # not below the table
@@ -85,8 +85,8 @@ def write_capture(
     poses[:, 2, 3] += height
     cameras = {}
     objects = {}
-    # Without this record the folder is no capture: a run that is stopped leaves no mixture of two
-    # objects' views.
+    # This file is written last. Without it the folder is not a capture, so an interrupted run
+    # leaves no mixture of two objects' views.
     with new_folder(folder, overwrite, last="scene_camera.json", withdraw=True) as new:
         (new / "box.json").write_text(
             json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n"
@@ -124,7 +124,7 @@ def _write_images(
     which: NDArray[np.integer],
     masks: bool,
 ) -> None:
-    """Write the depth of each ray, and the mask of the object, by which thing it meets."""
+    """Write the depth of each ray, and the mask of the object, from the index of the hit mesh."""
     steps = np.rint(np.where(which < 0, np.float32(0), depth) / DEPTH_STEP).astype(
         np.uint16
     )
@@ -135,11 +135,11 @@ def _write_images(
 
 
 def _check_others(folder: Path, views: int, masks: bool) -> None:
-    """Refuse a folder with images that would be taken for those of the new views.
+    """Reject a folder with images that would be mistaken for those of the new views.
 
     Raises:
-        ResultsError: it holds colour or grey images of views of these numbers, or masks where none
-            are written.
+        ResultsError: it contains colour or grey images of views with these numbers, or masks
+            although none are written.
     """
     others = {"rgb": "", "gray": ""} | ({} if masks else {"mask_visib": "_*"})
     for name, end in others.items():

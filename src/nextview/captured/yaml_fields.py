@@ -1,8 +1,8 @@
-"""YAML as cameras and recorders write it: fields, lists, numbers and text, within bounds.
+"""Read YAML files of cameras and recorders safely: mappings, lists, numbers and text.
 
-A few hundred bytes of YAML can name a list of lists of lists as often as they like, and a tag can
-ask for a value that its text is not. Here a text is read event by event, its size is known before
-it is built, and what is no number is text.
+A few hundred bytes of YAML can expand to huge nested lists through aliases, and a tag can request a
+type that its text is not. This reader processes events, knows the expanded size before building the
+values, and reads everything that is not a number as text.
 """
 
 from typing import Any
@@ -12,12 +12,10 @@ import yaml
 from nextview.checks import one_line
 from nextview.errors import DatasetError
 
-MOST_YAML_VALUES = 100_000  # of a file, with all that its aliases repeat
-DEEPEST_YAML = 50  # lists and fields inside each other
-OPENCV_HEADER = (
-    "%YAML:"  # which no YAML reader takes; the rest of OpenCV's files is YAML
-)
-# what a word stands for; all else is a number or text
+MOST_YAML_VALUES = 100_000  # in a file, including values repeated by aliases
+DEEPEST_YAML = 50  # nesting of lists and mappings
+OPENCV_HEADER = "%YAML:"  # not valid YAML; the rest of an OpenCV file is
+# values of special words; everything else is a number or text
 YAML_WORDS = {
     "": None,
     "~": None,
@@ -28,13 +26,13 @@ YAML_WORDS = {
 
 
 class _Unfinished:
-    """A list or the fields of a mapping, as far as they were read.
+    """A list or a mapping that is being read.
 
     Attributes:
-        values: those of a list; keys and values, one after the other, of a mapping.
-        is_list: which of both it is.
-        anchor: by which others repeat it, if it has one.
-        count: values in it, with those that aliases repeat.
+        values: elements of a list; alternating keys and values of a mapping.
+        is_list: whether it is a list.
+        anchor: name used by aliases, if it has one.
+        count: number of values in it, including those repeated by aliases.
     """
 
     def __init__(self, is_list: bool, anchor: str | None) -> None:
@@ -44,7 +42,7 @@ class _Unfinished:
         self.count = 1
 
     def finished(self, where: str) -> Any:
-        """The list, or a dictionary."""
+        """Return the list, or a dictionary."""
         if self.is_list:
             return self.values
         keys = self.values[::2]
@@ -54,17 +52,17 @@ class _Unfinished:
 
 
 def read_yaml(text: str, where: str) -> Any:
-    """The content of a YAML text; of its first document, where it has several.
+    """Read a YAML text, or its first document if there are several.
 
     Args:
-        text: as a file holds it.
-        where: beginning of the sentence of an error.
+        text: content of a file.
+        where: beginning of the error message.
 
     Returns:
         Dictionaries, lists, numbers (float), text, True, False and None.
 
     Raises:
-        DatasetError: it is no YAML, or repeats itself beyond ``MOST_YAML_VALUES``.
+        DatasetError: it is not YAML, or expands beyond ``MOST_YAML_VALUES``.
     """
     if text.startswith(OPENCV_HEADER):
         text = text.partition("\n")[2]
@@ -76,7 +74,7 @@ def read_yaml(text: str, where: str) -> Any:
 
 
 def _built(events: Any, where: str) -> Any:
-    """The first document of a row of events."""
+    """Build the first document of a sequence of events."""
     named: dict[str, tuple[Any, int]] = {}
     around = [_Unfinished(True, None)]
 
@@ -115,10 +113,10 @@ def _built(events: Any, where: str) -> Any:
 
 
 def _scalar(event: Any) -> Any:
-    """A number if the text of a plain value is one; whatever its tag asks for."""
+    """Return a plain scalar as a number if its text is one, whatever its tag."""
     text = event.value
     if not event.implicit[0] and event.style is not None:
-        return text  # in quotes
+        return text  # quoted
     if text.lower() in YAML_WORDS:
         return YAML_WORDS[text.lower()]
     try:

@@ -1,4 +1,4 @@
-"""The results of a benchmark and of an evaluation as tables in the terminal."""
+"""Print benchmark and evaluation results as tables in the terminal."""
 
 from dataclasses import replace
 from math import isfinite
@@ -20,14 +20,14 @@ from nextview.errors import EntryError
 
 
 def print_classes(found: ClassResults) -> None:
-    """Print the leaderboard; then what failed is an error."""
+    """Print the leaderboard, then raise an error if any policy failed."""
     print_leaderboard(found)
     if found.settings["failures"]:
         raise EntryError("; ".join(found.settings["failures"].values()))
 
 
 def print_leaderboard(results: ClassResults) -> None:
-    """Print the policies at the headline threshold, and what follows from them."""
+    """Print the policies at the headline threshold, and the conclusions of the tests."""
     tables = results.tables
     reference = results.settings["reference"]
     console = Terminal()
@@ -62,7 +62,7 @@ def print_leaderboard(results: ClassResults) -> None:
 
 
 def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
-    """In 80 columns; only a long name of a policy is folded."""
+    """Lay out the policies in 80 columns; only long policy names are folded."""
     title = (
         f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
     )
@@ -117,7 +117,7 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
 
 
 def print_compared(found: ComparedTables) -> None:
-    """Print a table for each board, in 80 columns, and what follows from them."""
+    """Print a table for each board, in 80 columns, and the conclusions of the tests."""
     console = Terminal()
     for each in found.boards:
         console.print(_compared(found, each))
@@ -142,7 +142,10 @@ def _compared(found: ComparedTables, shown: Board) -> Table:
 
 
 def print_evaluation(found: Evaluation) -> None:
-    """Print how often the recogniser is right, and how good each map is; its page says more."""
+    """Print the accuracy of the recogniser and the scores of each map.
+
+    The HTML page of the evaluation shows more.
+    """
     console = Terminal()
     right = numbers(found.accuracy, "n_views", "label", "measure")
     views = int(found.accuracy["n_views"].max())

@@ -21,7 +21,7 @@ PRESET = "recipe that sets the defaults of the recipe options"
 
 
 def find(path: str) -> Any:
-    """What MODULE:NAME means."""
+    """Import the object that MODULE:NAME names."""
     module, _, name = path.partition(":")
     return getattr(import_module(module), name)
 
@@ -38,10 +38,10 @@ def call(
         name: of the command.
         command: the command.
         arguments: of the command line.
-        track: follows the work of the command.
+        track: callable that shows the progress of the command.
 
     Returns:
-        What the function returns, and its arguments by their names.
+        The return value of the function, and its arguments by name.
     """
     run, called = entry(command, arguments, track)
     returned = tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG)
@@ -55,16 +55,16 @@ def entry(
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
     """Create a function that tyro can read from a command line.
 
-    Parameters without a default, and positional-only ones, are arguments; all others are options. A
-    parameter ``track`` is passed in and is not an option.
+    Parameters without a default, and positional-only ones, become arguments; all others become
+    options. A parameter ``track`` is passed in and is not an option.
 
     Args:
         command: the command.
-        arguments: of the command line; they decide which preset the defaults are of.
-        track: follows the work of the command.
+        arguments: of the command line; ``--preset`` among them selects the defaults.
+        track: callable that shows the progress of the command.
 
     Returns:
-        The function, and a dictionary that holds its arguments once it was called.
+        The function, and a dictionary that is filled with its arguments when it is called.
     """
     function = find(command.function)
     signature = inspect.signature(function)
@@ -107,11 +107,11 @@ def _described(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Read the docstring of a function.
 
     Args:
-        function: its docstring is in Google's style.
+        function: with a docstring in Google style.
 
     Returns:
-        What it does, a paragraph a line, as tyro would keep where lines end; and the help of each
-        parameter in its ``Args`` section.
+        The description, with each paragraph on one line because tyro keeps line breaks; and the
+        help of each parameter in the ``Args`` section.
     """
     parsed = docstring_parser.parse(
         function.__doc__ or "",

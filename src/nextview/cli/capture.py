@@ -24,17 +24,19 @@ def capture(
     largest_part: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write depth images, poses and intrinsics of a mesh, for ``nextview recognise FOLDER``.
+    """Write rendered depth images of a mesh, with poses and intrinsics.
+
+    Use it to try nextview recognise FOLDER, or as an example of the BOP layout.
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one upright object.
         out: folder to write, in the layout of the BOP challenge.
-        viewpoints: viewpoints of the images.
-        table: put the object on a table, which is visible too; without one, masks are written.
+        viewpoints: number of viewpoints.
+        table: place the object on a visible table; without a table, object masks are written.
         radius: object radius, metres, if the unit of the file is not known.
         up: up axis of the file; by default z, and y for GLB.
         unit: unit of length of the file.
-        max_faces: largest number of triangles; the file may have 60 bytes for each of these.
+        max_faces: largest number of triangles; also limits the file to 60 bytes per triangle.
         largest_part: keep only the largest connected part of the mesh.
         overwrite: replace an earlier capture.
     """

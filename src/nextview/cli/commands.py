@@ -1,4 +1,4 @@
-"""The table of commands: the function of each, which is imported when it is called."""
+"""The table of commands. The function of a command is imported only when it is called."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ class Command:
 
     Attributes:
         function: MODULE:NAME of the function that runs the command.
-        line: in the list of all commands.
-        then: printed at the end; names in braces are arguments, ``found`` is what the function
-            returns.
-        show: the function that shows what it returns.
-        thesis: the recipe that --preset thesis names.
+        line: one-line description for the list of all commands.
+        then: text printed at the end; names in braces are arguments, and ``found`` is the return
+            value of the function.
+        show: MODULE:NAME of the function that prints the return value.
+        thesis: MODULE:NAME of the recipe that --preset thesis selects.
     """
 
     function: str
@@ -35,7 +35,7 @@ EXPORTED = (
 MORE_POLICIES = (
     "tables and figures are in {out}; one more policy: the same command with --policies"
 )
-COMMANDS = {  # by name, in the order in which they are listed
+COMMANDS = {  # by name, in the order of the printed list
     "recognise": Command(
         f"{CLI}.recognise:recognise",
         "recognise the object of a mesh or of captured frames",
@@ -99,7 +99,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "train segmentation": Command(
         f"{TRAINING}.segmentation_training:train_segmentation",
-        "train the network that parts a frame into things",
+        "train the network that segments frames into objects",
         "next: nextview export segmentation {out} MODELS",
     ),
     "train gain": Command(
@@ -191,8 +191,7 @@ COMMANDS = {  # by name, in the order in which they are listed
         "{found}",
     ),
 }
-# resumable
-RESUMES = (
+RESUMES = (  # commands that continue an interrupted run
     "render",
     "measure",
     "predict",

@@ -1,4 +1,4 @@
-"""Options of several commands: who looks, what is looked at, and files of pictures."""
+"""Options shared by several commands: models and policy, object and camera, figure files."""
 
 import os
 from dataclasses import dataclass, fields
@@ -23,11 +23,12 @@ FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes and machines.
+    """Parallel processes.
 
     Attributes:
-        workers: number of processes; by default one for each core.
-        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
+        workers: number of processes; by default one per core.
+        scheduler: address of a dask.distributed scheduler to use instead, such as
+            tcp://HOST:8786.
     """
 
     workers: int | None = None
@@ -36,26 +37,26 @@ class Workers:
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """Models, policy, and when the episode ends.
+    """Models, policy and stopping rule.
 
     Attributes:
         models: name of bundled models (modelnet10, ycb), or folder of your own models.
-        policy: policy that chooses the next view: gain (predicted gain less weighted travel; the
+        policy: policy that chooses the next view: gain (predicted gain minus weighted travel; the
             default), discriminate (the default for taught things), MAP, MAP-peak or MAP-sphere-peak
             for a map of the models (lem, lcm), random, random-all, furthest, unidirectional,
-            spread, spread-local, a card of a learned policy (.json), or MODULE:CLASS.
-        threshold: stop when the belief in one class reaches this value after one view; it decreases
-            with every view.
-        risk: instead of a threshold, the largest share of wrong answers among the episodes that
-            stop early.
-        max_views: largest number of views.
+            spread, spread-local, the card of a learned policy (.json), or MODULE:CLASS.
+        threshold: stop as soon as the belief in one class reaches this value; it applies after the
+            first view and decreases with every further view.
+        risk: stop so that at most this share of the episodes that end early have a wrong answer;
+            replaces the threshold.
+        max_views: largest number of views in an episode.
         stopping: stopping rule of your own, MODULE:NAME (docs/add_a_policy.md).
         recogniser: recogniser of your own, MODULE:NAME (docs/add_a_recogniser.md).
-        viewpoints: candidate viewpoints: 40 or 12 views, rings:0,30,60x12 (elevations in degrees,
-            views on each ring), or fibonacci:60 (spread evenly over the upper hemisphere).
-        unknown: p-value below which an object is called unknown; by default 0.02, so one known
-            object in 50 is. Objects of a size that the class never has are unknown too. 0 always
-            names a class.
+        viewpoints: candidate viewpoints: 40 or 12 views on rings, rings:0,30,60x12 (elevations in
+            degrees x views per ring), or fibonacci:60 (spread evenly over the upper hemisphere).
+        unknown: significance level of the test for unknown objects: an object with a smaller
+            p-value is called unknown. The default of 0.02 also rejects one known object in 50.
+            Objects of a size that their class never has are unknown too. 0 always names a class.
     """
 
     models: str = "modelnet10"
@@ -75,27 +76,27 @@ class ObjectOptions:
 
     Attributes:
         up: up axis of a mesh file; by default z, and y for GLB. For captured frames also a
-            direction in their world; by default z, and the normal of the support plane for
-            7-Scenes.
-        unit: unit of length of a mesh file; with it, size counts as evidence.
+            direction in the world frame; by default z, and for 7-Scenes the normal of the support
+            plane.
+        unit: unit of length of a mesh file; if it is given, size counts as evidence.
         sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
-            (docs/your_camera.md); clean renders by default.
-        max_faces: largest number of triangles of a mesh; its file may have 60 bytes for each of
-            these.
+            (docs/your_camera.md); by default renders are free of noise.
+        max_faces: largest number of triangles in a mesh; also limits the file to 60 bytes per
+            triangle.
         largest_part: keep only the largest connected part of a mesh, without tables or loose
             pieces.
-        point: for captured frames: a point near the object, metres, in the world of the frames.
-        box: for captured frames: upright box that just contains the object: its low and its high
-            corner, metres (heights along --up), or a JSON file with low, high and axes.
-        object_id: for BOP folders with several objects: the number of the object.
-        intrinsics: for captured frames: FX FY CX CY, pixels, or a file with the pinhole matrix, or
-            a file of ROS, librealsense or Open3D (JSON or YAML).
-        depth_scale: for captured frames: metres per step of the depth images, such as 0.001 for
-            millimetres; by default as their files say.
-        depth_topic: for ROS 2 bags with several topics of depth images: the topic.
+        point: for captured frames: point near the object, world frame, metres.
+        box: for captured frames: upright bounding box of the object: its low and its high corner,
+            metres (heights along --up), or a JSON file with low, high and axes.
+        object_id: for BOP folders with several objects: number of the object.
+        intrinsics: for captured frames: FX FY CX CY in pixels, a file with the pinhole matrix, or
+            a camera file of ROS, librealsense or Open3D (JSON or YAML).
+        depth_scale: for captured frames: metres per unit of the depth images, such as 0.001 for
+            millimetres; by default read from the folder.
+        depth_topic: for ROS 2 bags with several depth topics: the topic to read.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
-        at: for ROS 2 bags of a camera that stands still: which image to use: first (the default),
-            last, or the first one from so many seconds after the bag's first message.
+        at: for ROS 2 bags of a static camera: the image to use: first (the default), last, or the
+            number of seconds after the first message of the bag.
         raw: for captured frames: use the depth without denoising.
         by_shape: for captured frames: ignore the size of the object, as for toys and models.
     """
@@ -120,8 +121,8 @@ class ObjectOptions:
         """Create a camera in front of the object of a mesh file or of captured frames.
 
         Args:
-            path: of the mesh file, or of the folder, the bag or the image.
-            seed: of the sensor's errors.
+            path: of the mesh file, or of the folder, bag or image of captured frames.
+            seed: of the simulated sensor errors.
 
         Returns:
             The camera.
@@ -178,26 +179,24 @@ class ObjectOptions:
 
 
 def check_there(path: Path) -> None:
-    """Refuse a path of nothing before it is said what its options are for.
+    """Check that a path exists, before its options are checked.
 
     Args:
-        path: that was given.
+        path: of a file or folder.
 
     Raises:
         UsageError: there is no such file or folder.
     """
-    if not os.path.exists(
-        path
-    ):  # not Path.exists, which raises where a name is too long
+    if not os.path.exists(path):  # Path.exists raises an error if a name is too long
         shown = one_line(str(path), LONGEST_PATH)
         raise UsageError(f"{shown}: no such file or folder")
 
 
 def say_written(*paths: Path | None) -> None:
-    """Say on standard error which files were written.
+    """Print the paths of the written files to standard error.
 
     Args:
-        paths: of the files; None where none was asked for.
+        paths: of the files; None for files that were not requested.
     """
     for path in paths:
         if path is not None:
@@ -209,16 +208,16 @@ def check_file(
     overwrite: bool,
     kinds: tuple[str, ...] = FIGURE_ENDINGS,
 ) -> None:
-    """Check a file that is to be written, before any work is done.
+    """Check the path of an output file before any work is done.
 
     Args:
         path: of the file; None for no file.
         overwrite: whether an existing file may be replaced.
-        kinds: suffixes that the name may have.
+        kinds: allowed suffixes.
 
     Raises:
         ResultsError: the file cannot be written.
-        UsageError: the name has another suffix.
+        UsageError: the suffix is not allowed.
     """
     if path is not None:
         check_new(path, overwrite)

@@ -1,4 +1,4 @@
-"""``nextview completion``: what a shell completes of the whole command."""
+"""``nextview completion``: print a script for tab completion in a shell."""
 
 from typing import Literal
 
@@ -12,7 +12,7 @@ def completion(
     shell: Literal["bash", "zsh", "fish"],
     /,
 ) -> None:
-    """Print a script that lets a shell complete commands, options and their values.
+    """Print a script for tab completion of commands, options and their values.
 
     For bash: nextview completion bash > ~/.local/share/bash-completion/completions/nextview
 

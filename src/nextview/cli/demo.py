@@ -30,17 +30,16 @@ DEMO_PICTURE = Path("nextview_demo.png")
 def demo(out: Path | None = None, overwrite: bool = False) -> None:
     """Name and locate everything on a table, in a bundled recording of three depth frames.
 
-    Seven YCB objects and a toy that nextview was not taught lie on a simulated table. A wrist
-    camera looks at them three times, with depth noise and pose errors. The command registers the 78
-    bundled YCB scans to the frames and prints names and poses, followed by the ground truth. The
-    table was not selected by the result, so some names may be wrong. It takes about 25 s of CPU
-    time.
+    Seven YCB objects and a toy that was not taught lie on a simulated table. A wrist camera
+    captures three frames, with depth noise and pose errors. The command registers the 78 bundled
+    YCB scans to the frames and prints names and poses, followed by the ground truth. The table was
+    not selected by the result, so some names may be wrong. It takes about 25 s of CPU time.
 
-    It writes table.png, table.html for the browser, and the folder recording, which shows the
-    layout for frames of your own: nextview look nextview_demo/recording gives the same table.
+    It writes table.png, table.html for the browser, and the folder recording, an example of the
+    layout for your own frames: nextview look nextview_demo/recording gives the same table.
 
     Args:
-        out: folder of the output; by default nextview_demo, in which files are replaced.
+        out: output folder; by default nextview_demo, whose files are replaced.
         overwrite: replace files in a folder of your own.
     """
     folder = DEMO_FOLDER if out is None else out
@@ -57,7 +56,7 @@ def demo(out: Path | None = None, overwrite: bool = False) -> None:
 
 
 def _bundled_scene() -> Scene:
-    """The scene of the bundled frames, as ``nextview look`` builds it."""
+    """Build the scene of the bundled frames, as ``nextview look`` does."""
     capture = read_capture(BUNDLED_TABLE)
     scene = Scene(load("ycb"), capture.up)
 
@@ -71,7 +70,7 @@ def _bundled_scene() -> Scene:
 
 
 def _named_places(scene: Scene) -> list[NamedPlace]:
-    """Names and places of all objects."""
+    """Return the names and positions of all objects."""
     return [
         NamedPlace(
             None if one.name == UNKNOWN_NAME else one.name,
@@ -88,19 +87,19 @@ def demo_episode(
     figure: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Recognise sample furniture that ships with nextview, and draw the episode.
+    """Recognise a piece of sample furniture that ships with nextview, and draw the episode.
 
-    A simulated camera looks at one object. The picture shows the views, the belief after each view,
-    and the value of each candidate view.
+    A simulated camera moves around one object. The figure shows the views, the belief after each
+    view, and the value of each candidate view.
 
     Args:
         shape: the sample object.
         start: index of the first view, 0 to 39.
-        figure: file of the picture; by default nextview_demo.png, which is replaced.
-        overwrite: replace an existing picture of another name.
+        figure: file of the figure; by default nextview_demo.png, which is always replaced.
+        overwrite: replace an existing file that was named with --figure.
     """
     output = Output(figure, overwrite=overwrite)
-    if figure is None:  # the name is the demo's own: a second demo draws over the first
+    if figure is None:  # the default file may be replaced by every run
         output = Output(DEMO_PICTURE, overwrite=True)
     check_file(output.figure, output.overwrite)
     system = load()

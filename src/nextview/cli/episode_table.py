@@ -1,4 +1,4 @@
-"""An episode as a table."""
+"""Print an episode as a table."""
 
 from collections.abc import Sequence
 
@@ -28,16 +28,16 @@ def print_episode(
     """Print each view and the answer.
 
     Args:
-        result: how the episode ended.
-        name: of what was looked at.
-        policy: that chose the views.
-        frames: of captured views, which frame answered each.
+        result: of the episode.
+        name: of the object.
+        policy: name of the policy.
+        frames: name of the captured frame used for each view; empty for rendered views.
     """
     stops = [
         float(result.stopping.threshold_at(step))
         for step in range(1, len(result.views) + 1)
     ]
-    # a rule of your own need not stop at a belief
+    # custom stopping rules may have no threshold
     has_threshold = bool(np.isfinite(stops).any())
 
     console = Terminal()
@@ -59,7 +59,7 @@ def print_episode(
 
 
 def _limit_in_words(unknown_rate: float) -> str:
-    """Below which novelty an object is called unknown."""
+    """Describe the p-value below which an object is called unknown."""
     if not unknown_rate:
         return "none is called unknown, as asked for"
     return f"below {100 * unknown_rate:.3g} % it would be called unknown"
@@ -72,7 +72,7 @@ def _table_of_views(
     frames: Sequence[str],
     stops: Sequence[float],
 ) -> Table:
-    """A row for each view; ``stops`` are the thresholds at which each stops, if there are any."""
+    """Make a table with a row for each view; ``stops`` holds the threshold of each, or nothing."""
     table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
     table.title = f"Looking at {name}, next views by {policy}"
     table.caption = (
@@ -121,7 +121,7 @@ def _table_of_views(
 
 
 def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
-    """What the object is, or that it is unknown, and after how many views."""
+    """Describe the answer, or that the object is unknown, and the number of views."""
     effort = f"after {result.effort_in_words}"
     if result.unknown:
         why = f": {printable(result.why_unknown)}, {effort}."
@@ -140,7 +140,7 @@ def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
 
 
 def _pose_in_words(result: Recognition) -> list[str]:
-    """Where the object is, or why that is not known, a line each."""
+    """Describe the pose of the object, or why it is not known, one line each."""
     if result.pose is None:
         return (
             [f"Its pose is not known: {printable(result.why_no_pose)}."]

@@ -1,4 +1,4 @@
-"""How a command ends: a user's error in one sentence, a bug with its traceback."""
+"""End a command: user errors print one sentence, bugs keep their traceback."""
 
 import errno
 import io
@@ -16,7 +16,7 @@ from nextview.errors import printable as on_one_line
 
 
 def printable(text: str) -> str:
-    r"""The text with escapes for what cannot be printed, except for ends of lines.
+    r"""Escape unprintable characters, except line breaks.
 
     >>> print(printable("a\x1b[31mb"))
     a\x1b[31mb
@@ -26,13 +26,13 @@ def printable(text: str) -> str:
 
 @contextmanager
 def orderly_end(after_stop: str) -> Iterator[None]:
-    """Turn what a command raises into one sentence and an exit status.
+    """Turn the exceptions of a command into one sentence and an exit status.
 
-    The status is 1 if the output cannot be written, 2 after an error of the user's or if an extra
-    is missing, and 130 after Ctrl-C or SIGTERM. A bug keeps its traceback.
+    The status is 1 if the output cannot be written, 2 after a user error or if an extra is
+    missing, and 130 after Ctrl-C or SIGTERM. A bug keeps its traceback.
 
     Args:
-        after_stop: what the user can do after Ctrl-C.
+        after_stop: advice that is printed after Ctrl-C.
     """
     _prepare_outputs()
     try:
@@ -45,7 +45,7 @@ def orderly_end(after_stop: str) -> Iterator[None]:
         if sentence is None:
             raise
         _end(sentence, 2)
-    except BrokenPipeError:  # who read the output has gone, as head does
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
         _discard(sys.stdout)
         sys.exit(1)
     except OSError as error:
@@ -58,15 +58,15 @@ def orderly_end(after_stop: str) -> Iterator[None]:
     except (KeyboardInterrupt, SystemExit) as ended:
         stop = ended.__context__ if isinstance(ended, SystemExit) else ended
         if not isinstance(stop, KeyboardInterrupt):
-            raise  # an exit; Lightning makes one of a KeyboardInterrupt
+            raise  # an ordinary exit; Lightning turns a KeyboardInterrupt into one
         warnings.simplefilter("ignore")
-        # reads that zarr has begun complain of being left
+        # unfinished reads of zarr would print errors
         sys.unraisablehook = lambda unraisable: None
         _end(f"stopped; {after_stop}", 130)
 
 
 def _prepare_outputs() -> None:
-    """Print characters that an encoding lacks as codes, and nothing where an output is closed."""
+    """Escape characters that the encoding lacks, and redirect closed streams to the null device."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -78,13 +78,13 @@ def _prepare_outputs() -> None:
 def _end(sentence: str, status: int) -> NoReturn:
     try:
         print(f"nextview: {printable(sentence)}", file=sys.stderr)
-    except OSError:  # standard error is full: the status still tells
+    except OSError:  # standard error is full; the exit status still reports the error
         _discard(sys.stderr)
     sys.exit(status)
 
 
 def _discard(stream: TextIO) -> None:
-    """Send the rest of an output nowhere, also what Python flushes when the process ends."""
+    """Discard all further output of a stream, including the flush when the process ends."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
@@ -95,14 +95,15 @@ def require(
     packages: Mapping[str, tuple[str, ...]] = EXTRAS,
     project: str = "nextview",
 ) -> None:
-    """End a script, before its imports fail, with the sentence that says what to install.
+    """End a script with installation advice if an optional dependency is missing.
 
-    With --help it goes on: stand-ins are imported for what is missing, and its help is shown.
+    Call it before the imports that would fail. With --help the script continues: stand-ins are
+    imported for the missing packages, and the help is shown.
 
     Args:
-        extra: the optional part of the installation that the script needs.
-        packages: those of each optional part.
-        project: whose parts they are, as pip is told.
+        extra: that the script needs.
+        packages: of each extra.
+        project: name of the project that defines the extras, as pip knows it.
     """
     missing = [package for package in packages[extra] if find_spec(package) is None]
     if not missing:

@@ -1,4 +1,4 @@
-"""``nextview explore``: an object, its views and their values, in the browser."""
+"""``nextview explore``: show an object, its views and their values in the browser."""
 
 import os
 import sys
@@ -24,28 +24,28 @@ def explore(
     port: int = 8080,
     browser: bool = True,
 ) -> None:
-    """Explore objects in the browser: click the views to take, or let a policy choose them.
+    """Explore objects in the browser: click on views to take them, or let a policy choose.
 
     Candidate views are coloured by the value that the policy assigns to them. Images, local maps
-    and belief are updated at once. Two policies can run side by side, on clean renders or with a
-    simulated sensor.
+    and beliefs are updated at once. Two policies can run side by side, on noise-free renders or
+    with a simulated sensor.
 
     Args:
         path: mesh file, folder of meshes or of class folders, or view store; by default the sample
             objects.
         looking: Models and policies. More views can be taken after the end of an episode.
-        compare: second policy, which runs beside the first.
+        compare: second policy, which runs side by side with the first.
         sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
         start: index of the first view; by default random.
         up: up axis of the mesh files; by default z, and y for GLB.
-        unit: unit of length of the mesh files; with it, size counts as evidence.
+        unit: unit of length of the mesh files; if it is given, size counts as evidence.
         seed: seed of the first view, the policies and the sensor errors.
-        host: address to serve the page at; 0.0.0.0 opens it to every machine that reaches this one.
-        port: port of the page; the next free one if it is taken.
+        host: address at which the page is served; 0.0.0.0 makes it reachable from other machines.
+        port: port of the page; if it is taken, the next free one is used.
         browser: by default the page is opened in a browser.
     """
     with extras():
-        import viser  # noqa: F401  # a missing extra is named before models are opened
+        import viser  # noqa: F401  # fails early, before the models are loaded
 
     from nextview.viewers.exploration import Exploration, shown_objects
     from nextview.viewers.page import Page
@@ -77,7 +77,9 @@ def explore(
         or os.environ.get("DISPLAY")
         or os.environ.get("WAYLAND_DISPLAY")
     )
-    if browser and screen:  # else a browser would open in the terminal
+    if (
+        browser and screen
+    ):  # without a display, a text browser might start in the terminal
         import webbrowser
 
         webbrowser.open(page.address)

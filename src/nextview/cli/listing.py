@@ -1,4 +1,4 @@
-"""``nextview list`` and ``nextview download``: bundled models, and published datasets."""
+"""``nextview list`` and ``nextview download``: bundled models and published datasets."""
 
 from functools import partial
 from pathlib import Path
@@ -19,12 +19,12 @@ def show(
 ) -> None:
     """List the bundled models or the view measures.
 
-    A measure scores how good a view is. Measures that need only the depth are computed from a view
-    store; docs/add_a_measure.md describes the others, and how to add your own.
+    A view measure is a number that scores a view. Measures that need only the depth are computed
+    from a view store; docs/add_a_measure.md describes the others, and how to add your own.
 
     Args:
-        what: models or measures.
-        name: name of a model whose card is printed.
+        what: list to print: models or measures.
+        name: model whose card is printed instead of the list.
     """
     if what == "measures":
         from nextview.data.measures import all_measures
@@ -74,7 +74,7 @@ def download(
 
     Args:
         name: dataset to download.
-        out: folder to unpack it into, as OUT/ModelNet10.
+        out: folder into which it is unpacked, as OUT/ModelNet10.
     """
     from rich.progress import (
         BarColumn,
@@ -104,7 +104,7 @@ def download(
             progress.update,
             progress.add_task(f"downloading {archive.folder}", total=None),
         )
-        # as pooch wants it
+        # the interface that pooch expects of a progress bar
         bar = SimpleNamespace(
             total=0, reset=partial(move, completed=0), close=lambda: None
         )

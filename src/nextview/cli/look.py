@@ -1,4 +1,4 @@
-"""``nextview look``: which of the known things are where in captured frames of a table."""
+"""``nextview look``: name and locate all known things in captured frames of a table."""
 
 import json
 from collections.abc import Callable
@@ -31,25 +31,26 @@ from nextview.types import Float
 
 @dataclass(frozen=True)
 class LookOptions:
-    """The known things, the frames and the region.
+    """Known things, frames and region.
 
     Attributes:
-        models: name of a bundled memory, or folder of your own; several are used together.
-        intrinsics: FX FY CX CY, pixels, or a file with them (the pinhole matrix, or what ROS,
-            librealsense or Open3D wrote), instead of those of the folder.
-        depth_scale: metres per step of the depth images, such as 0.001 for millimetres; by default
-            as their files say.
-        depth_topic: for ROS 2 bags with several topics of depth images: the topic.
+        models: name of a bundled memory, or folder of your own memory; several are combined.
+        intrinsics: FX FY CX CY in pixels, a file with the pinhole matrix, or a camera file of ROS,
+            librealsense or Open3D (JSON or YAML); by default read from the folder.
+        depth_scale: metres per unit of the depth images, such as 0.001 for millimetres; by default
+            read from the folder.
+        depth_topic: for ROS 2 bags with several depth topics: the topic to read.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
-        at: for ROS 2 bags of a camera that stands still: which image to use: first (the default),
-            last, or the first one from so many seconds after the bag's first message.
-        up: axis of the world that points up, or a direction; by default that of the layout, or the
-            normal of the support plane.
-        region: upright box to which the search is limited: its low and its high corner, metres
-            (heights along --up).
+        at: for ROS 2 bags of a static camera: the image to use: first (the default), last, or the
+            number of seconds after the first message of the bag.
+        up: up axis of the world, or a direction; by default that of the layout, or the normal of
+            the support plane.
+        region: upright box that limits the search: its low and its high corner, metres (heights
+            along --up).
         frames: number of frames to use, evenly spread over the recording.
-        unknown: p-value below which an object is called unknown; by default 0.02, so one known
-            thing in 50 is. 0 always names a thing.
+        unknown: significance level of the test for unknown objects: an object with a smaller
+            p-value is called unknown. The default of 0.02 also rejects one known thing in 50.
+            0 always names a thing.
     """
 
     models: str | tuple[str, ...] = "ycb"
@@ -69,12 +70,12 @@ class LookOutput:
     """Files and output.
 
     Attributes:
-        figure: write a picture of the last frame and of the table from above to this file (PNG,
-            PDF or SVG).
-        explorer: write a page to this file (.html) that shows all in 3D, in place on the table.
+        figure: write a figure of the last frame and a top view of the table to this file (PNG, PDF
+            or SVG).
+        explorer: write an interactive 3D view of the scene to this file (.html).
         record: write a recording for the Rerun viewer to this file (.rrd).
         json: print JSON instead of a table.
-        overwrite: replace files that exist.
+        overwrite: replace existing files.
     """
 
     figure: Path | None = None
@@ -92,19 +93,19 @@ def look(
 ) -> None:
     """Name and locate all known things on a table, in captured depth frames.
 
-    Objects that match no known thing are listed as unknown, with size and position. Frames that
-    contradict the others are left out.
+    Each object is printed with its pose and its belief. Objects that match no known thing are
+    listed as unknown, with size and position. Frames that contradict the others are left out.
 
     Args:
         path: folder of captured depth images with poses (BOP, TUM RGB-D, 7-Scenes, or depth images
-            with the intrinsics of the camera), a ROS 2 bag, or one depth image (.png).
+            with camera intrinsics), a ROS 2 bag, or a single depth image (.png).
     """
     check_file(output.figure, output.overwrite)
     check_file(output.explorer, output.overwrite, (".html",))
     check_file(output.record, output.overwrite, (".rrd",))
     if output.explorer is not None:
         with extras():
-            import viser  # noqa: F401  # a missing extra is named before the frames are looked at
+            import viser  # noqa: F401  # fails early, before the frames are processed
     if looking.frames < 1:
         raise UsageError(f"at least one frame is looked at, not {looking.frames}")
     read = read_capture(
@@ -166,17 +167,17 @@ def _look_at_frames(
     left_out: dict[str, str],
     recorder: Callable[[Scene], None] | None,
 ) -> dict[str, Look]:
-    """Take frames into a scene.
+    """Update a scene with the frames of a capture.
 
     Args:
-        scene: takes them in.
-        capture: has them.
-        most: how many are looked at, evenly spread over the capture.
-        left_out: why frames were not read, by their names; it is added to.
-        recorder: is called after each frame.
+        scene: to update.
+        capture: with the frames.
+        most: largest number of frames, evenly spread over the capture.
+        left_out: reasons for the frames that were left out, by frame name; extended in place.
+        recorder: called after each frame.
 
     Returns:
-        What each frame changed, by its name.
+        The changes of each frame, by frame name.
     """
     looks: dict[str, Look] = {}
     there = len(capture.frames)
@@ -204,7 +205,7 @@ def _look_at_frames(
 
 
 def _where(capture: Capture, looking: LookOptions) -> tuple[Float | None, Box | None]:
-    """The direction up, (3,), and the region in which is looked."""
+    """Return the up direction, (3,), and the search region."""
     given = looking.up if looking.up is not None else capture.up
     if isinstance(given, str):
         if given not in UP:
@@ -231,7 +232,7 @@ def print_scene(scene: Scene, name: str) -> None:
 
     Args:
         scene: with one frame at least.
-        name: of what was looked at.
+        name: of the capture.
     """
     objects = scene.objects
     console = Terminal()

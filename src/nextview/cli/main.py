@@ -1,4 +1,4 @@
-"""The ``nextview`` command: finds one of those in commands.py, and calls it."""
+"""The ``nextview`` command: find the requested command in commands.py and call it."""
 
 import os
 import shutil
@@ -15,10 +15,10 @@ ABOUT = "Active 3D object recognition: what an object is, and where to look next
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command; see ``orderly_end`` for how it may end."""
+    """Run a command; see ``orderly_end`` for the exit statuses."""
     arguments = sys.argv[1:] if arguments is None else arguments
     resumes = " ".join(arguments[:2]).startswith(RESUMES)
-    # tyro hangs in fewer
+    # tyro hangs in a narrower terminal
     os.environ["COLUMNS"] = str(min(max(shutil.get_terminal_size().columns, 20), 500))
     with orderly_end(
         "run the same command again; it resumes" if resumes else "nothing was written"

@@ -1,4 +1,4 @@
-"""``nextview predict``: what the models say of every view of a store, into one file."""
+"""``nextview predict``: run the models over every view of a store and save the outputs."""
 
 from pathlib import Path
 
@@ -31,16 +31,16 @@ def predict(
 
     Args:
         store: view store made by nextview render.
-        out: predictions to write (.npz), from which nextview benchmark classes replays policies.
+        out: file of predictions to write (.npz); nextview benchmark classes replays policies on it.
         split: predict only this split.
         models: name of bundled models, or folder of your own models.
         recogniser: recogniser to use instead: name of a bundled model, or path of a card.
         held_out: predict only objects that this model (name or card) held out of its training.
-        maps: maps to predict with these models, or NAME=CARD for others; by default all that the
-            models predict.
-        by_shape: ignore the size of the objects. By default it counts if the store knows it
-            (nextview render --unit) and the card of the recogniser has size evidence (nextview fit
-            size).
+        maps: maps to predict with these models, or NAME=CARD for other networks; by default all
+            maps of the models.
+        by_shape: ignore the size of the objects. By default size counts as evidence if the store
+            has it (nextview render --unit) and the card of the recogniser has a size model
+            (nextview fit size).
         overwrite: replace existing predictions.
     """
     if out.suffix != ".npz":
@@ -78,11 +78,11 @@ def predict(
 
 
 def summed_up(p: Predictions) -> list[str]:
-    """How often the recogniser is right in each split, from single views and from all of them."""
+    """Describe the accuracy in each split, for single views and for all views together."""
     lines: list[str] = []
     answers = p.logits.argmax(2)
     of_all = p.logits.sum(1).argmax(1)
-    if p.calibration.hypotheses:  # taught things: what is said of azimuths tells
+    if p.calibration.hypotheses:  # taught things: sum the belief over azimuths
         classes = len(p.classes)
         answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
         of_all = p.calibration.log_belief(

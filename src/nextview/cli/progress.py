@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar in a terminal, else lines, the first one at once."""
+"""Show progress on standard error: a bar in a terminal, otherwise lines of text."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -13,13 +13,13 @@ from nextview.data.progress import in_lines
 
 
 class Terminal(Console):
-    """Prints text literally: no markup, and control characters are escaped."""
+    """Console that prints text literally: no markup, and control characters are escaped."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Every text passes here, those in tables too."""
+        """Escape a text; every text passes here, including those in tables."""
         return super().render_str(printable(text), **options)
 
 
@@ -27,11 +27,11 @@ console = Terminal(stderr=True)
 
 
 def track(done: Iterable[int], total: int, what: str, /) -> None:
-    """Exhaust an iterable of growing counts and show the progress and the time left.
+    """Exhaust an iterable of increasing counts and show progress and remaining time.
 
     Args:
-        done: growing counts.
-        total: number that is reached at the end.
+        done: increasing counts of finished items.
+        total: final count.
         what: name of the work.
     """
     if console.is_terminal:
@@ -41,14 +41,15 @@ def track(done: Iterable[int], total: int, what: str, /) -> None:
 
 
 def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
-    """Follow a stage that yields how many items are done.
+    """Show the progress of a stage that yields the number of finished items.
 
     Args:
-        steps: pairs of the number of items done and of all items; the first one is before any work.
+        steps: pairs of the number of finished items and the total; the first pair comes before any
+            work.
         what: name of the work.
 
     Returns:
-        The number of items that were done before, and of all items.
+        The number of items that were finished before this run, and the total.
     """
     before, total = next(steps)
     track((done for done, _ in steps), total, what)
@@ -61,16 +62,16 @@ def track_all(
     what: str,
     before: int = 0,
 ) -> list[str]:
-    """Follow a job that yields what is done and why it failed, and print the reasons.
+    """Show the progress of a job and print the reasons of failed items.
 
     Args:
-        done: name of each item and None, or why it failed.
+        done: name of each finished item, with None or the reason why it failed.
         total: number of items.
         what: name of the work.
-        before: number of items that were done before.
+        before: number of items that were finished before this run.
 
     Returns:
-        The reasons.
+        The reasons of the failed items.
     """
     failed: list[str] = []
 
@@ -86,12 +87,12 @@ def track_all(
 
 
 def say_done(where: Path, done: str, before: int, total: int) -> None:
-    """Print what a run of a resumable stage did.
+    """Print a summary of a run of a resumable stage.
 
     Args:
-        where: what the stage wrote.
+        where: output of the stage.
         done: participle of the work, such as "measured" or "planned".
-        before: number of objects that were done before.
+        before: number of objects that were finished before this run.
         total: number of all objects.
     """
     if before == total:
@@ -108,7 +109,7 @@ def say_done(where: Path, done: str, before: int, total: int) -> None:
 
 
 def _show_bar(done: Iterable[int], total: int, what: str) -> None:
-    from rich import progress  # takes as long to import as all the rest of rich
+    from rich import progress  # slow to import
 
     width = Column(no_wrap=True, max_width=24, overflow="ellipsis")
     name = progress.TextColumn("{task.description}", table_column=width, markup=False)

@@ -1,4 +1,4 @@
-"""``nextview recognise``: look at one object until it is clear what it is."""
+"""``nextview recognise``: recognise one object from as few views as needed."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ class Output:
     """Files and output.
 
     Attributes:
-        figure: write a picture of the episode to this file (PNG, PDF or SVG).
+        figure: write a figure of the episode to this file (PNG, PDF or SVG).
         record: write a recording of the episode for the Rerun viewer to this file (.rrd).
         json: print JSON instead of a table.
-        overwrite: replace these files if they exist.
+        overwrite: replace existing files.
     """
 
     figure: Path | None = None
@@ -48,22 +48,22 @@ def recognise(
     seed: int = 0,
     any_orientation: bool = False,
 ) -> None:
-    """Recognise an object from as few views as needed, and show the views and the beliefs.
+    """Recognise an object from as few views as needed, and print the views and the beliefs.
 
-    The object is in a mesh file, or in captured depth images with poses: a ROS 2 bag, or a folder
-    in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. For each requested view the
-    nearest captured one is used. The object is selected by the masks of the frames; otherwise by
-    --box; otherwise it is the thing on the support plane that is nearest to --point, or at which
-    the first camera points.
+    The input is a mesh file, which is rendered, or captured depth images with poses: a ROS 2 bag,
+    or a folder in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. For each
+    requested view the nearest captured view is used. The masks of the frames select the object; if
+    there are none, --box does. Otherwise it is the object on the support plane nearest to --point,
+    or nearest to the optical axis of the first camera.
 
     Args:
-        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder or
-            a bag of captured views, or one depth image (.png).
-        more: more objects; with --json each is printed on its own line.
+        path: OFF, OBJ, PLY, STL or GLB file of one upright object; or a folder or bag of captured
+            views, or a single depth image (.png).
+        more: further objects; with --json each is printed on its own line.
         start: index of the first view, 0 to 39 for the 40 views (ring * 8 + azimuth step); by
             default random.
         seed: seed of the first view, the policy and the sensor errors.
-        any_orientation: the object is a taught thing in any orientation: held, leaning or thrown.
+        any_orientation: allow any orientation of a taught thing, for example in a hand or leaning.
     """
     if more and (output.figure or output.record):
         raise UsageError(
@@ -101,18 +101,18 @@ def show(
     output: Output,
     indent: int | None = 1,
 ) -> None:
-    """Recognise what a camera sees, print the episode and write the requested files.
+    """Recognise the object in front of a camera, print the episode and write the requested files.
 
     Args:
-        session: recognises the object.
+        session: that recognises the object.
         camera: in front of the object.
         name: of the object.
-        policy: name of what chooses the views.
-        output: what is to be written.
+        policy: name of the policy.
+        output: requested files and format.
         indent: of the JSON text, in spaces; None for one line.
 
     Raises:
-        ObservationError: nothing of the object is seen from any view.
+        ObservationError: the object is not visible in any view.
     """
     with ExitStack() as recorded:
         if output.record is not None:

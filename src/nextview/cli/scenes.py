@@ -1,4 +1,4 @@
-"""``nextview scenes``: draw cluttered scenes, or rooms."""
+"""``nextview scenes``: generate random cluttered tables or rooms."""
 
 from pathlib import Path
 from typing import Literal
@@ -24,30 +24,29 @@ def scenes(
     seed: int = 0,
     workers: Workers = Workers(),
 ) -> None:
-    """Draw cluttered scenes around targets on a table, or rooms.
+    """Generate random scenes: a target among clutter on a table, or rooms.
 
-    Each scene is a small JSON file that names meshes and says where they stand; the same seed draws
-    the same files. An interrupted run resumes. Objects of one split stand only among objects of
-    that split. Render them with nextview render OUT STORE --meshes MESHES, and go on as with any
-    other store.
+    Each scene is a small JSON file with meshes and their poses; the same seed gives the same
+    files. An interrupted run resumes. Objects of different splits are never mixed in a scene.
+    Render the scenes with nextview render OUT STORE --meshes MESHES, and use the store like any
+    other.
 
-    With --room a scene is a room as a mobile robot sees it: floor, walls, furniture in the
-    background, objects of life size on the floor or on a table, and a level camera. A RoomCamera
-    renders its frames (docs/scenes.md).
+    With --room a scene is a room as seen by a mobile robot: floor, walls, background furniture,
+    life-size objects on the floor or on a table, and a level camera. A RoomCamera renders its
+    frames (docs/scenes.md).
 
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
         out: folder of the scenes; existing scenes are kept.
-        levels: levels of clutter: the visible share of the target is 85 % (light), 65 % (medium) or
+        levels: clutter levels: the visible share of the target is 85 % (light), 65 % (medium) or
             45 % (heavy), averaged over the 40 views.
-        scenes: number of scenes at each level and of each split; by default one around each object.
-        split: draw only scenes of this split.
-        held_out: draw only scenes around objects that this model (name or card) held out of its
-            training.
-        room: draw rooms; without --unit, with ModelNet10's classes at usual sizes.
+        scenes: number of scenes per level and split; by default one for each object.
+        split: generate only scenes of this split.
+        held_out: use only target objects that this model (name or card) held out of its training.
+        room: generate rooms; without --unit, the ModelNet10 classes are scaled to usual sizes.
         unit: for rooms: unit of length of the mesh files; small objects then lie on a table, in any
             resting pose.
-        seed: seed of the targets and of everything around them.
+        seed: seed of the targets and the clutter.
     """
     if room:
         if held_out is not None or levels != ("light", "medium", "heavy"):

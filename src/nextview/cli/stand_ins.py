@@ -1,9 +1,9 @@
-"""Import modules whose packages are missing with stand-ins, for the help of a command.
+"""Replace missing packages with stand-ins, so that a command can still print its help.
 
-A command's help is made from the parameters of its function, and the module of that function
-imports torch or pandas. As Sphinx does for its pages (``autodoc_mock_imports``), what is missing is
-replaced by objects that can be called, subclassed and annotated with. The process ends once the
-help is shown: nothing is ever run with them.
+The help of a command is generated from the parameters of its function, whose module may import
+torch or pandas. Like ``autodoc_mock_imports`` of Sphinx, this module replaces missing packages by
+objects that can be called, subclassed and used as annotations. The process ends after printing
+the help; no other code runs with stand-ins.
 """
 
 import sys
@@ -20,10 +20,10 @@ from nextview.checks import EXTRAS
 
 
 class _StandIn(ABCMeta):
-    """The kind of all classes that stand for what a package would hold.
+    """Metaclass of the stand-ins for the contents of a package.
 
-    They are classes, because other libraries ask for subclasses of ``torch.Tensor`` once torch
-    seems to be there.
+    Stand-ins are classes because other libraries test for subclasses of ``torch.Tensor`` once
+    torch appears to be imported.
     """
 
     def __getattr__(cls, name: str) -> type:
@@ -42,13 +42,13 @@ class _StandIn(ABCMeta):
 
 
 def _stand_in(name: str) -> type:
-    if name.startswith("__"):  # Python asks for many of these, and goes on without
+    if name.startswith("__"):  # Python looks up many of these and does not need them
         raise AttributeError(name)
     return _StandIn(name, (), {})
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Finds missing packages; it comes last, so that installed ones are used."""
+    """Finder of missing packages; it comes last, so that installed packages are preferred."""
 
     def __init__(self, missing: Iterable[str]) -> None:
         self.missing = frozenset(missing)
@@ -77,18 +77,18 @@ class _Finder(MetaPathFinder, Loader):
         )
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """A module from which anything can be taken."""
+        """Create a module that has every attribute."""
         module = ModuleType(spec.name)
         module.__getattr__ = _stand_in  # type: ignore[method-assign]
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """There is nothing in it."""
+        """Do nothing: the module is empty."""
 
 
 @contextmanager
 def stand_ins() -> Iterator[None]:
-    """Import with stand-ins for missing extras; only for a process that ends afterwards."""
+    """Import stand-ins for missing extras; only for a process that ends afterwards."""
     named = {package for packages in EXTRAS.values() for package in packages}
     finder = import_stand_ins(
         package for package in named if find_spec(package) is None

@@ -1,4 +1,4 @@
-"""``nextview render``, ``check`` and ``measure``: view stores."""
+"""``nextview render``, ``check`` and ``measure``: create and process view stores."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,20 +27,21 @@ def render(
     workers: Workers = Workers(),
     overwrite: bool = False,
 ) -> None:
-    """Render the meshes or scenes of a dataset folder into a view store; resumes.
+    """Render the meshes or scenes of a dataset folder into a view store.
 
-    The folder is CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH.
+    The store holds a depth image of every object from every viewpoint. The layout of the folder is
+    CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH. An interrupted run resumes.
 
     A folder of scenes (nextview scenes) can be rendered too. The store then holds the visible part
-    of each target, and the scene around it.
+    of each target, and the surrounding scene.
 
     Args:
         dataset: folder of meshes or scenes.
         store: view store to create or to complete.
         viewpoints: number of viewpoints.
-        azimuths: views on each ring; by default 8 for the 40 views and 12 for the 12.
-        size: side of the images, pixels.
-        overwrite: replace a store of other objects or settings.
+        azimuths: views per ring; by default 8 for the 40 viewpoints and 12 for the 12.
+        size: side of the square images, pixels.
+        overwrite: replace a store with other objects or settings.
     """
     sphere = ViewSphere.named(viewpoints)
     sphere = sphere if azimuths is None else replace(sphere, azimuths=azimuths)
@@ -59,7 +60,7 @@ def render(
     try:
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
-        before = 0  # there is none yet, or rendering says what is wrong
+        before = 0  # there is no store yet, or rendering reports the error
     jobs = rendering.render(
         dataset,
         store,
@@ -99,9 +100,9 @@ def check(
     /,
     workers: Workers = Workers(),
 ) -> None:
-    """Check every object of a view store against its checksum.
+    """Verify the checksum of every object in a view store.
 
-    The exit status is 2 if one is damaged.
+    The exit status is 2 if an object is damaged.
 
     Args:
         store: view store made by nextview render.
@@ -140,19 +141,19 @@ def measure(
     workers: Workers = Workers(),
     overwrite: bool = False,
 ) -> None:
-    """Compute view measures of every rendered object and keep them in the store.
+    """Compute view measures of every rendered object and write them to the store.
 
     An interrupted run resumes.
 
     Args:
         store: view store made by nextview render.
-        measures: names of measures (see nextview list measures), or MODULE:FUNCTION of your own; by
-            default all that need only the depth.
+        measures: names of measures (see nextview list measures), or MODULE:FUNCTION for your own;
+            by default all that need only the depth.
         split: measure only this split.
         held_out: measure only objects that this model (name or card) held out of its training.
-        objects: measure only this number of objects, spread evenly; a later run with twice the
-            number includes the same ones.
-        overwrite: compute existing values again.
+        objects: measure only this number of evenly spaced objects; a later run with twice the
+            number includes the same objects.
+        overwrite: recompute existing values.
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
     steps = view_measures.measure(

@@ -1,4 +1,4 @@
-"""Download a published dataset: verified, and unpacked whole or not at all."""
+"""Download a published dataset, verify it, and unpack it completely or not at all."""
 
 import tempfile
 import zipfile
@@ -10,7 +10,7 @@ from nextview.checks import one_line
 from nextview.errors import DatasetError
 from nextview.files import new_folder, only_one
 
-LONGEST_ANSWER = 200  # letters of what a server says of itself
+LONGEST_ANSWER = 200  # characters of a server's message that are shown
 
 
 @dataclass(frozen=True)
@@ -48,21 +48,21 @@ def download(
     timeout: float = 60,
     bar: Any = False,
 ) -> Path:
-    """Fetch and verify an archive and unpack it below a folder.
+    """Download and verify an archive and unpack it below a folder.
 
-    Nothing is done if the unpacked folder is already there.
+    Nothing is done if the unpacked folder already exists.
 
     Args:
-        archive: what to fetch.
+        archive: the archive.
         destination: folder in which ``archive.folder`` is created.
-        timeout: of a silent connection, seconds.
-        bar: whether to show the progress.
+        timeout: of an inactive connection, seconds.
+        bar: whether to show progress.
 
     Returns:
         The unpacked folder.
 
     Raises:
-        DatasetError: the archive cannot be fetched, is not the published file, or cannot be
+        DatasetError: the archive cannot be downloaded, is not the published file, or cannot be
             unpacked.
     """
     import pooch

@@ -1,16 +1,16 @@
-"""Folders of meshes: which files are objects, of which class and split, and what is left out.
+"""Folders of meshes: the objects in them, with class and split, and the files that are left out.
 
-Understood are, with MESH for a file:
+Supported layouts, with MESH for a file, are:
 
-- MESH in the folder itself: each is a class of its own, if all meshes lie there.
-- CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with folders before the mesh
+- MESH in the folder itself: each is a class of its own, if all meshes are there.
+- CLASS/MESH, CLASS/SPLIT/MESH and SPLIT/CLASS/MESH, each also with further folders before the mesh
   (CLASS/ID/models/MESH).
-- SPLIT/MESH, with two splits or more: each mesh is a class of its own.
-  A SPLIT is a folder called as in SPLIT_NAMES, in capitals or not.
+- SPLIT/MESH, with at least two splits: each mesh is a class of its own.
 - NAME/google_16k/nontextured.ply, the download of the YCB object set: each NAME is one object.
 
-Files of one name beside each other, in several formats, are one model, of which the best is taken.
-Links are followed. ``read_folder`` does all that, and leaves nothing out without saying so.
+A SPLIT is a folder with one of the names in SPLIT_NAMES, in any case. Files with the same name in
+several formats are one model, of which the best is used. Links are followed. ``read_folder``
+implements these rules, and reports everything that it leaves out.
 """
 
 import logging
@@ -26,7 +26,7 @@ from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import find_card
 
 SPLITS = ("train", "test", "val")
-SPLIT_NAMES = {  # of folders, in lower case, and the split that each holds
+SPLIT_NAMES = {  # names of folders, in lower case, and their splits
     "train": "train",
     "training": "train",
     "test": "test",
@@ -35,12 +35,11 @@ SPLIT_NAMES = {  # of folders, in lower case, and the split that each holds
     "valid": "val",
     "validation": "val",
 }
-NAMED_FILES = 3  # that are named of those left out for one reason
-LONGEST_FOLDER_PATH = 200  # letters of a path in a sentence
-
-# The best first: STL knows no corners that faces share, and the axes of a GLB file are often wrong.
+NAMED_FILES = 3  # files named per reason for leaving them out
+LONGEST_FOLDER_PATH = 200  # characters of a path in a message
+# The best first: STL has no shared vertices, and the axes of a GLB file are often wrong.
 BEST_FORMATS = (".ply", ".off", ".obj", ".glb", ".stl")
-# Formats of shapes that are not read; other files beside the meshes are pictures, materials and
+# Formats of shapes that are not supported; other files next to meshes are images, materials and
 # notes.
 OTHER_SHAPES = (
     ".3ds",
@@ -79,7 +78,7 @@ OTHER_SHAPES = (
     ".x_t",
     ".xyz",
 )
-# of one object, the best first
+# scans of one object, the best first
 YCB_SCANS = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds")
 METADATA_FOLDERS = ("__MACOSX",)
 
@@ -103,7 +102,7 @@ class Entry:
         name: unique in the dataset.
         label: its class.
         split: one of SPLITS, or "".
-        layout: in which it lies, such as "CLASS/MESH".
+        layout: of the folder, such as "CLASS/MESH".
     """
 
     path: Path
@@ -115,12 +114,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Listing:
-    """What a folder holds.
+    """Contents of a folder.
 
     Attributes:
         entries: the objects, sorted by class, split and name.
-        left_out: paths in the folder that are not taken, with the reason of each.
-        notes: what was decided about the layout, a sentence each.
+        left_out: paths in the folder that are not used, with reasons.
+        notes: decisions about the layout, a sentence each.
     """
 
     entries: list[Entry]
@@ -128,7 +127,7 @@ class Listing:
     notes: list[str] = field(default_factory=list)
 
     def summary(self) -> str:
-        """How many objects lie in which layout, and what was left out, for people to read."""
+        """Describe the objects by layout, and the files that were left out."""
         objects = (
             "1 object" if len(self.entries) == 1 else f"{len(self.entries)} objects"
         )
@@ -137,16 +136,16 @@ class Listing:
         return f"{text}; left out: {'; '.join(phrases)}" if phrases else text
 
     def layout(self) -> str:
-        """How many objects lie in which layout."""
+        """Describe the number of objects in each layout."""
         layouts = Counter(entry.layout for entry in self.entries)
         return ", ".join(f"{count} in {layout}" for layout, count in layouts.items())
 
 
 def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
-    """What was left out, a phrase for each reason, for people to read.
+    """Describe the files that were left out, one phrase per reason.
 
     Args:
-        left_out: paths, and the reason of each.
+        left_out: paths with reasons.
 
     Returns:
         Phrases such as "a.step, b.step: of a format that is not read".
@@ -165,11 +164,11 @@ def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
 
 
 def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
-    """List all meshes of a dataset folder and log what was left out; see ``scan_dataset``.
+    """List all meshes of a dataset folder and log the files left out; see ``scan_dataset``.
 
     Args:
         root: the folder.
-        loose: whether meshes outside of class folders are listed too.
+        loose: whether to list meshes outside class folders, too.
 
     Returns:
         The meshes.
@@ -188,19 +187,19 @@ def scan_dataset(
     suffixes: tuple[str, ...] = FORMATS,
     loose: bool = False,
 ) -> Listing:
-    """List the objects of a dataset folder and what was left out; see ``read_folder``.
+    """List the objects of a dataset folder and the files left out; see ``read_folder``.
 
     Args:
         root: the folder.
-        suffixes: of the files that count.
-        loose: whether files outside of class folders are listed too.
+        suffixes: of the object files.
+        loose: whether to list files outside class folders, too.
 
     Returns:
-        The objects and what was left out.
+        The objects and the files left out.
 
     Raises:
-        DatasetError: there is no such folder, it holds no object, or two objects would have one
-            name.
+        DatasetError: there is no such folder, it contains no object, or two objects would have the
+            same name.
     """
     listing = read_folder(Path(root), suffixes, loose)
     if listing.entries:
@@ -218,21 +217,20 @@ def read_folder(
     loose: bool = False,
     skip: Mapping[Path, str] = {},
 ) -> Listing:
-    """Find out what a folder holds: its objects, in which layout they lie, and what is left out.
+    """Find the objects in a folder, their layout, and the files that are left out.
 
     Args:
         root: the folder.
-        suffixes: of the files that are objects, in lower case.
-        loose: whether a mesh in the folder itself is a class of its own also beside class folders;
-            else it is left out there.
-        skip: folders below it that are left out, with the reason of each; where that is empty,
-            nothing is said.
+        suffixes: of the object files, in lower case.
+        loose: whether a mesh in the folder itself is a class of its own even if there are class
+            folders; otherwise it is left out in that case.
+        skip: subfolders that are left out, with reasons; an empty reason is not reported.
 
     Returns:
-        What it holds; there may be no object.
+        The contents, possibly without any object.
 
     Raises:
-        DatasetError: there is no such folder, or two objects would have one name.
+        DatasetError: there is no such folder, or two objects would have the same name.
     """
     if not root.is_dir():
         raise DatasetError(
@@ -277,13 +275,13 @@ def select(
     split: str | None,
     held_out: str | Path | None,
 ) -> list[Entry]:
-    """Select objects by their split and by a card's list of held-out objects.
+    """Select objects by split and by the held-out objects of a card.
 
     Args:
         entries: of the folder.
         dataset: the folder, for messages.
         split: name of the split; None for all.
-        held_out: name or path of a card, of which the held-out objects are kept (scenes by their
+        held_out: name or path of a card, whose held-out objects are selected (scenes by their
             target); None for all.
 
     Returns:
@@ -307,13 +305,13 @@ def select(
 
 @dataclass(frozen=True)
 class _Content:
-    """What lies below a folder, all paths relative to it.
+    """Everything below a folder, with relative paths.
 
     Attributes:
-        files: that may be objects.
-        left_out: what cannot be, with reasons.
+        files: possible objects.
+        left_out: everything that cannot be an object, with reasons.
         other_files: files of other kinds.
-        folders: all folders that were entered.
+        folders: all visited folders.
     """
 
     files: list[Path] = field(default_factory=list)
@@ -322,7 +320,7 @@ class _Content:
     folders: list[Path] = field(default_factory=list)
 
     def without_objects(self, kind: str) -> list[tuple[Path, str]]:
-        """Return files that are no objects, and folders without any object as a whole."""
+        """Return files that are not objects, and whole folders without any object."""
         told = [*self.files, *(place for place, _ in self.left_out)]
         worth_entering = {
             Path(),
@@ -346,7 +344,7 @@ class _Content:
 
 
 def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _Content:
-    """List all that lies below a folder, each folder once even if links lead there again."""
+    """List everything below a folder; each folder is visited once, even with circular links."""
     content = _Content()
     unreadable: list[OSError] = []
     top = _real(root)
@@ -384,12 +382,12 @@ def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _C
 
 
 def _real(path: Path) -> Path:
-    # Path.resolve raises where links lead in a circle
+    # Path.resolve raises an error for circular links
     return Path(os.path.realpath(path))
 
 
 def _not_entered(folder: Path) -> str | None:
-    """Why a folder holds no objects of a dataset, whatever is in it."""
+    """Return the reason why a folder is not searched for objects, or None."""
     if folder.name.startswith(".") or folder.name in METADATA_FOLDERS:
         return HIDDEN_FILE
     if not folder.name.isprintable():
@@ -403,7 +401,7 @@ def _note_file(
     place: Path,
     suffixes: tuple[str, ...],
 ) -> None:
-    """Put a file, by its place in a folder, where it belongs."""
+    """Add a file to the contents, by its path."""
     suffix = place.suffix.lower()
     wanted = suffix in suffixes
     shape = wanted or suffix in OTHER_SHAPES
@@ -426,7 +424,7 @@ def _note_file(
 
 
 def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, str]]]:
-    """Of the files of each model the best one, by what they have in common; and the others."""
+    """Return the best file of each model, by the common part of their paths; and the others."""
     models: dict[Path, list[Path]] = {}
     for place in files:
         models.setdefault(_model_of(place), []).append(place)
@@ -447,7 +445,7 @@ def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, s
 
 
 def _model_of(place: Path) -> Path:
-    """Return what the files of one model have in common.
+    """Return the common part of the paths of one model's files.
 
     It is the path without suffix; in a YCB download, the folder of the object.
     """
@@ -457,7 +455,7 @@ def _model_of(place: Path) -> Path:
 
 
 def _preference(place: Path) -> tuple[int, bool, int, str]:
-    """Sorts the files of one model, the best first."""
+    """Sort key of the files of one model, the best first."""
     folder = place.parent.name
     scan = YCB_SCANS.index(folder) if folder in YCB_SCANS else 0
     suffix = place.suffix.lower()
@@ -466,9 +464,9 @@ def _preference(place: Path) -> tuple[int, bool, int, str]:
 
 
 def _split_first(in_folders: list[Path]) -> bool:
-    """Whether the folders at the top are splits.
+    """Return True if the top-level folders are splits.
 
-    One folder called "train" that holds meshes, and no class folders, is a class.
+    A single folder called "train" that contains meshes, and no class folders, is a class.
     """
     tops = {model.parts[0] for model in in_folders}
     with_classes = any(len(model.parts) > 2 for model in in_folders)
@@ -477,7 +475,7 @@ def _split_first(in_folders: list[Path]) -> bool:
 
 
 def _split_of(folder: str) -> str:
-    """The split that a folder of this name holds; "" if it is none."""
+    """Return the split for the name of a folder; "" if it is none."""
     return SPLIT_NAMES.get(folder.lower(), "")
 
 
@@ -488,8 +486,8 @@ def _entry(
     split_first: bool,
     own_class: bool,
 ) -> Entry | None:
-    """What the place of a model says of it; None if it names no class."""
-    # the folder may be that of one object of a YCB download
+    """Return the object for the path of a model; None if the path has no class."""
+    # the folder may be that of a single object in a YCB download
     *folders, stem = model.parts or (_real(root).name,)
     split = ""
     layout = ""
@@ -508,7 +506,7 @@ def _entry(
 
 
 def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
-    """Name entries by their file, or by as much of the path as makes them unique."""
+    """Name entries by their file, or by as much of the path as needed for unique names."""
 
     # CLASS/ID/models/MESH: ID, models, MESH
     def below(model: Path, entry: Entry) -> tuple[str, ...]:
@@ -543,7 +541,7 @@ def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
 
 
 def _notes(root: Path, entries: list[Entry]) -> list[str]:
-    """What was decided about folders that may be meant otherwise, a sentence each."""
+    """Describe decisions about ambiguous folders, a sentence each."""
     labels = sorted({entry.label for entry in entries})
     notes = [
         f"the folder {label} is taken for a class, not for a split"
@@ -559,7 +557,7 @@ def _notes(root: Path, entries: list[Entry]) -> list[str]:
 
 
 def _deep_folders(entries: list[Entry]) -> Counter[Path]:
-    """How many objects lie directly in each of the folders below those of the classes."""
+    """Count the objects directly in each folder below the class folders."""
     return Counter(
         entry.path.parent for entry in entries if entry.layout.endswith(".../MESH")
     )

@@ -1,8 +1,7 @@
-"""Simulated frames with labels for the segmentation network: drawn into files, and read again.
+"""Generate simulated frames with labels for the segmentation network, and read them again.
 
-Each file holds frames of worlds with things of its own. Which they are depends on the seed, the
-number of the file and the meshes alone, so whoever is killed goes on with the files that are
-missing.
+Each file contains frames of its own worlds. They depend only on the seed, the number of the file
+and the meshes, so an interrupted run continues with the missing files.
 """
 
 from __future__ import annotations
@@ -46,21 +45,21 @@ from nextview.simulation.worlds import (
 from nextview.types import Float, Float32, Index, Mask
 
 FRAME_SHAPE = (160, 213)  # rows and columns
-FRAMES_OF_A_FILE = 400  # at most
+FRAMES_OF_A_FILE = 400  # largest number of frames in a file
 VIEWS_OF_A_WORLD = 2
-FEW_PIXELS = 0.06  # of things; most frames with fewer teach little and are dropped
+FEW_PIXELS = 0.06  # share of object pixels; most frames with fewer are dropped
 FEW_KEPT = 0.35  # share of these that are kept
-# of each frame: solids that its file draws things from, and meshes among them
+# per frame: number of solids from which a file draws objects, and of meshes among them
 SHAPES_PER_FRAME = 0.35
 TOYS_PER_FRAME = 0.15
 FURNITURE_PER_FRAME = 0.075
 FEWEST_SHAPES = 6
 FARTHEST_LEARNED = 6.5  # metres
-STORED_DEPTH_STEP = 1e-4  # metres, of the depth in files
-UNKNOWN_CLASS = -1  # of a pixel without depth
-SMALLEST_TAUGHT = 8  # pixels of a thing that weighs most for each of them
-UP_NOISE = 0.03  # of a direction against gravity that an arm reports
-CLASS_OF = {  # by label; things have labels from 0 on
+STORED_DEPTH_STEP = 1e-4  # metres, unit of the depth in files
+UNKNOWN_CLASS = -1  # class of a pixel without depth
+SMALLEST_TAUGHT = 8  # pixels; smaller objects get no larger weight per pixel
+UP_NOISE = 0.03  # error of the up direction reported by an arm
+CLASS_OF = {  # by label; objects have labels from 0
     HOLE: UNKNOWN_CLASS,
     BACKGROUND: OUTPUT_CLASSES.index("background"),
     SURFACE: OUTPUT_CLASSES.index("surface"),
@@ -69,11 +68,11 @@ CLASS_OF = {  # by label; things have labels from 0 on
 
 @dataclass(frozen=True)
 class WorldMeshes:
-    """Meshes that worlds are drawn of, beside generated solids.
+    """Meshes used in worlds, in addition to generated solids.
 
     Attributes:
-        toys: of things, of any size.
-        furniture: as large as its class is in life.
+        toys: of objects, of any size.
+        furniture: of life-size furniture.
     """
 
     toys: tuple[Entry, ...] = ()
@@ -81,15 +80,15 @@ class WorldMeshes:
 
     @classmethod
     def of(cls, toys: Path | None, furniture: Path | None) -> WorldMeshes:
-        """List the meshes of folders, without those of other splits than that to train on.
+        """List the training meshes of folders.
 
         Args:
-            toys: folder of things of any size; None for none.
-            furniture: folder of furniture, of ModelNet10's classes; None for none.
+            toys: folder of objects of any size; None for none.
+            furniture: folder of furniture with ModelNet10 classes; None for none.
 
         Raises:
-            DatasetError: a folder is missing or holds no mesh to train on.
-            UsageError: furniture is of a class whose size is not known.
+            DatasetError: a folder is missing or contains no training mesh.
+            UsageError: the size of a furniture class is not known.
         """
         large = _entries(furniture)
         for entry in large:
@@ -102,15 +101,15 @@ class WorldMeshes:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Return the names of the meshes."""
         return tuple(entry.name for entry in (*self.toys, *self.furniture))
 
     def divided(self, share: float, seed: int) -> tuple[WorldMeshes, WorldMeshes]:
-        """Return those to learn from and those to validate on.
+        """Divide the meshes into a training and a validation part.
 
         Args:
-            share: of the meshes that is held out for validation, about.
-            seed: of the draw.
+            share: approximate share for validation.
+            seed: of the random division.
         """
         rng = np.random.default_rng([seed, 2])
         parts = []
@@ -122,7 +121,7 @@ class WorldMeshes:
 
 
 def _entries(folder: Path | None) -> tuple[Entry, ...]:
-    """The meshes of a folder that are to train on."""
+    """Return the training meshes of a folder."""
     if folder is None:
         return ()
     entries = [entry for entry in list_dataset(folder) if entry.split in ("train", "")]
@@ -133,12 +132,12 @@ def _entries(folder: Path | None) -> tuple[Entry, ...]:
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A file of frames that is to be drawn.
+    """A file of frames to be generated.
 
     Attributes:
         path: of the file.
-        seed: what its random numbers begin with.
-        frames: how many it holds.
+        seed: of its random numbers.
+        frames: number of frames.
     """
 
     path: Path
@@ -152,13 +151,13 @@ def frame_files(
     seed: Sequence[int],
     most: int = FRAMES_OF_A_FILE,
 ) -> list[FrameFile]:
-    """Plan files of equally many frames.
+    """Plan files with equal numbers of frames.
 
     Args:
         folder: of the files.
-        frames: in all of them, at least.
-        seed: of all draws.
-        most: frames of a file.
+        frames: least total number.
+        seed: of all random numbers.
+        most: largest number of frames per file.
     """
     count = -(-frames // most)
     return [
@@ -173,16 +172,16 @@ def draw_frames(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Draw the files that are not there yet.
+    """Generate the missing files.
 
     Args:
         files: see ``frame_files``.
-        meshes: that the worlds are drawn of, beside generated solids.
-        workers: number of processes; None for one on each core, 0 for this process.
+        meshes: used in the worlds, in addition to generated solids.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
 
     Yields:
-        Number of files done so far, and of all files.
+        Number of finished files, and of all files.
 
     Raises:
         DatasetError: a process died.
@@ -199,11 +198,11 @@ def draw_frames(
 
 
 def draw_file(meshes: WorldMeshes, file: FrameFile) -> None:
-    """Draw worlds, photograph each, and write the frames, all or none.
+    """Draw worlds, capture each, and write the frames, all or none.
 
     Args:
-        meshes: that the worlds are drawn of, beside generated solids.
-        file: what to write.
+        meshes: used in the worlds, in addition to generated solids.
+        file: to write.
     """
     rng = np.random.default_rng(file.seed)
     toys = solids_of(meshes.toys, max(1, round(TOYS_PER_FRAME * file.frames)), rng)
@@ -226,14 +225,14 @@ def draw_file(meshes: WorldMeshes, file: FrameFile) -> None:
 
 
 def solids_of(entries: Sequence[Entry], count: int, rng: Generator) -> list[Solid]:
-    """Load some meshes, upright on z = 0; furniture is as large as in life.
+    """Load some meshes, upright on z = 0; furniture is life-size.
 
-    Those that are too fine or damaged are passed over.
+    Meshes that are too large or damaged are skipped.
 
     Args:
-        entries: to draw from, each once.
-        count: how many, at most.
-        rng: draws them and their sizes.
+        entries: available meshes, each used once.
+        count: largest number.
+        rng: for the selection and the sizes.
     """
     solids: list[Solid] = []
     for index in rng.permutation(len(entries)):
@@ -256,13 +255,13 @@ def solids_of(entries: Sequence[Entry], count: int, rng: Generator) -> list[Soli
 
 @dataclass(frozen=True, eq=False)
 class LabelledFrames:
-    """Frames with labels, as files hold them.
+    """Frames with labels, as stored in files.
 
     Attributes:
-        depth: (N, H, W) uint16, tenths of a millimetre; 0 where nothing was measured.
+        depth: (N, H, W) uint16, tenths of a millimetre; 0 without valid depth.
         labels: see ``simulation.worlds.LabelledFrame``, (N, H, W) int16.
         pinhole: focal lengths and principal point, (N, 4) float64, pixels.
-        up: direction against gravity in the camera's axes, (N, 3) float64.
+        up: direction against gravity in camera axes, (N, 3) float64.
     """
 
     depth: NDArray[np.uint16]
@@ -275,7 +274,7 @@ class LabelledFrames:
 
     @classmethod
     def of(cls, frames: Sequence[LabelledFrame]) -> LabelledFrames:
-        """Round the depth of frames, and forget what is too far."""
+        """Quantise the depth of frames, and remove depth that is too large."""
         depth = np.stack([frame.depth for frame in frames])
         depth = np.where(depth > FARTHEST_LEARNED, 0, depth)
         steps = np.rint(depth / STORED_DEPTH_STEP).astype(np.uint16)
@@ -289,7 +288,7 @@ class LabelledFrames:
         )
 
     def save(self, path: Path) -> None:
-        """Write them to a file, whole or not at all."""
+        """Write the frames to a file, completely or not at all."""
         with new_file(path) as part:
             np.savez_compressed(part, **vars(self))
 
@@ -307,11 +306,12 @@ class LabelledFrames:
         return cls(*(np.concatenate(parts) for parts in zip(*read, strict=True)))
 
     def example(self, index: int, rng: Generator | None) -> Example:
-        """Return what the network learns from one frame.
+        """Return the training example of one frame.
 
         Args:
             index: of the frame.
-            rng: mirrors it or not, and tilts or hides gravity; None for the frame as it is.
+            rng: for augmentation: mirroring, and tilting or hiding the up direction; None for no
+                augmentation.
         """
         depth = self.depth[index].astype(np.float32) * np.float32(STORED_DEPTH_STEP)
         labels = self.labels[index]
@@ -320,7 +320,7 @@ class LabelledFrames:
         up = self.up[index]
         told = True
         if rng is not None:
-            if rng.random() < 0.5:  # a mirrored world is as good
+            if rng.random() < 0.5:  # mirror the frame
                 depth, labels, x = depth[:, ::-1].copy(), labels[:, ::-1], -x[::-1]
                 up = up * [-1, 1, 1]
             told = rng.random() < 0.5
@@ -331,9 +331,9 @@ class LabelledFrames:
 
 
 def _arrays(path: Path) -> list[NDArray]:
-    """The arrays of a file, in the order of ``LabelledFrames``."""
+    """Return the arrays of a file, in the order of ``LabelledFrames``."""
     try:
-        # opened here, as numpy would leave a damaged file open
+        # opened here, because numpy would leave a damaged file open
         with path.open("rb") as file, np.load(file) as arrays:
             return [arrays[field.name] for field in fields(LabelledFrames)]
     except DAMAGED:
@@ -344,15 +344,15 @@ def _arrays(path: Path) -> list[NDArray]:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """What the network learns from a frame; its sides are multiples of SIDE_MULTIPLE.
+    """A training example; its sides are multiples of SIDE_MULTIPLE.
 
     Attributes:
         features: input, see ``segmentation.features``, (C, h, w) float32.
         classes: index in OUTPUT_CLASSES, UNKNOWN_CLASS without depth, (h, w) int64.
-        same: for each of AFFINITY_STEPS, whether the other pixel is of the same thing, (12, h, w)
-            float32.
-        compared: weight of what is learned of each pair, 0 unless both are of things, (12, h, w)
-            float32.
+        same: for each of AFFINITY_STEPS, whether the other pixel belongs to the same object,
+            (12, h, w) float32.
+        compared: weight of each pair in the loss, 0 unless both pixels belong to objects,
+            (12, h, w) float32.
     """
 
     features: Float32
@@ -362,12 +362,12 @@ class Example:
 
     @classmethod
     def of(cls, picture: SmallPicture, labels: NDArray, up: Float | None) -> Example:
-        """Compute what is learned from a picture.
+        """Create the example of a downscaled frame.
 
         Args:
-            picture: the picture.
+            picture: the frame.
             labels: of its pixels, see ``simulation.worlds.LabelledFrame``, (h, w).
-            up: direction against gravity in the camera's axes, (3,); None if it is not given.
+            up: direction against gravity in camera axes, (3,); None if not given.
         """
         classes = np.full(labels.shape, OUTPUT_CLASSES.index("thing"))
         for label, number in CLASS_OF.items():
@@ -385,14 +385,14 @@ class Example:
 
 
 def _padded(values: NDArray, value: int) -> NDArray:
-    """Rows and columns added below and on the right."""
+    """Pad rows and columns at the bottom and on the right."""
     added = [(0, -size % SIDE_MULTIPLE) for size in values.shape[-2:]]
     sides = [(0, 0)] * (values.ndim - 2) + added
     return np.pad(values, sides, constant_values=value)
 
 
 def pair_weights(labels: NDArray) -> Float32:
-    """Weights of the pixels of things, (h, w); those of a small thing weigh more.
+    """Return weights of object pixels, (h, w), which are larger for small objects.
 
     Args:
         labels: see ``simulation.worlds.LabelledFrame``, (h, w).
@@ -408,7 +408,7 @@ def pair_weights(labels: NDArray) -> Float32:
 def _pairs(
     labels: NDArray, weights: Float32, down: int, right: int
 ) -> tuple[Mask, Float32]:
-    """Whether each pixel and one farther on are of one thing, and how much that counts."""
+    """Return whether pairs of pixels belong to the same object, and their weights."""
     first, second = pair_slices(labels.shape, down, right)
     same = np.zeros(labels.shape, bool)
     compared = np.zeros(labels.shape, np.float32)
@@ -419,16 +419,16 @@ def _pairs(
 
 
 def output_scores(outputs: Float32, examples: Sequence[Example]) -> dict[str, float]:
-    """Judge a network's outputs.
+    """Evaluate the outputs of a network.
 
     Args:
         outputs: for the frames, (N, 15, h, w).
         examples: the frames.
 
     Returns:
-        ``class_accuracy``, the share of pixels whose class is right, mean of the classes;
-        ``thing_iou``, the intersection over union of the pixels of things; ``pair_accuracy``, the
-        share of pairs that are rightly called of one thing or not, mean of both and of the steps.
+        ``class_accuracy``, the share of correctly classified pixels, averaged over the classes;
+        ``thing_iou``, the intersection over union of object pixels; ``pair_accuracy``, the share of
+        correctly classified pairs, averaged over same and different objects and over the steps.
     """
     classes = np.stack([example.classes for example in examples])
     taken = outputs[:, : len(OUTPUT_CLASSES)].argmax(1)

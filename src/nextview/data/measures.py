@@ -1,4 +1,4 @@
-"""View measures: their input, your own by import path, and their values for a store."""
+"""View measures: their input, custom measures by import path, and their computation for a store."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -20,18 +20,18 @@ from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-Made = dict[str, Float32]  # the values of one object, by the names of their arrays
+Made = dict[str, Float32]  # values of one object, by array name
 QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One view of an object.
+    """One view of an object, as the input of measures.
 
-    What several measures ask for is computed once, when the first one asks.
+    Intermediate results that several measures need are computed once, on demand.
 
     Attributes:
-        depth: along the optical axis, (H, W) float, object radii, 0 where there is no object.
+        depth: along the optical axis, (H, W) float, object radii, 0 for the background.
         pose: camera-to-world, (4, 4), OpenCV axes; the world is the object frame, z up.
         intrinsics: pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
     """
@@ -45,38 +45,38 @@ class MeasuredView:
 
     @cached_property
     def box(self) -> tuple[slice, ...]:
-        """Rows and columns that hold the object, (H', W'); none of them where nothing is seen."""
+        """Rows and columns that contain the object, (H', W'); empty if it is not visible."""
         found = find_objects((self.depth > 0).astype(np.int8))
         return found[0] if found else (slice(0, 0), slice(0, 0))
 
     @cached_property
     def near(self) -> Floats:
-        """The depth in the bounding box, (H', W'), which saves work on the background."""
+        """Depth in the bounding box, (H', W')."""
         return self.depth[self.box]
 
     @cached_property
     def seen(self) -> Mask:
-        """Where the box shows the object, (H', W')."""
+        """Object pixels in the bounding box, (H', W')."""
         return self.near > 0
 
     @cached_property
     def depths(self) -> Floats:
-        """Depth of the pixels that show the object, (n,), row by row."""
+        """Depth of the object pixels, (n,), row by row."""
         return self.near[self.seen]
 
 
-# gives an object of a store, from all its views
+# returns all views of an object in a store
 MeasuredViews = Callable[[ViewStore, int], Iterator[MeasuredView]]
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A measure of a view, and what it needs.
+    """A measure of a view, and its required input.
 
     Attributes:
         function: computes the measure of one view.
-        needs: whether the function needs only the depth image, or the mesh too.
-        source: publication that the measure comes from.
+        needs: "depth" if the depth image is enough, or "mesh".
+        source: publication of the measure.
         good: whether high values (peak) or low values (valley) mark the better views.
     """
 
@@ -86,14 +86,14 @@ class Measure:
     good: Good = "peak"
 
     def __call__(self, view: MeasuredView) -> float:
-        """The measure of a view."""
+        """Compute the measure of a view."""
         return self.function(view)
 
 
 MEASURES: dict[
     str,
     Measure,
-] = {  # the thesis's own; packages add theirs by entry points of MEASURE_ENTRY_POINTS
+] = {  # of the thesis; other packages add measures with entry points MEASURE_ENTRY_POINTS
     "depth_entropy": Measure(
         lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
     )
@@ -102,7 +102,7 @@ MEASURE_ENTRY_POINTS = "nextview.measures"
 
 
 def all_measures() -> dict[str, Measure]:
-    """Every measure that has a name: MEASURES, and those that installed packages add."""
+    """Return all named measures: MEASURES, and those of installed packages."""
     return MEASURES | {
         name: find_measure(name) for name in plugins(MEASURE_ENTRY_POINTS)
     }
@@ -111,7 +111,7 @@ def all_measures() -> dict[str, Measure]:
 def find_measure(name: str) -> Measure:
     """Return a measure by its name or as "MODULE:FUNCTION".
 
-    The latter is a function or a ``Measure`` of your own.
+    The latter is a custom function or ``Measure``.
     """
     if name in MEASURES:
         return MEASURES[name]
@@ -133,11 +133,11 @@ def find_measure(name: str) -> Measure:
 
 
 def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
-    """Return the measures that a user means.
+    """Return the measures that a user requests.
 
     Args:
         names: of measures, or "all"; empty for all that can be computed.
-        meshes: whether the meshes are at hand.
+        meshes: whether the meshes are available.
 
     Returns:
         Names of the measures, each once.
@@ -169,9 +169,9 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
 
 
 def depth_entropy(depth: Floats) -> float:
-    """Return the Shannon entropy, bits, of the values of a depth image.
+    """Return the Shannon entropy of the values of a depth image, bits.
 
-    The image is (H, W), object radii, 0 where there is no object.
+    The image is (H, W), object radii, 0 for the background.
     """
     depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
     seen = depth[depth > 0]
@@ -184,7 +184,7 @@ def depth_entropy(depth: Floats) -> float:
 def normalise_per_object(values: Floats) -> Float32:
     """Scale values, (..., V), to [0, 1] over each object's views, float32.
 
-    They are all 0 where the views do not differ.
+    They are all 0 if the views do not differ.
     """
     values = np.asarray(values)
     low = values.min(-1, keepdims=True)
@@ -197,8 +197,8 @@ def normalise_per_object(values: Floats) -> Float32:
 def confidence_maps(logits: Floats, labels: NDArray[np.integer]) -> Float32:
     """Return the confidence in the true class of each single view.
 
-    It is the highest probability where the view is right, the first of equal classes counting, else
-    0.
+    It is the highest probability if the most likely class, the first one in case of ties, is the
+    true one, else 0.
 
     Args:
         logits: (N, V, C).
@@ -215,7 +215,7 @@ def confidence_maps(logits: Floats, labels: NDArray[np.integer]) -> Float32:
 
 
 def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:
-    """Iterate over the views of a stored object as measures take them.
+    """Iterate over the views of a stored object as input of measures.
 
     Args:
         store: the view store.
@@ -245,17 +245,17 @@ def measure(
     Args:
         path: of the store.
         names: of the measures, see ``find_measure``, or "all"; empty for all that ``views`` allows.
-        workers: number of processes; None for one on each core, 0 for this process.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         objects: rows of the objects, (n,) int64; None for all.
-        overwrite: whether to compute existing values again.
-        views: returns what the measures take of an object.
+        overwrite: whether to recompute existing values.
+        views: returns the views of an object.
 
     Yields:
-        Number of objects done so far, and the number of all.
+        Number of finished objects, and the total.
     """
     names = names_of(names, views is not depth_views)
-    # says if it is missing, before anything is begun
+    # raises an error if it is missing, before any work is done
     ViewStore.open(path).array("depth")
     function = partial(_measure, names, views)
     yield from keep(
@@ -292,7 +292,7 @@ def _measure(
             with (
                 guard,
                 np.errstate(over="ignore"),
-            ):  # what is too large for float32 is told below
+            ):  # overflow of float32 is reported below
                 values[name][k] = function(view)
     for name, found in values.items():
         if not np.isfinite(found).all():
@@ -318,13 +318,13 @@ def keep(
         path: of the store.
         names: of the arrays.
         function: called with the store and a row; returns the values of the arrays.
-        workers: number of processes; None for one on each core, 0 for this process.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         objects: rows of the objects, (n,) int64; None for all.
-        overwrite: whether to compute existing values again.
+        overwrite: whether to recompute existing values.
 
     Yields:
-        Number of objects done so far, and the number of all.
+        Number of finished objects, and the total.
     """
     with writing(path):
         store = ViewStore.open(Path(path).absolute())
@@ -350,7 +350,7 @@ def keep(
                 workers,
                 scheduler,
             )
-        finally:  # nothing is left of what failed at once
+        finally:  # remove arrays without any values
             for name in names:
                 if not store.held(name).any():
                     store.remove(name)

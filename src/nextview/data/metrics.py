@@ -68,7 +68,7 @@ def accuracy(answers: Index, labels: Index) -> dict[str, float]:
         labels: true classes, the same shape.
 
     Returns:
-        "instance": over all; "class": mean over classes. Both rounded to four digits.
+        "instance": over all; "class": mean over classes. Both rounded to four decimals.
     """
     right = answers == labels
     return {
@@ -78,7 +78,7 @@ def accuracy(answers: Index, labels: Index) -> dict[str, float]:
 
 
 def recogniser_scores(logits: Floats, labels: Index) -> dict[str, dict[str, float]]:
-    """Return the accuracy from single views and with the logits of all views summed.
+    """Return the accuracy for single views and for the summed logits of all views.
 
     Args:
         logits: (N, V, classes).
@@ -140,18 +140,18 @@ MAP_DIGITS = {"mse": 5, "d0": 4, "d_le_1": 4, "d_lt_2": 4, "regret": 4}
 
 
 def map_errors(predicted: Floats, true: Floats) -> dict[str, Float]:
-    """Return how well local maps are predicted (thesis, section 5.3 and table 4).
+    """Return the errors of predicted local maps (thesis, section 5.3 and table 4).
 
     The errors are the mean squared error ("mse"); whether the predicted highest cell is at d = 0, d
     <= 1 and d < 2 cells from the true one; and the regret, the true highest value minus the true
-    value at the predicted highest cell. Of equal cells the first counts.
+    value at the predicted highest cell. In case of ties the first cell is used.
 
     Args:
         predicted: (M, rings, 3).
         true: (M, rings, 3).
 
     Returns:
-        The errors of each map by their names, (M,) float64 each.
+        The errors of each map by name, (M,) float64 each.
     """
     m, _, columns = true.shape
     p = predicted.reshape(m, -1).astype(np.float64)
@@ -177,7 +177,7 @@ def map_scores(predicted: Floats, true: Floats) -> dict[str, float]:
         true: (M, rings, 3).
 
     Returns:
-        The means by their names.
+        The means by name.
     """
     return {
         name: round(float(v.mean()), MAP_DIGITS[name])

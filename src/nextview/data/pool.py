@@ -20,7 +20,7 @@ from nextview.checks import extras, whole
 from nextview.errors import DatasetError
 
 MOST_WORKERS = 1024  # processes on one machine
-PATIENCE = "10s"  # how long a scheduler may take to answer
+PATIENCE = "10s"  # timeout of the connection to a scheduler
 
 _starting = threading.Lock()
 
@@ -30,10 +30,10 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """The process that worked on an item was killed or crashed twice.
+    """Result of an item whose process was killed or crashed twice.
 
     Attributes:
-        reason: What happened, in words. ``str`` gives it, too.
+        reason: description, also returned by ``str``.
     """
 
     reason: str
@@ -43,7 +43,7 @@ class WorkerDied:
 
 
 def count(workers: int | None) -> int:
-    """The number of processes: one for each core by default."""
+    """Return the number of processes, by default one per core."""
     return (
         os.cpu_count() or 1
         if workers is None
@@ -59,15 +59,15 @@ def each(
 ) -> Iterator[tuple[GivenItem, Result | WorkerDied]]:
     """Call a function for every item in parallel.
 
-    Function and items must be picklable, items hashable. A script whose functions or classes are
-    passed in has to guard its code by ``if __name__ == "__main__"``; no other script has to. If a
-    process dies, its item is tried once more alone, and costs only its own result if the process
-    dies again. What the function raises ends the run.
+    Function and items must be picklable, items hashable. A script that defines the passed functions
+    or classes must guard its code by ``if __name__ == "__main__"``; other scripts need not. If a
+    process dies, its item is tried once more alone, and fails only if the process dies again.
+    Exceptions of the function end the run.
 
     Args:
         function: called with an item.
         items: the items.
-        workers: number of processes; None for one on each core, 0 for this process.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
 
     Yields:
@@ -90,8 +90,8 @@ def each(
             return
         except BrokenProcessPool:
             waiting = [item for item in waiting if item not in finished]
-            # Items are begun in order, so the first that are not finished were being worked on. Try
-            # each alone.
+            # Items are started in order, so the first unfinished ones were being processed. Each is
+            # tried alone.
             suspects = waiting[:workers]
             waiting = waiting[workers:]
             for item in suspects:
@@ -113,14 +113,14 @@ def counted(
 
     Args:
         function: called with an item.
-        items: those that are left.
-        total: number of all items, with those done before.
+        items: remaining items.
+        total: number of all items, including those finished before.
         name: returns the name of an item, for messages.
-        workers: number of processes; None for one on each core, 0 for this process.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
 
     Yields:
-        Number of items done so far, and the total.
+        Number of finished items, and the total.
     """
     before = total - len(items)
     yield before, total
@@ -153,23 +153,23 @@ def _in_pool(
 
 
 class _NamedModules(ForkingPickler):
-    """Passes work on as a pool does, and remembers the modules of what it names."""
+    """Pickler that records the modules of pickled functions and classes."""
 
     def __init__(self) -> None:
         super().__init__(io.BytesIO())
         self.modules: set[str] = set()
 
     def reducer_override(self, named: Any) -> Any:
-        """Called for functions, classes and their instances; they are pickled as usual."""
+        """Record functions, classes and their instances, which are then pickled as usual."""
         self.modules.add(getattr(named, "__module__", ""))
         return NotImplemented
 
 
 def _of_script(function: Callable, items: Sequence[Any]) -> bool:
-    """Whether a worker needs the script that runs.
+    """Return True if a worker needs the running script.
 
-    It does if the function, or what it is called with, is defined there: workers import the modules
-    that what is passed to them names.
+    It does if the function, or one of its arguments, is defined there, because workers import the
+    modules of everything passed to them.
     """
     pickler = _NamedModules()
     pickler.dump((function, items))
@@ -179,17 +179,16 @@ def _of_script(function: Callable, items: Sequence[Any]) -> bool:
 class _OwnMain(SpawnProcess):
     """A worker that does not run the caller's script.
 
-    A process of multiprocessing imports it, so a script that calls a function of this package would
-    have to stand below ``if __name__ == "__main__"``: else each worker calls that function again.
+    A multiprocessing worker imports the script. A script that calls a function of this package
+    would therefore need the guard ``if __name__ == "__main__"``, or each worker would call that
+    function again.
     """
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:
         def without_script(name: str) -> dict[str, Any]:
             told = usual(name)
-            if (
-                name != process_obj.name
-            ):  # another thread starts a process of its own meanwhile
+            if name != process_obj.name:  # another thread is starting its own process
                 return told
             return {
                 key: value
@@ -207,13 +206,13 @@ class _OwnMain(SpawnProcess):
 
 
 class _OwnMainContext(SpawnContext):
-    """Starts such workers."""
+    """Context that starts such workers."""
 
     Process = _OwnMain
 
 
 def _begin_worker() -> None:
-    """Prepare a worker: one core, a silent end with Ctrl-C and with its parent."""
+    """Prepare a worker: one core, and a silent exit on Ctrl-C or when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threadpool_limits(1, "blas")
     parent = multiprocessing.parent_process()

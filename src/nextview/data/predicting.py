@@ -1,4 +1,4 @@
-"""Run the models over every view of a store, once; resumable by object."""
+"""Run the models over every view of a store, resumable by object."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -22,9 +22,9 @@ from nextview.recognition.network_input import from_store
 from nextview.things.recogniser import open_recogniser
 from nextview.types import Float32, Index
 
-VIEWS_PER_CALL = 8  # views a call of the networks
+VIEWS_PER_CALL = 8  # batch size of the networks
 Cards = dict[str, ModelCard]  # of map networks, by name
-Files = tuple[tuple[str, Path], ...]  # where these are
+Files = tuple[tuple[str, Path], ...]  # their paths
 
 
 def predict(
@@ -41,7 +41,7 @@ def predict(
 ) -> Iterator[tuple[int, int]]:
     """Predict all views of a store's objects and write the predictions.
 
-    Finished parts are kept beside the output until it is complete, so an interrupted run resumes.
+    Finished parts are kept next to the output until it is complete, so an interrupted run resumes.
 
     Args:
         path: of the view store.
@@ -50,13 +50,13 @@ def predict(
         maps: cards of the map networks by the names of their maps.
         split: name of the split; None for all objects.
         held_out: card, or its name or path, whose held-out objects are predicted; None for all.
-        size: whether to use the size of the objects where store and card know it.
-        workers: number of processes; None for one on each core, 0 for this process.
+        size: whether to use the size of the objects if store and card have it.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         overwrite: whether to replace an existing file.
 
     Yields:
-        Number of objects done so far, and the number of all.
+        Number of finished objects, and the total.
 
     Raises:
         DatasetError: there are no such objects, the recogniser does not know a class, or an object
@@ -122,7 +122,7 @@ def _plan(
     recogniser: ModelCard,
     maps: Cards,
 ) -> Predictions:
-    """What store and cards say of the objects; what the networks say is still to come."""
+    """Return predictions with the metadata of store and cards, and without network outputs."""
     own = [
         card
         for card in (recogniser, *maps.values())
@@ -164,9 +164,9 @@ def _open(
 
 
 def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> None:
-    """Write the outputs for all views of an object, complete or not at all.
+    """Write the outputs for all views of an object, completely or not at all.
 
-    They are zero where nothing is seen.
+    They are zero for views without a visible object.
     """
     i, file = item
     store, recogniser, maps = _open(*files)
@@ -196,14 +196,14 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     if bins:
         found["azimuth_bins"] = np.concatenate(bins)
 
-    # a view in which nothing is seen says nothing
+    # views without a visible object carry no evidence
     nothing = np.array(
         [not enough_shows(depth > 0) for depth in store.read("depth", i)]
     )
     for name in {"azimuth_bins", "logits"} & found.keys():
         found[name][nothing] = 0
 
-    # complete or not at all
+    # written completely or not at all
     aside = file.with_name(f"{i}.part.npz")
     np.savez(aside, **found)
     aside.replace(file)

@@ -1,4 +1,4 @@
-"""What the models say of every view of every object: the table from which policies are replayed."""
+"""Model outputs for every view of every object: the table from which policies are replayed."""
 
 import math
 from collections.abc import Sequence
@@ -23,36 +23,37 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.types import Float, Float32, Index, Mask
 
 PREDICTIONS_FORMAT = 1
-# a file holds at most this many times its size, and so many bytes more
+# limits of the decompressed size: factor of the file size, and additional bytes
 PACKED = 100
 SPARE = 64 * 2**20
-SAME_LOGIT = 1e-5  # difference between logits that are the same, but for rounding
-# of numpy's types; all other arrays are of floats
+SAME_LOGIT = 1e-5  # tolerance of equal logits
+# kinds of numpy types; all other arrays are floats
 ARRAY_KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """What the models say of N objects from the V views of a sphere; C classes, R rings.
+    """Model outputs for N objects from the V views of a sphere; C classes, R rings.
 
     Attributes:
         logits: of the recogniser for each view alone, (N, V, C).
         maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3); those of the
-            whole sphere ("lem-sphere") are (N, V, R, azimuths), once round from the view.
+            whole sphere ("lem-sphere") are (N, V, R, azimuths), once around from the view.
         depth_entropy: the true measure, bits, (N, V).
         names: of the objects, unique.
         labels: true class of each as an index into ``classes``, (N,).
         classes: their names, in the order of the logits.
         splits: "train", "test" or "" for each object, (N,).
-        conflicting: objects that are the very mesh of another one with another label, (N,).
+        conflicting: objects whose identical mesh also has another label, (N,).
         sphere: the V viewpoints.
         models: name and SHA-256 of the "recogniser" and of each map network ("lem").
-        valley_classes: of each map: those for which the valley is the better view.
-        calibration: how far a sum of the recogniser's logits is to be trusted.
+        valley_classes: for each map, the classes for which the valley is the better view.
+        calibration: of summed logits of the recogniser.
         azimuth_bins: see ``Evidence``, (N, V, hypotheses, bins); None if not known.
-        of_size: what the size added to the logits, (N, C); None if not known.
-        store: absolute path of the view store they were made from; empty if it is not known.
-        commands: all that made them, in order, from the meshes on; () if that is not known.
+        of_size: contribution of the size to the logits, (N, C); None if not known.
+        store: absolute path of the view store; empty if not known.
+        commands: all commands that created them, in order, starting from the meshes; () if not
+            known.
     """
 
     logits: Float32
@@ -138,7 +139,7 @@ class Predictions:
         return len(self.names)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays that have a row for each object, without the maps."""
+        """Arrays with a row for each object, without the maps."""
         return {
             f.name: values
             for f in fields(self)
@@ -157,7 +158,7 @@ class Predictions:
     def seen(self) -> Mask:
         """Whether enough of the object is visible in each view, (N, V).
 
-        In all other views the classes are alike.
+        In all other views the logits of all classes are equal.
         """
         seen = np.ptp(self.by_shape().logits, axis=2) > (
             SAME_LOGIT if len(self.classes) > 1 else -1
@@ -170,7 +171,7 @@ class Predictions:
 
     @property
     def weights(self) -> Float:
-        """Of the objects, (N,), sum N: all classes that occur count the same."""
+        """Weights of the objects, (N,), with sum N; all occurring classes have the same weight."""
         count = np.bincount(self.labels, minlength=len(self.classes))
         return len(self) / ((count > 0).sum() * count[self.labels])
 
@@ -194,7 +195,7 @@ class Predictions:
         )
 
     def of_split(self, split: str) -> "Predictions":
-        """The objects of one split."""
+        """Return the objects of one split."""
         kept = self.splits == split
         if not kept.any():
             if not self.splits.any():
@@ -215,7 +216,7 @@ class Predictions:
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
     def of_objects(self, kept: Index) -> "Predictions":
-        """Some of the objects, by their rows, (n,)."""
+        """Return some of the objects, by rows, (n,)."""
         arrays: dict[str, Any] = {
             name: values[kept] for name, values in self._arrays().items()
         }
@@ -250,7 +251,7 @@ class Predictions:
         return replace(parts[0], **arrays, maps=maps, names=tuple(names))
 
     def by_shape(self) -> "Predictions":
-        """What the recogniser says to those who do not know how large the objects are."""
+        """Return the predictions without size evidence."""
         if self.of_size is None:
             return self
         return replace(self, logits=self.logits - self.of_size[:, None], of_size=None)
@@ -263,17 +264,18 @@ class Predictions:
         classes: Sequence[str] | None = None,
         split: str | None = None,
     ) -> "Predictions":
-        """Predictions by a recogniser of your own, of no maps; they name no model.
+        """Create predictions from the logits of your own recogniser, without maps and models.
 
         Args:
             store: view store, or its path.
-            logits: of each view of the rendered objects of the split, in the store's order, (N, V,
-                C). Those of views in which nothing is seen are set to 0: no evidence.
+            logits: of each view of the rendered objects of the split, in the store's order,
+                (N, V, C). Those of views without a visible object are set to 0, which is no
+                evidence.
             classes: their names; those of the store by default.
             split: "train", "test" or "val"; all objects by default.
 
         Raises:
-            DatasetError, PredictionsError: store, classes and logits do not fit together.
+            DatasetError, PredictionsError: store, classes and logits are not consistent.
         """
         store = store if isinstance(store, ViewStore) else ViewStore.open(store)
         objects = some_objects(store, split)
@@ -346,7 +348,7 @@ class Predictions:
         )
 
     def save(self, path: Path, overwrite: bool = False) -> None:
-        """Write the predictions to an .npz file, complete or not at all.
+        """Write the predictions to an .npz file, completely or not at all.
 
         Args:
             path: of the file.
@@ -382,7 +384,7 @@ class Predictions:
 
     @classmethod
     def load(cls, path: str | Path) -> "Predictions":
-        """Read what ``save`` wrote; PredictionsError if it is missing or damaged.
+        """Read a file written by ``save``; PredictionsError if it is missing or damaged.
 
         Nothing is unpickled.
         """
@@ -451,7 +453,7 @@ class Predictions:
 
 
 def _read(path: Path) -> dict[str, NDArray]:
-    """Read the arrays of a file, once the sizes that they announce were checked."""
+    """Read the arrays of a file, after checking their declared sizes."""
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         members = file.zip.infolist()
         if (

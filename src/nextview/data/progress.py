@@ -1,4 +1,4 @@
-"""How a long job tells how far it is, to whoever wants to know: a progress bar, lines or nobody."""
+"""Report the progress of a long job with a progress bar, lines of text, or not at all."""
 
 import sys
 import time
@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Callable, Iterable
 
 TrackProgress = Callable[[Iterable[int], int, str], None]
-"""Follows one part of a job to its end, given counts of what is done, their last one and its name.
+"""Exhausts an iterable of counts of finished items, given their total and the name of the work.
 
 ``cli.progress.track``, a progress bar, is one; ``in_lines`` and ``silently`` are others.
 """
-# seconds to the second line, and between two lines in the end
+# seconds before the second line, and largest interval between lines
 FIRST_WAIT = 5.0
 LONGEST_WAIT = 30.0
 
@@ -19,19 +19,19 @@ def silently(done: Iterable[int], total: int, what: str, /) -> None:
     """Do the work without showing progress.
 
     Args:
-        done: growing counts.
-        total: number that is reached at the end.
+        done: increasing counts of finished items.
+        total: final count.
         what: name of the work.
     """
     deque(done, maxlen=0)
 
 
 def in_lines(done: Iterable[int], total: int, what: str, /) -> None:
-    """Do the work, and print lines to standard error: one at once, and then less and less often.
+    """Do the work, and print lines to standard error at increasing intervals.
 
     Args:
-        done: growing counts.
-        total: number that is reached at the end.
+        done: increasing counts of finished items.
+        total: final count.
         what: name of the work.
     """
     print(f"{what}: begun, {total} in all", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Render a dataset into a view store, on all cores, resumable."""
+"""Render a dataset into a view store, in parallel and resumable."""
 
 import logging
 from collections.abc import Iterator
@@ -50,12 +50,12 @@ from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 from nextview.types import Float
 
 AnySensor = Sensor | SensorMix | None
-# bytes that may be compressed at once, the compressor's own included
+# bytes, largest chunk for the compressor, including its overhead
 LARGEST_CHUNK = 2**31 - 2**20
-ODD_MESHES = 10  # that are named
-# depth that can be stored, object radii
+ODD_MESHES = 10  # largest number of meshes that are named in warnings
+# largest depth that can be stored, object radii
 FARTHEST_STORED = np.iinfo(np.uint16).max * DEPTH_UNIT
-# sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
+# separates the random numbers of sensors from those of deformations: larger than a byte of a name
 SENSING = 256
 
 _log = logging.getLogger("nextview")
@@ -63,7 +63,7 @@ _log = logging.getLogger("nextview")
 
 @dataclass(frozen=True)
 class Deform:
-    """Make a new object of a mesh.
+    """Random deformation of meshes.
 
     Attributes:
         stretch: scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn
@@ -92,7 +92,7 @@ class Deform:
         )
 
     def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
-        """The new object, normalised again."""
+        """Return the deformed mesh, normalised again."""
         factors, angle = self.draw(seed, name)
         return mesh.reshaped(mesh.vertices * factors @ rotation_z(angle).T)
 
@@ -102,7 +102,7 @@ def render_object(
     sphere: ViewSphere,
     size: int,
 ) -> dict[str, np.ndarray]:
-    """Render all views of an object as the store keeps them.
+    """Render all views of an object in the format of a store.
 
     Args:
         camera: in front of the object.
@@ -140,19 +140,20 @@ class RenderOptions:
     """Objects and images.
 
     Attributes:
-        seed: seed of the deformations and of the sensor errors; those of an object depend on it and
-            on the name alone.
+        seed: seed of the deformations and of the sensor errors; those of an object depend only on
+            the seed and its name.
         deform: Random deformations of each mesh.
-        noise_seed: seed of the sensor errors alone: the same objects with other errors.
-        sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md); clean renders
-            by default.
+        noise_seed: separate seed of the sensor errors, to render the same objects with other
+            errors.
+        sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md); by default
+            renders are free of noise.
         unit: unit of length of the mesh files (mm, cm, inch, foot, m), so that sizes are known
             (ModelNet: inch).
         split: render only this split of the dataset.
         held_out: render only objects that this model (name or card) held out of its training.
         meshes: for scenes: folder of their meshes.
-        max_faces: largest number of triangles of a mesh; its file may have 60 bytes for each of
-            these.
+        max_faces: largest number of triangles in a mesh; also limits the file to 60 bytes per
+            triangle.
         largest_part: keep only the largest connected part of each mesh.
     """
 
@@ -178,20 +179,19 @@ def render(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render all meshes, or the targets of all scenes, that a store lacks.
+    """Render the meshes, or the targets of the scenes, that are missing in a store.
 
-    An object that failed before is tried again. A run may be killed at any moment; the next one
-    continues.
+    An object that failed before is tried again. An interrupted run can be continued at any point.
 
     Args:
         dataset: folder of meshes or scenes.
         path: of the view store.
         sphere: the viewpoints.
         size: side of the images, pixels.
-        options: what to render and how.
-        workers: number of processes; None for one on each core, 0 for this process.
+        options: selection and rendering of objects.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
-        overwrite: whether to replace a store of other objects or settings.
+        overwrite: whether to replace a store with other objects or settings.
 
     Yields:
         The name of each object and None, or the reason why it cannot be rendered.
@@ -223,7 +223,7 @@ def render(
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
-        # Largest files first, so that no worker is left with a long one at the end.
+        # Largest files first, to balance the load of the workers.
         todo = sorted(
             np.flatnonzero(~store.done).tolist(),
             key=lambda i: -entries[i].path.stat().st_size,
@@ -248,8 +248,8 @@ def render(
                 if name != entry.name
             }
             if reason is not None:
-                # Only this process writes reasons; the status comes last, as for an object that is
-                # done.
+                # Only this process writes reasons; the status is written last, as for finished
+                # objects.
                 store.note(failures=others | {entry.name: reason})
                 store.write(i, {"status": np.array(FAILED, np.uint8)})
             elif len(others) < len(store.attributes.failures):
@@ -259,7 +259,7 @@ def render(
 
 
 def _warn(odd: list[str]) -> None:
-    """Log what is odd about meshes, a sentence for each of them; of many, the first."""
+    """Log a sentence about each unusual mesh; only the first ones of many."""
     for sentence in sorted(odd)[:ODD_MESHES]:
         _log.warning("%s", sentence)
     if len(odd) > ODD_MESHES:
@@ -275,7 +275,7 @@ def _check(
     size: int,
     options: RenderOptions,
 ) -> AnySensor:
-    """Refuse settings that make no views; the sensor, if there is one."""
+    """Check the settings; returns the sensor, if there is one."""
     whole(
         size,
         f"the size of {len(sphere)} views in pixels",
@@ -315,17 +315,17 @@ def _check(
 
 
 def listing(dataset: Path, options: RenderOptions) -> Listing:
-    """List the meshes or scenes to render and what was left out.
+    """List the meshes or scenes to render and the files left out.
 
     Args:
         dataset: the folder.
-        options: which of them are wanted.
+        options: selection of objects.
 
     Returns:
-        The objects and what was left out.
+        The objects and the files left out.
 
     Raises:
-        DatasetError: nothing is left to render.
+        DatasetError: there is nothing to render.
     """
     try:
         found = scan_dataset(dataset, FORMATS if options.meshes is None else (SUFFIX,))
@@ -350,15 +350,15 @@ def rotations(store: ViewStore) -> Float:
 
 
 def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
-    """Return a mesh as it was deformed for a store.
+    """Return a mesh with the deformation that it has in a store.
 
     Args:
         store: the view store.
         mesh: the mesh of the object.
-        name: of the object, from which its deformation is drawn.
+        name: of the object, which determines its deformation.
 
     Returns:
-        The deformed mesh; the mesh itself if the store deforms none.
+        The deformed mesh; the mesh itself if the store has no deformations.
     """
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return mesh if deform == Deform() else deform(mesh, store.attributes.seed, name)
@@ -367,7 +367,7 @@ def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
 def _hash(path: Path) -> str:
     with suppress(OSError):
         return sha256_of(path)
-    return f"unreadable {path.name}"  # its rendering will say why
+    return f"unreadable {path.name}"  # rendering it will report the reason
 
 
 def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
@@ -378,7 +378,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
         raise DatasetError(f"{path}: exists and is not a view store; give another name")
     store = ViewStore.open(path)
     there = store.attributes
-    # what decides no view
+    # attributes that do not affect the views
     noted = ["unit"] if wanted.sensor is None or wanted.scene is not None else []
     for key in wanted.__struct_fields__:
         if key in (*noted, "dataset", "failures", "commands") or (
@@ -399,10 +399,8 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
             f"{path}: its meshes are measured in {there.unit}, not {wanted.unit}"
         )
     for name in store.rendered:
-        store.array(name)  # says what is missing
-    for leftover in path.rglob(
-        "*.partial"
-    ):  # what was being written when a run was killed
+        store.array(name)  # raises an error if it is missing
+    for leftover in path.rglob("*.partial"):  # incomplete files of an interrupted run
         leftover.unlink()
     return store
 
@@ -416,7 +414,7 @@ def _render_entry(
     """Render one object, or the target of one scene, into the store.
 
     Returns:
-        The reason if its mesh cannot be used; and what is odd about it, a sentence each.
+        The reason if its mesh cannot be used; and sentences about unusual properties.
     """
     i, entry = item
     store = opened(path)
@@ -426,7 +424,7 @@ def _render_entry(
         return str(error), ()
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory", ()
-    # last: an object counts only when it is whole
+    # the status is written last, when the object is complete
     store.write(i, rendered | {"status": np.array(DONE, np.uint8)})
     return None, doubts
 
@@ -437,7 +435,7 @@ def _rendered(
     sensor: AnySensor,
     entry: Entry,
 ) -> tuple[dict[str, NDArray], tuple[str, ...]]:
-    """What the store keeps of an object, and what is odd about its mesh."""
+    """Return the stored arrays of an object, and unusual properties of its mesh."""
     sphere = store.sphere
     size = store.attributes.size
     seed = options.seed if options.noise_seed is None else options.noise_seed
@@ -457,7 +455,7 @@ def _rendered(
             if sensor is None
             else SensedCamera(mesh, sensor, rng)
         )
-        # A store keeps lengths of the files: their unit may be told later.
+        # A store keeps the lengths of the files, whose unit may be specified later.
         metres = 1.0 if options.unit is None else UNITS[options.unit]
         radius = np.array(mesh.radius / metres)
         return render_object(camera, sphere, size) | {"radius": radius}, doubts

@@ -1,9 +1,9 @@
-"""Draw a folder of rooms around the objects of a dataset, on all cores, resumable.
+"""Generate a folder of random rooms around the objects of a dataset, in parallel and resumable.
 
-A room is as a mobile robot sees it: floor, walls, ceiling and furniture, all at the size that it
-has in life, and a camera that is level. Furniture stands on the floor, half of it against a wall.
-Monitors, and what is small enough for a hand, stand on a table. What has a known unit of length
-lies there in any pose that it can rest in; furniture stands upright.
+A room is as seen by a mobile robot: floor, walls, ceiling and furniture, all life-size, and a level
+camera. Furniture stands on the floor, half of it against a wall. Monitors and hand-sized objects
+are on a table. Objects with a known unit of length lie there in any resting pose; furniture stands
+upright.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,32 +32,31 @@ from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.scene_layout import SUFFIX
 from nextview.types import Float
 
-# in the names of rooms, where other scenes have their level of clutter
+# in the names of rooms, in place of the clutter level of other scenes
 ROOM_NAME = "room"
 ROOM_LAYOUTS_TRIED = 60
-VIEWS_TRIED = 60  # first views of one layout
+VIEWS_TRIED = 60  # attempts to find a first view of a layout
 
 ROOM_SIDE = (3.5, 6.5)  # metres
 ROOM_HEIGHT = (2.4, 2.8)
-AT_WALL = (0.0, 0.06)  # metres between a thing that stands against a wall and the wall
-FURNITURE_GAP = 0.3  # metres between the target and other furniture, at least
-FURNITURE = (1, 3)  # things beside the target, at least and at most
-PLACES_TRIED = 20  # for each
-
-HAND_SIZED = 0.3  # metres: what has a smaller radius lies on a table
+AT_WALL = (0.0, 0.06)  # metres between a wall and furniture against it
+FURNITURE_GAP = 0.3  # metres, least distance between the target and other furniture
+FURNITURE = (1, 3)  # least and largest number of other pieces of furniture
+PLACES_TRIED = 20  # attempts for each
+HAND_SIZED = 0.3  # metres; objects with a smaller radius are on a table
 TABLE_HEIGHTS = (0.70, 0.78)
 TABLE_WIDTH = (1.2, 1.6)
 TABLE_DEPTH = (0.7, 0.9)
 TABLE_TOP_THICKNESS = 0.04  # thickness
 TABLE_LEG = 0.05
-TABLE_EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
-LEAST_SPACING = 0.08  # metres between two things on a table, at least
+TABLE_EDGE = 0.08  # metres, least distance of objects from the edge of the table
+LEAST_SPACING = 0.08  # metres, least distance between objects on a table
 MOST_BESIDE = 2
 # width, depth and height of boxes on a table
 BOOK = ((0.05, 0.25), (0.05, 0.2), (0.03, 0.15))
 CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
 
-# of the first view: metres from the target, metres over the floor, and over a table
+# first view: distance from the target, height above the floor, and above a table, metres
 FLOOR_DISTANCE = (1.5, 3.5)
 FLOOR_HEIGHT = (0.6, 1.6)
 ABOVE_TABLE = 0.1
@@ -65,29 +64,28 @@ CLOSEST_CAMERA = 0.8  # metres from the target's sphere
 TABLE_DISTANCE = (0.4, 0.7)
 CLOSEST_TO_SMALL = 0.25
 TABLE_ELEVATION = (20.0, 60.0)  # degrees
-# standard deviation of where the camera is aimed, as a part of its distance
+# standard deviation of the aiming point, relative to the distance
 AIM_OFF = 0.02
-# share of the target's picture that nothing else hides in the first view, at least
+# least visible share of the target in the first view
 LEAST_SHOWN = 0.7
-PREVIEW_SIDE = 96  # pixels across, in which that is measured
-FIELD = 0.9  # of that picture: its half width at unit distance
-
-# the first pose of a layout that has none yet
+PREVIEW_SIDE = 96  # pixels, side of the image that measures it
+FIELD = 0.9  # half width of that image at unit distance
+# placeholder for the first pose of a layout
 NO_POSE = tuple(np.eye(4).ravel().tolist())
 
-# the target, the other things, and the boxes beside them
+# the target, the other objects, and the boxes
 Furnished = tuple[Standing, list[Standing], list[Slab]]
 
 
 @dataclass(frozen=True)
 class LifeSize:
-    """How large the objects of a class are in life.
+    """Usual size of the objects of a class.
 
     Attributes:
         measure: "height", or "length" for the longer side on the floor.
         low: metres.
         high: metres.
-        back: direction from an object's middle to its back, degrees from +x, in ModelNet's axes.
+        back: direction from an object's centre to its back, degrees from +x, in ModelNet's axes.
     """
 
     measure: str
@@ -110,16 +108,16 @@ LIFE_SIZES = {
     "toilet": LifeSize("height", 0.68, 0.82, 90),
 }
 ON_TABLES = ("monitor",)
-MOST_LENGTH = 2.6  # metres on the floor: a wide table is lower than usual instead
+MOST_LENGTH = 2.6  # metres, largest length on the floor; wider tables are scaled down
 
 
 @dataclass(frozen=True)
 class RoomTask:
-    """One room to draw.
+    """One room to generate.
 
     Attributes:
         target: mesh file of the target, below the dataset.
-        split: of the target, and of all that stands around it.
+        split: of the target and of all other objects.
         label: class of the target.
         name: of the room.
         path: its file.
@@ -134,13 +132,14 @@ class RoomTask:
 
 @dataclass(frozen=True)
 class RoomMeshes:
-    """What rooms are drawn of.
+    """Meshes for rooms.
 
     Attributes:
         folder: of the meshes.
-        unit: of length of all of them; None: furniture of known classes, and files that say it.
-        furniture: file below the folder and class of what may stand beside a target, by split.
-        small: files of what may lie beside a target on a table, by split.
+        unit: of length of all of them; None for furniture of known classes, and files that define
+            it.
+        furniture: file below the folder and class of possible furniture, by split.
+        small: files of possible objects on a table, by split.
     """
 
     folder: Path
@@ -151,12 +150,12 @@ class RoomMeshes:
 
 @dataclass(frozen=True)
 class LifeSizeMesh:
-    """A mesh as large as in life.
+    """A life-size mesh.
 
     Attributes:
         file: below the folder of the meshes.
         sha256: of the file.
-        mesh: what it holds.
+        mesh: contents of the file.
         radius: object radius, metres.
     """
 
@@ -173,7 +172,7 @@ class LifeSizeMesh:
         mesh: Mesh,
         radius: float,
     ) -> "LifeSizeMesh":
-        """A mesh of a file below a folder, and its object radius, metres."""
+        """Create a life-size mesh from a file below a folder, and its object radius, metres."""
         return cls(file, mesh_hash(folder / file), mesh, _short(radius))
 
 
@@ -187,24 +186,23 @@ def draw_rooms(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Draw the rooms that are not in the folder yet. Which they are depends on the seed alone.
+    """Generate the rooms that are missing in the folder. They depend only on the seed.
 
-    Classes take turns, and so do the objects of each, in an order that the seed draws. Files are
-    CLASS/SPLIT/NAME@room-NUMBER.json, or CLASS/NAME@room-NUMBER.json where the dataset has no
-    splits.
+    Classes alternate, and so do the objects of each class, in a random order. Files are
+    CLASS/SPLIT/NAME@room-NUMBER.json, or CLASS/NAME@room-NUMBER.json if the dataset has no splits.
 
     Args:
         dataset: folder of meshes.
         out: folder of the rooms.
-        rooms: how many of each split; by default one around each object.
-        seed: decides everything.
-        split: only this one.
+        rooms: number of rooms per split; by default one around each object.
+        seed: of all random numbers.
+        split: name of the split; None for all.
         unit: of length of the mesh files.
         workers: see ``pool.each``.
         scheduler: see ``pool.each``.
 
     Yields:
-        The name of each room that is there, and None, or the reason why it cannot be drawn.
+        The name of each existing room, and None, or the reason why it cannot be generated.
     """
     dataset = Path(dataset)
     out = Path(out)
@@ -241,14 +239,14 @@ def room_tasks(
     seed: int,
     split: str | None,
 ) -> list[RoomTask]:
-    """Return a task for each room to draw, see ``draw_rooms``.
+    """Return a task for each room, see ``draw_rooms``.
 
     Args:
         dataset: folder of meshes.
         out: folder of the rooms.
         rooms: number of rooms; None for one around each object.
-        seed: of all draws.
-        split: split whose objects are shown; None for all.
+        seed: of all random numbers.
+        split: name of the split; None for all.
     """
     if rooms is not None:
         whole(rooms, "the number of rooms", 1, MOST_SCENES)
@@ -267,7 +265,7 @@ def room_tasks(
 
 
 def _in_turns(entries: list[Entry], seed: int) -> list[Entry]:
-    """Entries of one split in an order in which classes take turns."""
+    """Order the entries of one split so that classes alternate."""
     rng = np.random.default_rng([seed, *entries[0].split.encode()])
     shuffled = [entries[i] for i in rng.permutation(len(entries))]
     labels = list(dict.fromkeys(entry.label for entry in shuffled))
@@ -280,7 +278,7 @@ def _in_turns(entries: list[Entry], seed: int) -> list[Entry]:
 
 
 def _source(dataset: Path, unit: str | None) -> RoomMeshes:
-    """What of a dataset may stand around a target."""
+    """Return the meshes of a dataset that may surround a target."""
     furniture: dict[str, list[tuple[str, str]]] = {}
     small: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
@@ -298,7 +296,7 @@ def _source(dataset: Path, unit: str | None) -> RoomMeshes:
 
 
 def _draw(source: RoomMeshes, seed: int, task: RoomTask) -> str | None:
-    """Draw one room into its file; the reason if that cannot be."""
+    """Generate one room and write its file; returns the reason if that is not possible."""
     try:
         draw_room(source, task, seed).save(task.path)
     except (MeshError, DatasetError) as error:
@@ -307,16 +305,16 @@ def _draw(source: RoomMeshes, seed: int, task: RoomTask) -> str | None:
 
 
 def draw_room(source: RoomMeshes, task: RoomTask, seed: int) -> RoomLayout:
-    """A room around a target; seed and name decide all that is random.
+    """Generate a room around a target; all random numbers depend on seed and name.
 
     Args:
-        source: what stands in it.
-        task: which room.
-        seed: of the draws.
+        source: available meshes.
+        task: the room.
+        seed: of the random numbers.
 
     Raises:
         MeshError: the target cannot be used.
-        DatasetError: its size is not known, or it shows in no layout that was tried.
+        DatasetError: its size is not known, or it is not visible in any tried layout.
     """
     rng = np.random.default_rng([seed, *task.name.encode()])
     mesh = load_mesh(source.folder / task.target, unit=source.unit)
@@ -339,12 +337,12 @@ def draw_room(source: RoomMeshes, task: RoomTask, seed: int) -> RoomLayout:
 
 
 def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
-    """The object radius that a mesh has in life, metres: by its unit, or drawn by its class.
+    """Return the real object radius of a mesh, metres: from its unit, or drawn for its class.
 
     Args:
         mesh: of the object.
         label: its class.
-        rng: draws the size.
+        rng: for the size.
     """
     if mesh.metres is not None:
         return mesh.metres
@@ -368,7 +366,7 @@ def _layout(
     seed: int,
     rng: np.random.Generator,
 ) -> RoomLayout | None:
-    """A room without a first view, its target on the floor or a table; None where nothing fits."""
+    """Return a room without a first view; None if the target does not fit."""
     width, depth, height = rng.uniform(
         *np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT])
     )
@@ -403,7 +401,7 @@ def _on_floor(
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> Furnished | None:
-    """A target on the floor, half of them with the back to a wall; None where nothing fits."""
+    """Place a target on the floor, half of them with the back to a wall; None if it cannot."""
     back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
     against = bool(rng.integers(2))
     target = _standing(thing, room, back, against, rng)
@@ -422,14 +420,14 @@ def _on_table(
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> Furnished | None:
-    """A target on a table; None where it does not fit."""
+    """Place a target on a table; None if it does not fit."""
     slabs = _table(room, rng)
     top = slabs[0]
     upright = task.label in ON_TABLES
     poses = np.eye(3)[None] if upright else resting_poses(thing.mesh)
     rest = poses[rng.integers(len(poses))]
     azimuth = rng.uniform(0, 2 * np.pi)
-    if upright:  # its back to the wall, as the table's
+    if upright:  # facing away from the wall behind the table
         azimuth = top.azimuth + np.pi / 2 - np.radians(LIFE_SIZES[task.label].back)
     taken: list[Float] = []
     target = _lying(thing, azimuth, rest, top, taken, rng)
@@ -457,7 +455,7 @@ def _standing(
 ) -> Standing | None:
     """Place a mesh on the floor of a room, ``against`` a wall or anywhere.
 
-    ``back`` is the direction from its middle to its back, radians. None where it is too large.
+    ``back`` is the direction from its centre to its back, radians. Returns None if it is too large.
     """
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * wall - back if against else rng.uniform(0, 2 * np.pi)
@@ -482,7 +480,7 @@ def _furniture(
     taken: list[Float],
     rng: np.random.Generator,
 ) -> tuple[list[Standing], list[Slab]]:
-    """Furniture against the walls, away from footprints that are taken; these are added."""
+    """Place furniture against the walls, outside the footprints ``taken``, which are extended."""
     objects: list[Standing] = []
     slabs: list[Slab] = []
 
@@ -512,9 +510,9 @@ def _piece(
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Standing | Slab | None, Float]:
-    """A cabinet or another piece of furniture against a wall, and its corners, (K, 3).
+    """Return a cabinet or another piece of furniture against a wall, and its corners, (K, 3).
 
-    None for a mesh that cannot be used or is too large.
+    Returns None for a mesh that cannot be used or is too large.
     """
     cabinet = _cabinet(room, rng)
     others = source.furniture.get(split, ())
@@ -536,7 +534,7 @@ def _piece(
 
 @lru_cache(maxsize=64)
 def _other(path: Path, unit: str | None = None) -> Mesh | None:
-    """A mesh that stands beside a target; None for one that is too large or damaged."""
+    """Load a mesh that stands near a target; None if it is too large or damaged."""
     try:
         return load_mesh(path, unit=unit, max_faces=MOST_FACES)
     except MeshError:
@@ -544,7 +542,7 @@ def _other(path: Path, unit: str | None = None) -> Mesh | None:
 
 
 def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
-    """A box against a wall."""
+    """Return a box against a wall."""
     width, depth, height = rng.uniform(*np.transpose(CABINET))
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * (wall - 1)
@@ -557,7 +555,7 @@ def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
 
 
 def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
-    """A table top with four legs, against a wall or in the room; the top comes first."""
+    """Return a table top with four legs, against a wall or in the room; the top comes first."""
     width, depth = rng.uniform(*np.transpose([TABLE_WIDTH, TABLE_DEPTH]))
     height = rng.uniform(*TABLE_HEIGHTS)
     wall = int(rng.integers(4))
@@ -590,9 +588,9 @@ def _lying(
     taken: list[Float],
     rng: np.random.Generator,
 ) -> Standing | None:
-    """Place a mesh on a table in a resting pose, a rotation (3, 3); None where it does not fit.
+    """Place a mesh on a table in a resting pose, a rotation (3, 3); None if it does not fit.
 
-    Its footprint is added to those of the other things.
+    Its footprint is added to ``taken``.
     """
     rotation = (
         IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
@@ -625,7 +623,7 @@ def _beside(
     taken: list[Float],
     rng: np.random.Generator,
 ) -> Standing | Slab | None:
-    """Another thing on a table, or a box; None where it does not fit."""
+    """Return another object on a table, or a box; None if it does not fit."""
     others = [file for file in source.small.get(task.split, ()) if file != task.target]
     if others and rng.integers(2):
         file = others[int(rng.integers(len(others)))]
@@ -646,14 +644,14 @@ def _beside(
 
 
 def _on_top(top: Slab, rng: np.random.Generator) -> Float:
-    """A place on a table, (2,)."""
+    """Draw a position on a table, (2,)."""
     free = np.array([top.width, top.depth]) / 2 - TABLE_EDGE
     aside = np.append(rng.uniform(-free, free), 0)
     return np.array([top.x, top.y]) + (rotation_z(top.azimuth) @ aside)[:2]
 
 
 def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
-    """Whether an outline, (K, 2), lies on a table, away from its edge and from what is taken."""
+    """Return True if an outline, (K, 2), is on a table, clear of its edge and of others."""
     own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
     inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - TABLE_EDGE / 2).all()
     return bool(inside) and all(
@@ -667,14 +665,14 @@ def _slab(
     size: Sequence[float],
     even: bool = True,
 ) -> Slab:
-    """A box whose bottom is at a place, (3,), of a width, a depth and a height."""
+    """Return a box with its bottom at a position, (3,), and with a width, a depth and a height."""
     x, y, z = map(_short, place)
     width, depth, height = map(_short, size)
     return Slab(x, y, z, _short(azimuth), width, depth, height, even)
 
 
 def _slab_corners(slab: Slab) -> Float:
-    """The corners of a box, (8, 3)."""
+    """Return the corners of a box, (8, 3)."""
     half = np.array([slab.width, slab.depth]) / 2
     corners = np.array(
         [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)],
@@ -685,7 +683,7 @@ def _slab_corners(slab: Slab) -> Float:
 
 
 def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
-    """A level pose, (4, 4), from which the target shows; None where none was found."""
+    """Find a level pose, (4, 4), from which the target is visible; None if none was found."""
     centre = room.centre
     for _ in range(VIEWS_TRIED):
         azimuth = rng.uniform(0, 2 * np.pi)
@@ -712,7 +710,7 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
 
 
 def _shown(room: Room, pose: Float) -> float:
-    """Share of the target's picture from a pose that lies in it and that nothing hides."""
+    """Return the share of the target that is inside the image of a pose and not occluded."""
     focal = PREVIEW_SIDE / 2 / FIELD
     camera = PinholeCamera.centred(focal, (PREVIEW_SIDE, PREVIEW_SIDE))
     rays = camera.rays.reshape(-1, 3) @ pose[:3, :3].T
@@ -723,5 +721,5 @@ def _shown(room: Room, pose: Float) -> float:
 
 
 def _short(value: float) -> float:
-    """Few digits are enough, and JSON holds them exactly."""
+    """Round a value to a few digits, which JSON represents exactly."""
     return round(float(value), 5)

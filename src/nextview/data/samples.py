@@ -1,4 +1,4 @@
-"""Sample objects of our own, made of boxes: something to look at before any dataset is there."""
+"""Sample objects made of boxes, for use without any dataset."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import numpy as np
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 
-# two opposite corners, centimetres, z up
+# opposite corners, centimetres, z up
 BoxCorners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -42,7 +42,7 @@ def table() -> list[BoxCorners]:
 
 
 def monitor() -> list[BoxCorners]:
-    """A flat screen on a foot; it faces +x."""
+    """A flat screen on a stand; it faces +x."""
     return [
         ((-2, -30, 12), (2, 30, 48)),
         ((-4, -4, 1), (-1, 4, 30)),
@@ -58,7 +58,7 @@ SAMPLE_MESHES: dict[str, Callable[[], list[BoxCorners]]] = {
 
 
 def sample_mesh(name: str) -> Mesh:
-    """A sample object by name."""
+    """Return a sample object by name."""
     if name not in SAMPLE_MESHES:
         raise UsageError(
             f"no sample is called {name!r}; there are {', '.join(SAMPLE_MESHES)}"

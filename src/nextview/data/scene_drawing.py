@@ -1,7 +1,8 @@
-"""Draw a folder of scenes around the objects of a dataset, on all cores, resumable.
+"""Generate a folder of random scenes around the objects of a dataset, in parallel and resumable.
 
-Things are set beside a target, where nothing stands yet, until so much of it shows as it should. No
-physics: they stand upright on the table. Their footprints, which are convex hulls, never overlap.
+Objects are placed at free positions around a target until the visible share of the target is as
+required. There is no physics simulation: they stand upright on the table. Their footprints, which
+are convex hulls, never overlap.
 """
 
 from collections.abc import Iterator, Sequence
@@ -45,53 +46,53 @@ from nextview.simulation.simulated import SimulatedCamera, visible_shares
 from nextview.types import Mask
 
 SCENE_VIEWS = ViewSphere.named("40")
-# pixels of the pictures that tell how much of the target shows: in the end, and while drawing
+# side of the images that measure the visible share, pixels: final, and while searching
 SHARE_PIXELS = 112
 COARSE_PICTURE = 48
-# how far a scene's wanted share lies from its level's at most, and how well it is met
+# largest difference of a scene's required share from that of its level, and tolerance
 SPREAD = 0.04
 VISIBLE_TOLERANCE = 0.02
-# things around a target
+# numbers of objects around a target
 FEWEST_AROUND = 3
 MOST_AROUND = 20
-# things that are tried for one layout, and layouts for one scene
+# attempts to place an object per layout, and layouts per scene
 THINGS_TRIED = 200
 SCENE_LAYOUTS_TRIED = 20
-THING_GAP = 0.04  # between things, at least, object radii
-# from the target's middle, object radii
+THING_GAP = 0.04  # least distance between objects, object radii
+# distance from the target's centre, object radii
 CLUTTER_DISTANCES = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 OBJECT_RADIUS = (0.5, 1.1)
-# of things that are no boxes or walls, if there are any meshes for them
+# least number of meshes among the objects, if there are any
 FEWEST_OBJECTS = 2
-# share of objects among objects and boxes
+# share of meshes among meshes and boxes
 OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}
-# what is low hides nothing from above
+# boxes must be high to occlude views from above
 BOX_HEIGHT = {"light": BLOCK_HEIGHT, "medium": BLOCK_HEIGHT, "heavy": (1.4, 2.9)}
-# what a thing hides at least: the table is soon full
+# least share occluded by one object, because space on the table is limited
 LEAST_HIDDEN = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
-# chances of 0, 1 and 2
+# probabilities of 0, 1 and 2 walls
 WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}
 WALL_AWAY = (1.2, 1.9)
 WALL_WIDTH = (2.0, 3.5)
 WALL_DEPTH = 0.1
 WALL_HEIGHT = (1.0, 2.6)
-# meshes that are tried in one scene, at several places each: reading them takes longest
+# meshes tried per scene, each at several positions, because loading them is slow
 MESHES_TRIED = 8
-# triangles of an object around the target: larger ones are passed over, for the sake of time
+# largest number of triangles of an object around the target, to limit the run time
 MOST_FACES = 100_000
-MOST_SCENES = 100_000  # at each level, of each split
+MOST_SCENES = 100_000  # per level and split
 
 
 @dataclass(frozen=True)
 class SceneTask:
-    """A scene to draw.
+    """A scene to generate.
 
     Attributes:
         target: mesh file of the target, relative to the dataset folder.
         split: split of the target.
-        level: level of clutter.
+        level: clutter level.
         name: name of the scene.
-        path: file that is written.
+        path: file to write.
     """
 
     target: str
@@ -125,27 +126,26 @@ def draw_scenes(
     scheduler: str | None = None,
     held_out: str | Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Draw scenes around the objects of a dataset folder and write their files.
+    """Generate scenes around the objects of a dataset folder and write their files.
 
-    Scenes that are already in the folder are kept; which scenes there are depends on the seed
-    alone. The objects of each split are taken in an order that the seed draws, the same at all
-    levels, each once before any is taken again. The things around an object are of its own split.
-    Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or CLASS/NAME@LEVEL-NUMBER.json where the dataset
-    has no splits.
+    Existing scenes are kept; scenes depend only on the seed. The objects of each split are used in
+    a random order, the same at all levels, each once before any is repeated. The objects around a
+    target are from the same split. Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or
+    CLASS/NAME@LEVEL-NUMBER.json if the dataset has no splits.
 
     Args:
         dataset: folder of meshes.
         out: folder of the scenes.
-        levels: names of the levels of clutter.
-        scenes: number of scenes at each level; None for one around each object.
-        seed: of all that is random.
+        levels: names of the clutter levels.
+        scenes: number of scenes per level; None for one around each object.
+        seed: of all random numbers.
         split: name of the split; None for all.
-        workers: number of processes; None for one on each core, 0 for this process.
+        workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         held_out: name or path of a card, whose held-out objects are the targets; None for all.
 
     Yields:
-        The name of each scene and None, or the reason why it cannot be drawn.
+        The name of each scene and None, or the reason why it cannot be generated.
     """
     dataset = Path(dataset)
     out = Path(out)
@@ -195,19 +195,19 @@ def tasks(
     split: str | None,
     held_out: str | Path | None = None,
 ) -> list[SceneTask]:
-    """List all scenes that are to be drawn, see ``draw_scenes``.
+    """List all scenes to generate, see ``draw_scenes``.
 
     Args:
         dataset: folder of meshes.
         out: folder of the scenes.
-        levels: names of the levels of clutter.
-        scenes: number of scenes at each level; None for one around each object.
-        seed: of all that is random.
+        levels: names of the clutter levels.
+        scenes: number of scenes per level; None for one around each object.
+        seed: of all random numbers.
         split: name of the split; None for all.
         held_out: name or path of a card, whose held-out objects are the targets; None for all.
 
     Returns:
-        The scenes to draw.
+        The scenes to generate.
 
     Raises:
         UsageError: a level, the number of scenes or the seed is not valid.
@@ -247,7 +247,7 @@ def tasks(
 
 
 def _draw(meshes: dict[str, Meshes], seed: int, task: SceneTask) -> str | None:
-    """Draw one scene into its file; the reason if that cannot be."""
+    """Generate one scene and write its file; returns the reason if that is not possible."""
     try:
         draw_scene(task.target, meshes[task.split], task.level, seed, task.name).save(
             task.path
@@ -264,13 +264,13 @@ def draw_scene(
     seed: int,
     name: str,
 ) -> SceneLayout:
-    """Draw a scene around a target.
+    """Generate a scene around a target.
 
     Args:
         target: mesh file of the target, in the folder of the meshes.
         meshes: the folder and its files.
         level: of clutter.
-        seed: of all that is random, together with the name.
+        seed: of all random numbers, together with the name.
         name: of the scene.
 
     Returns:
@@ -278,7 +278,7 @@ def draw_scene(
 
     Raises:
         MeshError: the target cannot be used.
-        DatasetError: no layout shows as much of the target as the level wants.
+        DatasetError: no layout has the visible share of the level.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
@@ -319,7 +319,7 @@ def draw_scene(
 
 
 class _Hiding:
-    """Rays from 40 cameras to the points of a target's surface that they see."""
+    """Rays from 40 cameras to the visible points of a target's surface."""
 
     def __init__(self, mesh: Mesh) -> None:
         camera = SimulatedCamera(mesh, COARSE_PICTURE, SCENE_VIEWS.distance)
@@ -363,7 +363,7 @@ class _Hiding:
         return hidden
 
     def share(self, still: Mask) -> float:
-        """Share of the target that shows, on the average over the views."""
+        """Return the visible share of the target, averaged over the views."""
         return float(
             (
                 np.bincount(self.views[still], minlength=len(SCENE_VIEWS)) / self.whole
@@ -383,7 +383,7 @@ def _layout(
     goal: float,
     rng: np.random.Generator,
 ) -> list[PlacedItem] | None:
-    """Place things that hide a given share of a target; None if that does not work."""
+    """Place objects that occlude a given share of a target; None if that fails."""
     walls = int(rng.choice(3, p=WALLS[level]))
     middle = footprint(mesh.vertices)
     floor = float(mesh.vertices[:, 2].min())
@@ -411,7 +411,7 @@ def _layout(
         if item is None or np.abs(item.footprint).max() > SCENE_TABLE:
             continue
 
-        # it overlaps with what is there
+        # skip it if it overlaps with others
         if (
             min(
                 separation(item.footprint, other)
@@ -439,7 +439,7 @@ def _thing(
     short: bool,
     rng: np.random.Generator,
 ) -> Placement | Block:
-    """An object or a box, anywhere around; an object where there are too few."""
+    """Draw a mesh or a box at a random position; a mesh if there are too few."""
     away = rng.uniform(*CLUTTER_DISTANCES[level])
     towards = rng.uniform(0, 2 * np.pi)
     azimuth = rng.uniform(0, 2 * np.pi)
@@ -462,7 +462,7 @@ def _thing(
 
 
 def _wall(rng: np.random.Generator) -> Block:
-    """A wall, across the way from the target."""
+    """Draw a wall perpendicular to the direction from the target."""
     away = rng.uniform(*WALL_AWAY)
     towards = rng.uniform(0, 2 * np.pi)
     lean = rng.uniform(-0.3, 0.3)
@@ -480,7 +480,7 @@ def _wall(rng: np.random.Generator) -> Block:
 
 
 def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
-    """On the table; None for a mesh that is too large, or damaged."""
+    """Place an object on the table; None for a mesh that is too large or damaged."""
     try:
         if isinstance(thing, Block):
             return block_item(thing, floor)
@@ -490,5 +490,5 @@ def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
 
 
 def _rounded(*values: float) -> list[float]:
-    """Few digits are enough, and JSON holds them exactly."""
+    """Round values to a few digits, which JSON represents exactly."""
     return [round(float(value), 4) for value in values]

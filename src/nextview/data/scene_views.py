@@ -1,4 +1,4 @@
-"""What a store keeps of scenes, and what a robot in them would expect to see from each view."""
+"""Scenes in a view store, with the expected visibility and reachability of each view."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -27,10 +27,10 @@ from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import SHOWS_TARGET, SceneCamera, visible_shares
 from nextview.types import Float, Float32, Index, Mask
 
-SCENE_SIDE = 80  # of the pictures of the whole scene, pixels
-HALF = 2.0  # they show so many object radii to each side of the target's centre
-SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many object radii: up to 13.1
-# side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
+SCENE_SIDE = 80  # side of the images of the whole scene, pixels
+HALF = 2.0  # half their width at the target's centre, object radii
+SCENE_UNIT = 2e-4  # unit of their uint16 depth, object radii; the range is 13.1
+# side of the image that measures the visible share, pixels, as in the generation of scenes
 SHARE_SIZE = 112
 
 
@@ -49,7 +49,7 @@ def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> Float:
 
 
 def render_scene(scene: TargetScene, sphere: ViewSphere) -> dict[str, NDArray]:
-    """Render what is kept of a scene besides the views of its target.
+    """Render the stored arrays of a scene, except for the views of its target.
 
     The images contain no sensor errors.
 
@@ -85,15 +85,15 @@ def render_scene(scene: TargetScene, sphere: ViewSphere) -> dict[str, NDArray]:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """One scene of a store, as it is from all V views.
+    """One scene of a store from all V views.
 
     Attributes:
         depth: (V, S, S), object radii, 0 = nothing.
         owner: of each pixel: SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER or SHOWS_TABLE, (V, S, S).
         intrinsics: of the camera, pixels, (3, 3).
         poses: camera-to-world, (V, 4, 4).
-        reachable: whether a camera can stand at each view, (V,).
-        visible_share: of the target, the truth, (V,).
+        reachable: whether a camera can be at each view, (V,).
+        visible_share: true visible share of the target, (V,).
         clearance: (V,), object radii.
     """
 
@@ -106,7 +106,7 @@ class SceneViews:
     clearance: Float32
 
     def scene_view(self, view: int) -> SceneView:
-        """What a camera sees from there: things and table alike are no target."""
+        """Return one view, in which other objects and the table are not distinguished."""
         return SceneView(
             self.depth[view],
             self.owner[view] == SHOWS_TARGET,
@@ -127,7 +127,7 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
         The views of the scene.
 
     Raises:
-        DatasetError: the store holds single objects.
+        DatasetError: the store contains single objects.
     """
     if store.attributes.scene is None:
         raise DatasetError(
@@ -145,7 +145,7 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
 
 
 def sight_of(scenes: "SceneSight | None", objects: Index) -> tuple[Constrain, Visible]:
-    """Return what ``run_episodes`` needs of scenes.
+    """Return the arguments of ``run_episodes`` for scenes.
 
     Args:
         scenes: the scenes; None for single objects.
@@ -191,7 +191,7 @@ class SceneSight:
     Attributes:
         store: view store of the scenes.
         rows: row of each scene in the store, (N,).
-        reachable: whether a camera can stand at each view, (N, V).
+        reachable: whether a camera can be at each view, (N, V).
     """
 
     store: ViewStore
@@ -205,17 +205,17 @@ class SceneSight:
 
     @classmethod
     def of(cls, store: ViewStore, names: Sequence[str]) -> "SceneSight | None":
-        """Prepare the scenes of some of a store's objects.
+        """Prepare some scenes of a store.
 
         Args:
             store: the view store.
-            names: of the objects.
+            names: of the scenes.
 
         Returns:
-            The scenes; None if the store holds single objects.
+            The scenes; None if the store contains single objects.
 
         Raises:
-            DatasetError: the store lacks an object.
+            DatasetError: a scene is missing in the store.
         """
         if store.attributes.scene is None:
             return None
@@ -231,14 +231,14 @@ class SceneSight:
         )
 
     def of_scenes(self, kept: Index) -> "SceneSight":
-        """Some of the scenes, by their index; also the same one several times."""
+        """Return some of the scenes, by index, possibly repeated."""
         return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
 
     def visibility(self, scenes: Index, visited: Mask) -> Float:
-        """Return the share of the target that is expected to be visible from each view.
+        """Return the expected visible share of the target from each view.
 
         Args:
-            scenes: which scene, (B,) int64.
+            scenes: index of each scene, (B,) int64.
             visited: views taken so far, (B, V) bool.
 
         Returns:
@@ -272,7 +272,7 @@ class SceneSight:
         view: int,
         read: Callable[[int], SceneViews],
     ) -> SeenScene:
-        """Return what the frame from one view shows, kept packed."""
+        """Return the occupancy after one view; cached in packed form."""
         if (row, view) not in self._frames:
             asked = sight_lines(
                 VISIBILITY_GRID,

@@ -15,7 +15,7 @@ from nextview.types import Floats, Index
 
 
 def duplicate_groups(measured: Floats) -> Index:
-    """Return a number for each object, (N,), that its copies share.
+    """Return a group number for each object, (N,), shared by its copies.
 
     Copies have the same depth entropies, (N, V).
     """
@@ -23,11 +23,11 @@ def duplicate_groups(measured: Floats) -> Index:
 
 
 def deduplicated(labels: Index, measured: Floats) -> Index:
-    """Return one object, the first, of each shape and label.
+    """Return the first object of each shape and label.
 
     Args:
         labels: class of each object, (N,).
-        measured: depth entropy of the views, (N, V), by which copies are found.
+        measured: depth entropy of the views, (N, V), which identifies copies.
 
     Returns:
         Index, ascending.
@@ -50,9 +50,9 @@ def divide(
 
     Args:
         labels: class of each object, (N,).
-        measured: depth entropy of the views, (N, V), by which copies are found.
+        measured: depth entropy of the views, (N, V), which identifies copies.
         share: of each class for validation.
-        seed: of the draw.
+        seed: of the random division.
 
     Returns:
         Index of the training and of the validation objects.
@@ -77,13 +77,13 @@ def split_training(
     Args:
         store: the view store; without splits all of its objects are divided.
         share: of each class for validation.
-        seed: of the draw.
+        seed: of the random division.
 
     Returns:
         Rows of the training and of the validation objects.
 
     Raises:
-        DatasetError: the store holds no rendered object of the training split.
+        DatasetError: the store has no rendered object of the training split.
     """
     usable = np.flatnonzero(store.done & np.isin(store.splits, ("train", "")))
     if len(usable) == 0:
@@ -138,14 +138,14 @@ def deduplicate(store: ViewStore, objects: Index) -> Index:
 
 
 def sample(objects: Index, count: int | None = None) -> Index:
-    """Select objects in even steps from the first.
+    """Select evenly spaced objects, starting with the first.
 
     Args:
         objects: indices.
-        count: how many; None for all.
+        count: number of objects; None for all.
 
     Returns:
-        The selected indices; all if there are no more.
+        The selected indices; all if there are not more.
     """
     if count is not None:
         whole(count, "the number of objects", 1)
@@ -163,14 +163,14 @@ def some_objects(
     held_out: ModelCard | str | Path | None = None,
     count: int | None = None,
 ) -> Index:
-    """Return the rendered objects of a store that a user wants.
+    """Select rendered objects of a store.
 
     Args:
         store: the view store.
         split: name of the split; None for all.
-        held_out: card, or its name or path, whose held-out objects are wanted (scenes by their
+        held_out: card, or its name or path, whose held-out objects are selected (scenes by their
             target); None for all.
-        count: how many, in even steps; None for all.
+        count: number of evenly spaced objects; None for all.
 
     Returns:
         Rows, ascending.
@@ -182,7 +182,7 @@ def some_objects(
     of = "" if split is None else f" of the split {split!r}"
     if held_out is not None:
         card = held_out if isinstance(held_out, ModelCard) else find_card(held_out)
-        # in scenes; all of the name for others
+        # the target of a scene; the whole name otherwise
         targets = [name.partition("@")[0] for name in store.names]
         chosen &= np.isin(targets, card.held_out) | np.isin(store.names, card.held_out)
         of += f" that {card.name} calls held out"

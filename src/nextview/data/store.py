@@ -29,13 +29,13 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float, Float32, Index, Mask
 
 STORE_FORMAT = 2
-DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
-POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
+DEPTH_UNIT = 1e-4  # unit of the uint16 depth, object radii
+POINT_UNIT = 1 / 32767  # unit of the int16 points, object radii
 PENDING = 0
 DONE = 1
 FAILED = 2
-PLANNED = 5  # views of a plan: the thesis's longest episode
-# by rendering; more in scenes:
+PLANNED = 5  # views of a plan: the longest episode of the thesis
+# arrays created by rendering, and additional ones for scenes
 RENDERED_ARRAYS = (
     "image",
     "depth",
@@ -119,7 +119,7 @@ def describe(
         entries: its objects.
         sphere: its viewpoints.
         size: side of the images, pixels.
-        recipe: all other attributes by their names.
+        recipe: all other attributes by name.
 
     Returns:
         The attributes.
@@ -141,17 +141,17 @@ def describe(
 class ViewStore:
     """Views of N objects from the V views of a sphere.
 
-    Arrays of the group, one chunk an object: ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S)
-    uint16 in DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object
-    frame; ``measures/NAME`` (N, V) float32; ``plans/NAME`` (N, V, PLANNED) float32, the views that
-    a policy takes from each first view; ``radius`` (N,) float64, in the unit of its mesh file;
-    ``status`` (N,) uint8. Every chunk has a checksum. Of a chunk that is gone zarr would read the
-    fill value, so every read looks for its file.
+    Arrays of the group, with one chunk per object: ``image`` (N, V, S, S) uint8; ``depth``
+    (N, V, S, S) uint16 in DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in
+    POINT_UNIT, object frame; ``measures/NAME`` (N, V) float32; ``plans/NAME`` (N, V, PLANNED)
+    float32, the views that a policy takes from each first view; ``radius`` (N,) float64, in the
+    unit of its mesh file; ``status`` (N,) uint8. Every chunk has a checksum. Zarr reads the fill
+    value for a missing chunk, so every read checks that the file exists.
 
     Attributes:
         path: of the store, a zarr folder.
         group: the arrays.
-        attributes: the objects, the views, and how they were rendered.
+        attributes: the objects, the views, and the settings of the rendering.
     """
 
     path: Path
@@ -165,7 +165,7 @@ class ViewStore:
         attributes: Attributes,
         overwrite: bool = False,
     ) -> "ViewStore":
-        """Create an empty store, complete or not at all.
+        """Create an empty store, completely or not at all.
 
         Args:
             path: of the store.
@@ -188,7 +188,7 @@ class ViewStore:
 
     @classmethod
     def open(cls, path: str | Path) -> "ViewStore":
-        """Open a store; DatasetError if there is none, it is of another format, or damaged."""
+        """Open a store; DatasetError if it is missing, damaged, or in another format."""
         path = Path(path)
         if not (path / "zarr.json").is_file():
             raise DatasetError(
@@ -207,7 +207,7 @@ class ViewStore:
                 f"{path}: not a view store of format {STORE_FORMAT}; render it again"
             )
 
-        content.setdefault("rotated", content.get("turn", False))  # its name before
+        content.setdefault("rotated", content.get("turn", False))  # former name
 
         return cls(
             path,
@@ -222,7 +222,7 @@ class ViewStore:
 
     @property
     def rendered(self) -> tuple[str, ...]:
-        """Names of the arrays that rendering makes: more for cluttered scenes."""
+        """Names of the arrays created by rendering; there are more for cluttered scenes."""
         return (
             RENDERED_ARRAYS
             if self.attributes.scene is None
@@ -239,7 +239,7 @@ class ViewStore:
         )
 
     def note(self, **changes: Any) -> None:
-        """Change attributes, and write them."""
+        """Change and write attributes."""
         for key, value in changes.items():
             setattr(self.attributes, key, value)
         self.group.attrs.put(msgspec.to_builtins(self.attributes))
@@ -264,7 +264,7 @@ class ViewStore:
             del self.group[name]
 
     def _layout(self, name: str) -> tuple[tuple[int, ...], str, float]:
-        """Shape for one object, type and fill value of an array."""
+        """Return shape per object, type and fill value of an array."""
         v = len(self.sphere)
         size = self.attributes.size
         scene = self.attributes.scene or 0
@@ -288,7 +288,7 @@ class ViewStore:
         return layouts.get(name, added)
 
     def array(self, name: str) -> zarr.Array:
-        """One of the store's arrays."""
+        """Return an array of the store."""
         try:
             array = self.group[name]
         except KeyError:
@@ -324,11 +324,11 @@ class ViewStore:
         return f"{maker} makes it"
 
     def holds(self, name: str) -> bool:
-        """Whether there is an array of that name."""
+        """Return True if there is an array of that name."""
         return (self.path / name / "zarr.json").exists()
 
     def _chunk(self, array: zarr.Array, i: int) -> Path:
-        """The file with the values of object i in an array: its only chunk there."""
+        """Return the file with the values of object i in an array."""
         return (
             self.path
             / array.path
@@ -348,7 +348,7 @@ class ViewStore:
         return self._chunk(self.array(name), i).exists()
 
     def held(self, name: str) -> Mask:
-        """Which objects an array holds values of, (N,)."""
+        """Return which objects have values in an array, (N,)."""
         array = self.array(name)
         return np.array([self._chunk(array, i).exists() for i in range(len(self))])
 
@@ -380,13 +380,13 @@ class ViewStore:
             ) from None
 
     def rows(self, name: str) -> NDArray:
-        """One of the arrays, as it is stored, (N, ...).
+        """Return an array as it is stored, (N, ...).
 
-        Rows of objects that are not rendered may hold anything.
+        Rows of objects that are not rendered are undefined.
         """
         done = self.done
         array = self.array(name)
-        with suppress(*DAMAGED):  # a damaged chunk, of which it matters whose it is
+        with suppress(*DAMAGED):  # a damaged chunk is identified below
             values = array[:]
             if self.held(name)[done].all():
                 return values
@@ -396,13 +396,13 @@ class ViewStore:
         return values
 
     def write(self, i: int, arrays: Mapping[str, NDArray]) -> None:
-        """Write the values of an object, each array complete or not at all.
+        """Write the values of an object, each array completely or not at all.
 
         Args:
             i: row of the object.
-            arrays: values by the names of their arrays, written in this order.
+            arrays: values by array name, written in this order.
         """
-        # zeros too: what has no chunk is missing
+        # includes zeros, as missing chunks mean missing values
         with zarr.config.set({"array.write_empty_chunks": True}):
             for name, values in arrays.items():
                 self.group[name][i] = values
@@ -412,11 +412,11 @@ class ViewStore:
 
     @property
     def names(self) -> list[str]:
-        """Of the objects, unique, N of them."""
+        """Names of the objects, unique, N of them."""
         return self.attributes.names
 
     def rows_of(self, names: Sequence[str]) -> Index:
-        """The rows of objects by name, (n,); -1 for those that it lacks."""
+        """Return the rows of objects by name, (n,); -1 for missing ones."""
         row = {name: i for i, name in enumerate(self.names)}
         return np.array([row.get(name, -1) for name in names])
 
@@ -437,13 +437,13 @@ class ViewStore:
 
     @property
     def dataset(self) -> str:
-        """Name of the dataset folder, in lower case; that of the store if it is not known."""
+        """Name of the dataset folder, in lower case; that of the store if not known."""
         name = (self.attributes.dataset or self.path.stem).lower()
         return re.sub(r"[^a-z0-9_.]+", "-", name).strip("-") or "objects"
 
     @property
     def commands(self) -> tuple[str, ...]:
-        """The commands that made it, in order."""
+        """Commands that created it, in order."""
         return tuple(self.attributes.commands)
 
     @property
@@ -464,7 +464,7 @@ class ViewStore:
 
     @property
     def radii(self) -> Float:
-        """Of the objects, metres, (N,) float64; NaN where it is not known."""
+        """Radii of the objects, metres, (N,) float64; NaN if not known."""
         unit = self.attributes.unit
         return (
             np.full(len(self), np.nan)
@@ -474,27 +474,27 @@ class ViewStore:
 
     @property
     def duplicates(self) -> list[list[int]]:
-        """Groups of objects whose mesh files hold the same bytes."""
+        """Groups of objects with identical mesh files."""
         groups: dict[str, list[int]] = {}
         for i, sha256 in enumerate(self.attributes.sha256 or ()):
             groups.setdefault(sha256, []).append(i)
         return [group for group in groups.values() if len(group) > 1]
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """All views of object i, (V, S, S) uint8."""
+        """Return all views of object i, (V, S, S) uint8."""
         return self.read("image", i)
 
     def depth(self, i: int) -> Float32:
-        """Depth of all views of object i, (V, S, S) float32, object radii, 0 = no object."""
+        """Return all depth images of object i, (V, S, S) float32, object radii, 0 = no object."""
         return self.read("depth", i).astype(np.float32) * np.float32(DEPTH_UNIT)
 
     def points(self, i: int) -> Float32:
-        """Clouds of all views of object i, (V, 1024, 3) float32, object frame."""
+        """Return the point clouds of all views of object i, (V, 1024, 3) float32, object frame."""
         return self.read("points", i).astype(np.float32) * np.float32(POINT_UNIT)
 
     @property
     def measures(self) -> list[str]:
-        """Names of the view measures it holds, sorted."""
+        """Names of the stored view measures, sorted."""
         return sorted(
             file.parent.name for file in self.path.glob("measures/*/zarr.json")
         )
@@ -508,7 +508,7 @@ class ViewStore:
 
 
 def opened(path: Path) -> ViewStore:
-    """Open a store once in each process, and again when its attributes change."""
+    """Open a store once per process, and again when its attributes change."""
     about = (path / "zarr.json").stat()
     return _opened(path, about.st_ino, about.st_mtime_ns)
 
@@ -520,7 +520,7 @@ def _opened(path: Path, *_: int) -> ViewStore:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """One writer at a time; what the disk refuses becomes a sentence."""
+    """Lock the store for one writer; disk errors become a sentence."""
     with only_one(path):
         try:
             yield
@@ -549,7 +549,7 @@ def check(
     """
     store = ViewStore.open(path)
     for name in store.rendered:
-        store.array(name)  # says what is wrong
+        store.array(name)  # raises an error if it is damaged
     objects = np.flatnonzero(store.done).tolist()
     for i, result in each(
         partial(_check_object, path.absolute()),

@@ -1,1 +1,1 @@
-"""Where to look next: one file for each family of policies."""
+"""Policies that choose the next view, one module for each family."""

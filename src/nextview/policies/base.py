@@ -1,4 +1,4 @@
-"""The contract of a policy: what it sees, and what it answers."""
+"""The interface of policies: the state of the episodes, and the choice of next views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,42 +15,42 @@ from nextview.types import Float, Floats, Index, Mask
 if TYPE_CHECKING:
     from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
-# where a policy may go: to all views, or to those of the local window
+# candidate views of a policy: all views, or those of the local window
 Scope = Literal["global", "local"]
 
 
 @dataclass(frozen=True)
 class EpisodeState:
-    """Where B episodes stand when the next view is to be chosen. The true label is not part of it.
+    """State of B episodes when the next view is chosen. The true label is not part of it.
 
     Attributes:
         current: the view just taken, (B,) int64.
-        visited: views taken so far, the current one included, (B, V) bool.
+        visited: views taken so far, including the current one, (B, V) bool.
         belief: fused over all views, (B, classes) float64.
         evidence: of the current view.
-        step: views taken so far, 1 or more.
-        episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live
-            there is one, 0.
-        azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view,
-            if the object is of each class, (B, classes, azimuth bins) float64; None unless the
-            policy needs it.
-        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` seen from
-            each azimuth bin from here, (B, hypotheses, azimuth bins) float64; None unless the
-            policy needs it.
-        reachable: which views the camera can be brought to, (B, V) bool; None for all.
-        travel: cost to go from here to each view, grid cells, (B, V) float64; None for the travel
-            of the viewpoints.
-        places: unit vectors towards where the camera really stood, the last one here, (B, step, 3)
-            float64; None where these are the views themselves. Then ``visited`` are the views
+        step: number of views taken so far, 1 or more.
+        episodes: indices of the episodes, (B,) int64, with which an oracle looks up the truth. A
+            live session has one, 0.
+        azimuth_bins: belief, over all views, in the azimuth bin of the current view for each class,
+            (B, classes, azimuth bins) float64; None unless the policy needs it.
+        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` and azimuth
+            bin of the current view, (B, hypotheses, azimuth bins) float64; None unless the policy
+            needs it.
+        reachable: views that the camera can reach, (B, V) bool; None for all.
+        travel: cost of moving to each view, grid cells, (B, V) float64; None for the travel of the
+            viewpoints.
+        places: unit vectors towards the actual camera positions, the current one last, (B, step, 3)
+            float64; None if these are those of the views. Otherwise ``visited`` are the views
             nearest to them.
         observations: all views taken so far, in order, B sequences; None unless the policy needs
             them.
-        visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64;
+        visibility: expected visible share of the object from each view, 0 to 1, (B, V) float64;
             None unless the policy needs it.
-        outlook: what can be foreseen of views by the geometry of taught things, of B episodes, None
-            in those where that is nothing; None unless the policy needs it.
+        outlook: predictions of further views from the geometry of taught things, one per episode or
+            None; None unless the policy needs it.
 
     Example:
+
         >>> visited = np.eye(40, dtype=bool)[[3]]  # one episode, seen from view 3
         >>> evidence = Evidence(np.zeros((1, 10)))
         >>> state = EpisodeState(np.array([3]), visited, np.full((1, 10), 0.1), evidence, step=1)
@@ -75,13 +75,13 @@ class EpisodeState:
 
     @property
     def free(self) -> Mask:
-        """The views that may be chosen: reachable and not visited, (B, V) bool."""
+        """Views that may be chosen: reachable and not visited, (B, V) bool."""
         return (
             ~self.visited if self.reachable is None else ~self.visited & self.reachable
         )
 
     def select(self, rows: Any) -> "EpisodeState":
-        """Some of the episodes, by index or mask."""
+        """Return a subset of the episodes, by index or mask."""
         parts: dict[str, Any] = {}
         for name, value in vars(self).items():
             parts[name] = value[rows] if isinstance(value, np.ndarray) else value
@@ -92,9 +92,10 @@ class EpisodeState:
 
 
 class Policy(Protocol):
-    """Chooses where to look next, in many episodes at once; no row may depend on another.
+    """Chooses the next views of many episodes at once; rows must not depend on each other.
 
     Example:
+
         >>> policy = nextview.make_policy("furthest", nextview.ViewSphere.named("40"))
         >>> policy.needs
         ()
@@ -102,7 +103,7 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of what the policy needs.
+        """Names of the required inputs.
 
         These are maps in the evidence, "azimuth_bins", "joint", "observations", "outlook" and
         "visibility".
@@ -122,7 +123,7 @@ class Policy(Protocol):
 
 @runtime_checkable
 class ValuesViews(Protocol):
-    """A policy that can show what it decides by. Optional: nothing but pictures depends on it."""
+    """A policy that exposes the values behind its choice. Optional, and used only for figures."""
 
     def view_values(self, state: EpisodeState) -> Float:
         """Return the value of each candidate view, (B, V) float64; NaN if not considered."""
@@ -130,19 +131,19 @@ class ValuesViews(Protocol):
 
 @runtime_checkable
 class SeeksPose(Protocol):
-    """A policy that can look for the pose of a thing, and not only for which thing it is."""
+    """A policy that can aim at the pose of a thing, and not only at its identity."""
 
     def seeking(self, goal: Literal["thing", "pose"]) -> Policy:
-        """The same policy with this goal."""
+        """Return the policy with this goal."""
 
 
 @runtime_checkable
 class ScoresViews(Protocol):
-    """A policy on a grid that maximises the score less weighted travel; see ``off_grid``."""
+    """A policy on a grid that maximises a score minus weighted travel; see ``off_grid``."""
 
     @property
     def travel_weight(self) -> float:
-        """Of a grid cell of travel."""
+        """Weight of a grid cell of travel."""
 
     def scores(self, state: EpisodeState) -> Float:
         """Return the score of each view without travel, (B, V) float64; NaN if not considered."""
@@ -156,13 +157,13 @@ def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
         state: the state of B episodes.
 
     Returns:
-        Cost in grid cells, (B, V) float64; the robot's own cost where the state has one.
+        Cost in grid cells, (B, V) float64; the robot's own cost if the state has one.
     """
     return sphere.travel[state.current] if state.travel is None else state.travel
 
 
 def visibility_of(state: EpisodeState) -> Float:
-    """What is expected to show from each view, (B, V)."""
+    """Return the expected visible share from each view, (B, V)."""
     if state.visibility is None:
         raise PolicyError(
             "this policy needs the share of the object that is expected to show from each view"
@@ -171,7 +172,7 @@ def visibility_of(state: EpisodeState) -> Float:
 
 
 def check_weight(travel_weight: float) -> None:
-    """Refuse a travel weight that is negative or not finite."""
+    """Reject a travel weight that is negative or not finite."""
     if not 0 <= travel_weight < np.inf:
         raise PolicyError(f"a travel weight is a number from 0 on, not {travel_weight}")
 
@@ -185,7 +186,7 @@ def in_window(sphere: ViewSphere, state: EpisodeState, values: Floats) -> Float:
         values: of the cells of the local window, (B, rings, 3).
 
     Returns:
-        Values of all views, (B, V) float64; NaN outside of the window.
+        Values of all views, (B, V) float64; NaN outside the window.
     """
     found = np.full(state.visited.shape, np.nan)
     np.put_along_axis(

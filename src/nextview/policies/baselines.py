@@ -1,6 +1,7 @@
 """Policies without networks: by the path so far, by visibility, and fixed views.
 
-The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and ``Unidirectional``.
+The baselines of the thesis (section 5.3, figure 11) are ``Random``, ``Furthest`` and
+``Unidirectional``.
 """
 
 from dataclasses import dataclass
@@ -24,11 +25,11 @@ from nextview.types import Float, Floats, Index
 
 @dataclass(frozen=True)
 class Baseline:
-    """A policy that asks for nothing but the viewpoints.
+    """A policy that needs only the viewpoints.
 
     Attributes:
         sphere: a ``ViewSphere``; for ``RandomAll`` any ``Viewpoints``.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: Any
@@ -36,7 +37,7 @@ class Baseline:
 
 
 class Random(Baseline):
-    """Any unvisited view of the local window, with equal chance."""
+    """Any unvisited view of the local window, with equal probability."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Draw a free view of the local window.
@@ -72,10 +73,10 @@ class RandomAll(Baseline):
 
 
 class Furthest(Baseline):
-    """The unvisited view of the local window with the largest travel; ties are drawn."""
+    """The unvisited view of the local window with the largest travel; ties are broken at random."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the view of the local window with the longest travel; ties are drawn.
+        """Choose the view of the local window with the longest travel; ties are broken at random.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -96,10 +97,10 @@ class Furthest(Baseline):
 
 
 class Unidirectional(Baseline):
-    """The next unvisited azimuth on the same ring, always the same way round."""
+    """The next unvisited azimuth on the same ring, always in the same direction."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the next free view round the ring; a local view once the ring is complete.
+        """Choose the next free view on the ring; a local view once the ring is complete.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -126,12 +127,12 @@ class Unidirectional(Baseline):
 
 @dataclass(frozen=True)
 class Spread:
-    """The unvisited view farthest from all visited ones; ties are drawn.
+    """The unvisited view farthest from all visited ones; ties are broken at random.
 
     Attributes:
-        sphere: the candidates, anywhere.
-        scope: where it may go.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        sphere: the candidates, with any positions.
+        scope: views that may be chosen.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: Viewpoints
@@ -139,7 +140,7 @@ class Spread:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the view whose nearest visited view is farthest away; ties are drawn.
+        """Choose the view whose nearest visited view is farthest away; ties are broken at random.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -149,7 +150,7 @@ class Spread:
             The next view of each episode, (B,) int64.
         """
         nearest = np.full(state.visited.shape, np.inf)
-        # one at a time, so that the memory does not grow with V squared
+        # one at a time, so that memory does not grow with V squared
         for view in range(len(self.sphere)):
             seen = state.visited[:, view]
             nearest[seen] = np.minimum(nearest[seen], self.sphere.arc[view])
@@ -163,14 +164,14 @@ class Spread:
 
 @dataclass(frozen=True)
 class MostVisible:
-    """The free view with the highest expected visible share, less weighted travel.
+    """The free view with the highest expected visible share minus weighted travel.
 
-    Ties are drawn.
+    Ties are broken at random.
 
     Attributes:
-        sphere: the candidates, anywhere.
+        sphere: the candidates, with any positions.
         travel_weight: of a grid cell of travel, shares of the object.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: Viewpoints
@@ -181,14 +182,14 @@ class MostVisible:
         check_weight(self.travel_weight)
 
     def view_values(self, state: EpisodeState) -> Float:
-        """Expected share less the weighted travel there, (B, V)."""
+        """Return the expected visible share minus weighted travel, (B, V)."""
         return visibility_of(state) - self.travel_weight * travel_from(
             self.sphere,
             state,
         )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the view with the highest expected visible share, less its travel; ties are drawn.
+        """Choose the view with the highest value; ties are broken at random.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -206,11 +207,11 @@ class MostVisible:
 
 @dataclass(frozen=True)
 class ViewList:
-    """Goes where a list says.
+    """Follows a fixed list of views.
 
     Attributes:
-        views: of each episode in order, (E, k); the first of them are the first views.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        views: of each episode in order, (E, k), starting with the first view.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     views: Index
@@ -235,7 +236,7 @@ class ViewList:
 
 
 def orbit(sphere: ViewSphere, starts: Index, k: int) -> Index:
-    """Return the next views round the ring of each start, then round the ring above.
+    """Return the next views around the ring of each start, then around the ring above.
 
     The lowest ring follows the top one.
 
@@ -261,6 +262,6 @@ def ranked(values: Floats, k: int) -> Index:
         k: number of views.
 
     Returns:
-        The views, highest value first, equal ones in their order, (E, k) int64.
+        The views, highest value first, ties in index order, (E, k) int64.
     """
     return np.argsort(-values, axis=1, kind="stable")[:, :k]

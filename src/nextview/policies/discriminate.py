@@ -1,4 +1,4 @@
-"""The policy for taught things: it looks where the most likely ones look least alike."""
+"""Policy for taught things: choose the view in which the most likely things differ most."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,22 +11,22 @@ from nextview.policies.base import EpisodeState, best_view, check_weight, travel
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.types import Float, Floats, Index, Mask
 
-# of a cosine, as a log-likelihood: for one view whose noise is not known yet
+# weight of a cosine as a log-likelihood, for a view whose noise is not known yet
 WEIGHT = 40.0
-# pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
+# number of compared hypotheses (thing in a resting pose, and azimuth), the most likely ones
 LEADING = 24
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """The two most likely classes, and their remembered views from V candidates.
+    """The two most likely classes, and their stored views from V candidates.
 
     Attributes:
-        classes: that believed most first, (2,).
+        classes: the most likely one first, (2,).
         hypotheses: the likeliest of each, (2,).
-        rings: of the remembered views, indices, (V,).
+        rings: of the stored views, indices, (V,).
         azimuths: likewise, (2, V).
-        alike: cosine of the two views, (V,); NaN where one of them is not remembered.
+        alike: cosine similarity of the two views, (V,); NaN if one of them is not stored.
     """
 
     classes: Index
@@ -38,21 +38,22 @@ class Rivals:
 
 @dataclass(frozen=True, eq=False)
 class Discriminate:
-    """Goes where the view is expected to tell most of which thing it is, less the weighted travel.
+    """Chooses the view with the most expected information about the identity, minus weighted
+    travel.
 
-    For each candidate view the memory says what each leading hypothesis, a thing and the azimuth it
-    is seen from, would show there. If one of them is true, the others keep the likelihood of their
-    likeness to it. A view is worth the expected logarithm of the belief in the true class (expected
-    information: Denzler and Brown, IEEE TPAMI 2002; Borotschnig et al., Image and Vision Computing
-    2000).
+    The memory provides the stored view of each leading hypothesis, a thing with its azimuth, from
+    each candidate view. If one hypothesis is true, the likelihood of the others follows from their
+    similarity to it. The value of a view is the expected logarithm of the belief in the true class
+    (expected information: Denzler and Brown, IEEE TPAMI 2002; Borotschnig et al., Image and Vision
+    Computing 2000).
 
     Attributes:
-        viewpoints: the candidates, anywhere.
-        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors;
-            zero where nothing is known.
+        viewpoints: the candidates, with any positions.
+        views: stored views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero if
+            unknown.
         classes: class of each hypothesis, (H,).
         travel_weight: of a grid cell of travel.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     viewpoints: Viewpoints
@@ -92,7 +93,7 @@ class Discriminate:
         return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the view from which the leading things look least alike; ties are drawn.
+        """Choose the view in which the leading things differ most; ties are broken at random.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -131,7 +132,7 @@ class Discriminate:
     def _worth(self, joint: Float, here: float) -> Float:
         """Return the expected log-belief in the true class after each view, (V,).
 
-        The belief is (H, azimuths), seen from here.
+        The belief is (H, azimuths), relative to the current azimuth ``here``.
         """
         flat = joint.ravel()
         leading = (
@@ -146,14 +147,14 @@ class Discriminate:
         shown = shown.swapaxes(0, 1)
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
         known: Mask = np.asarray(shown.any(2))
-        # what is not known tells nothing
+        # unknown views carry no information
         alike = np.where(known[:, :, None] & known[:, None], alike, 1)
         kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
         return np.log((kept * same).sum(2) / kept.sum(2)) @ belief
 
     def _remembered(self, azimuth: Index, here: float) -> tuple[Index, Index]:
-        """Return ring, (V,), and azimuth bin, (n, V), of the nearest remembered views."""
+        """Return ring, (V,), and azimuth bin, (n, V), of the nearest stored views."""
         ahead = np.rint(
             (self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS
         ).astype(np.int64)
@@ -161,7 +162,7 @@ class Discriminate:
         return ring, (azimuth[:, None] + ahead) % AZIMUTHS
 
     def rivals(self, joint: Float, here: float) -> Rivals | None:
-        """Return the two most likely classes as they are remembered from every view.
+        """Return the two most likely classes with their stored views from every candidate.
 
         Args:
             joint: belief in each hypothesis and azimuth bin, (H, azimuths).

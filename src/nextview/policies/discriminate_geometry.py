@@ -1,4 +1,4 @@
-"""The policy that tells things of known geometry apart: it looks where a view tells most."""
+"""Policy for things with known geometry: choose the view with the most expected information."""
 
 from dataclasses import dataclass, replace
 
@@ -10,24 +10,26 @@ from nextview.policies.base import EpisodeState, best_view, check_weight, travel
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Index, Mask
 
-NEAR_TIE = 0.05  # of the best value: among views that are worth so nearly the same, travel decides
-LEAST_INFORMATION = 1e-3  # nats, below which no view is expected to tell anything
+NEAR_TIE = (
+    0.05  # relative to the best value; among views within this range, travel decides
+)
+LEAST_INFORMATION = 1e-3  # nats; views with less are considered uninformative
 
 
 @dataclass(frozen=True, eq=False)
 class DiscriminateGeometry:
-    """Goes where the view is expected to tell most of which thing it is.
+    """Chooses the view with the most expected information about the object's identity.
 
     The leading hypotheses are rendered from each candidate view, see ``things.expected_views``.
-    Among views that are worth nearly the same, that with the shortest way is taken. If no view is
-    expected to tell anything, the camera goes to the view farthest from all others, where the
-    belief is tested hardest; so it does where nothing can be foreseen.
+    Among views of similar value, the one with the shortest travel is taken. If no view is
+    informative, or nothing can be predicted, the view farthest from all visited ones is taken, as
+    it tests the belief most.
 
     Attributes:
-        viewpoints: the candidates, anywhere.
-        goal: what is to be told: which "thing" it is, or its "pose" too.
+        viewpoints: the candidates, with any positions.
+        goal: "thing" for information about the identity, "pose" for identity and pose.
         travel_weight: of a grid cell of travel, nats.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     viewpoints: Viewpoints
@@ -39,11 +41,11 @@ class DiscriminateGeometry:
         check_weight(self.travel_weight)
 
     def seeking(self, goal: Goal) -> "DiscriminateGeometry":
-        """The same policy for the thing, or for the thing and its pose."""
+        """Return the policy with the goal "thing" or "pose"."""
         return replace(self, goal=goal)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the free view with the highest value; ties are drawn.
+        """Choose the free view with the highest value; ties are broken at random.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -61,7 +63,7 @@ class DiscriminateGeometry:
         )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """Expected information of each free view, nats, less what its way counts, (B, V)."""
+        """Return the expected information of each free view minus weighted travel, nats, (B, V)."""
         if state.outlook is None:
             raise PolicyError(
                 "this policy needs things of known geometry: a memory that was taught from scans"
@@ -77,7 +79,7 @@ class DiscriminateGeometry:
         visited: Mask,
         travel: Float,
     ) -> Float:
-        """Values of the views of one episode, (V,); NaN for those that are not free."""
+        """Return the values of the views of one episode, (V,); NaN for views that are not free."""
         values = np.full(len(free), np.nan)
         some = np.flatnonzero(free)
         if not len(some):
@@ -100,7 +102,7 @@ class DiscriminateGeometry:
         return values
 
     def _apart(self, views: Index, visited: Mask) -> Float:
-        """Values below LEAST_INFORMATION, by the distance from all visited views, (N,)."""
+        """Return values below LEAST_INFORMATION by the distance from all visited views, (N,)."""
         if not visited.any():
             return np.zeros(len(views))
         nearest = self.viewpoints.arc[views][:, visited].min(1)

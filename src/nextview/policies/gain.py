@@ -1,9 +1,9 @@
-"""The policy that predicts the value of each view and weighs it against the travel.
+"""Policy that predicts the value of each view and weighs it against the travel.
 
-It decides by numbers that do not depend on where the object's azimuth zero is. It knows the ring
-(from gravity), never the absolute azimuth: all views are written as cells (see
-``policies.learned_tables``), seen from where the camera stands, or from where the recogniser
-believes the object's own zero to be. An object and its mirror image are alike.
+Its inputs do not depend on the azimuth zero of the object. It knows the ring (from gravity), but
+not the absolute azimuth: all views are expressed as cells (see ``policies.learned_tables``),
+relative to the camera, or to the estimated azimuth zero of the object. An object and its mirror
+image are treated alike.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,23 +33,23 @@ from nextview.runtime import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.types import Float, Float32, Floats, Index
 
 INPUTS = ("belief", "view", "place", "azimuth_bin")
-"""What a network may take: the belief over all views; that by the last view alone; the ring and the
-views visited; and the azimuth bin that is seen, of the class believed most and over all classes.
-Any other name is that of a map."""
-# one more, for scenes: the share of the object that is expected to show from each view
+"""Inputs of a network: the belief over all views; the belief from the last view alone; the ring and
+the visited views; and the azimuth bin of the current view, for the most likely class and over all
+classes. Any other name is that of a map."""
+# another input, for scenes: the expected visible share of the object from each view
 VISIBILITY = "visibility"
 CellFrame = Literal["camera", "object"]
-"""From where azimuths of cells are counted: the camera's, or that at which the object, if of the
-class believed most, most likely shows its azimuth bin 0."""
-FLOOR = np.log(1e-4)  # logarithm of the smallest belief that is told apart from none
-FEATURES_INPUT = "told"  # the name that the features have in the ONNX file
+"""Origin of the azimuths of cells: the camera, or the estimated view of azimuth bin 0 of the object
+as the most likely class."""
+FLOOR = np.log(1e-4)  # lower bound of log-beliefs
+FEATURES_INPUT = "told"  # name of the features in the ONNX file
 
 
-# What it decides by
+# Features
 
 
 def maps_of(inputs: Sequence[str]) -> tuple[str, ...]:
-    """The predicted maps among some inputs, in the order of ``map_names.in_order``."""
+    """Return the predicted maps among some inputs, in the order of ``map_names.in_order``."""
     return tuple(in_order(name for name in inputs if name not in (*INPUTS, VISIBILITY)))
 
 
@@ -64,13 +64,13 @@ def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def mirrored(sphere: ViewSphere) -> Index:
-    """The cell that lies as far behind as each lies ahead, (V,) int64."""
+    """Return the mirror image of each cell with respect to the camera, (V,) int64."""
     n = sphere.azimuths
     return sphere.ring * n + (-sphere.azimuth_index) % n
 
 
 def origin(sphere: ViewSphere, state: EpisodeState, frame: CellFrame) -> Index:
-    """Return the view from which the cells of each episode are counted.
+    """Return the view at the origin of the cells in each episode.
 
     Args:
         sphere: the candidate views.
@@ -91,7 +91,7 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: CellFrame) -> Index:
 
 
 def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
-    """Return the belief in the azimuth bin seen now, for each class, (B, C, azimuths)."""
+    """Return the belief in the current azimuth bin, for each class, (B, C, azimuths)."""
     if state.azimuth_bins is None or state.azimuth_bins.shape[2] != sphere.azimuths:
         raise PolicyError(
             f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins"
@@ -100,7 +100,7 @@ def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
 
 
 def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
-    """The azimuth bins of the class that is believed most, (B, azimuths)."""
+    """Return the azimuth belief of the most likely class, (B, azimuths)."""
     return azimuth_bins[np.arange(len(belief)), belief.argmax(1)]
 
 
@@ -112,13 +112,13 @@ def features(
 ) -> Float:
     """Compute the input of the gain network from the state of episodes.
 
-    No number depends on the absolute azimuth, which a robot does not know.
+    The features do not depend on the absolute azimuth, which a robot does not know.
 
     Args:
         sphere: the candidate views.
         state: the state of B episodes.
         inputs: names of the parts, such as "belief", "view", "place", "azimuth_bin" and maps.
-        frame: in which cells are counted, "camera" or "object".
+        frame: origin of the cells, "camera" or "object".
 
     Returns:
         Features, (B, D) float32.
@@ -142,7 +142,7 @@ def features(
         parts.append(state.visited[rows[:, None], cells_from(sphere)[start]])
     for name in maps_of(inputs):
         values = np.asarray(state.evidence.maps[name])
-        if name.endswith(SPHERE_SUFFIX):  # its columns are counted from the camera
+        if name.endswith(SPHERE_SUFFIX):  # columns are relative to the camera
             columns = (np.arange(n) - ahead[:, None]) % n
             values = np.take_along_axis(values, columns[:, None], 2)
         parts.append(values)
@@ -166,7 +166,7 @@ def features(
 
 
 def _facets(belief: Float) -> list[Float]:
-    """A belief, its logarithm, and the three highest logarithms in order."""
+    """Return a belief, its logarithm, and the three highest logarithms in order."""
     logs = np.maximum(np.log(np.maximum(belief, 1e-300)), FLOOR) / -FLOOR + 1
     return [belief, logs, -np.sort(-logs, 1)[:, :3]]
 
@@ -177,16 +177,16 @@ def mirrored_features(
     inputs: Sequence[str],
     frame: CellFrame = "camera",
 ) -> Index:
-    """Return the place of each feature for the mirror image of an object.
+    """Return the permutation of features for the mirror image of an object.
 
     Args:
         sphere: the candidate views.
         classes: number of classes.
         inputs: names of the parts, as for ``features``.
-        frame: in which cells are counted, "camera" or "object".
+        frame: origin of the cells, "camera" or "object".
 
     Returns:
-        Index of the feature that stands in each place, (D,) int64.
+        Source index of each feature, (D,) int64.
     """
     n = sphere.azimuths
     facets = 2 * classes + min(3, classes)
@@ -219,26 +219,24 @@ def mirrored_features(
 
 @dataclass(frozen=True)
 class Gain:
-    """The unvisited view with the highest predicted value less weighted travel.
+    """The unvisited view with the highest predicted value minus weighted travel.
 
-    Small networks learn by replay of predictions what the belief in the true class becomes after
-    each possible next
-    view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor
-    planning of Denzler and Brown, "Information theoretic sensor data selection for active object
-    recognition", PAMI 24 (2002), but regressed from the decision state instead of simulated. They
-    decide by ``features`` alone.
+    Small networks, trained on replayed predictions, estimate the belief in the true class after
+    each possible next view (``nextview train gain``). This is fitted one-step lookahead, as in the
+    value functions for sensor planning of Denzler and Brown, "Information theoretic sensor data
+    selection for active object recognition", PAMI 24 (2002), but regressed from the decision state
+    instead of simulated. The networks use ``features`` alone.
 
     Attributes:
         sphere: of the views.
-        classes: how many, C.
+        classes: number of classes, C.
         score: from features, (B, D) float32, to the value of each cell, (B, V): the mean over
-            some networks and over the object and its mirror image; each row by itself, to the
-            last bit.
-        inputs: of which the features are made.
-        travel_weight: of a grid cell, in the unit of the values: log-belief for the bundled
-            one.
-        scope: where it may go.
-        frame: in which cells are counted.
+            several networks and over the object and its mirror image; rows are bitwise independent.
+        inputs: parts of the features.
+        travel_weight: of a grid cell, in the unit of the values, which is log-belief for the
+            bundled policy.
+        scope: views that may be chosen.
+        frame: origin of the cells.
     """
 
     sphere: ViewSphere
@@ -251,7 +249,7 @@ class Gain:
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)
-        # other needs of policies
+        # names of other inputs
         unknown = [name for name in maps if name not in maps_among(maps)]
         if unknown or not self.inputs:
             known = ", ".join((*INPUTS, VISIBILITY))
@@ -280,12 +278,12 @@ class Gain:
     def gains(self, state: EpisodeState) -> Float:
         """Return the predicted value of each view, (B, V) float64.
 
-        Only differences between views have a meaning.
+        Only differences between views are meaningful.
         """
         cells = self.score(
             features(self.sphere, state, self.inputs, self.frame).astype(np.float32)
         ).astype(np.float64)
-        # cells that are mirror images may tie; the first of them is taken
+        # cells that are mirror images may tie; the first one is taken
         cells -= 1e-9 * np.arange(len(self.sphere))
         return np.take_along_axis(
             cells,
@@ -294,15 +292,15 @@ class Gain:
         )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """Return the predicted value of each view less weighted travel, (B, V)."""
+        """Return the predicted value of each view minus weighted travel, (B, V)."""
         return self.gains(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def scores(self, state: EpisodeState) -> Float:
-        """The gains of the views where it may go; see ``ScoresViews``."""
+        """Return the gains of the views in scope; see ``ScoresViews``."""
         return considered(self.sphere, state, self.gains(state), self.scope)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the view with the highest predicted gain, less its travel.
+        """Choose the view with the highest predicted gain minus weighted travel.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -316,14 +314,14 @@ class Gain:
 
 @dataclass(frozen=True)
 class VisibleGain:
-    """The free view with the highest product of what shows from it and its value if all shows.
+    """The free view with the highest product of visible share and value of an unoccluded view.
 
-    The learned gain of a view tells only how much better it is than others. So a clear view is
-    taken to bring, on the average, all that the belief still lacks: its entropy. Where everything
-    shows it goes where the gain policy goes.
+    The learned gain is relative to other views. A fully visible view is therefore assumed to
+    resolve, on average, the entropy of the belief. Without occlusion the choice is that of the gain
+    policy.
 
     Attributes:
-        gain: the policy that values clear views.
+        gain: the policy that values unoccluded views.
         travel_weight: of a grid cell of travel, in the unit of its values.
     """
 
@@ -346,7 +344,7 @@ class VisibleGain:
         )
 
     def scores(self, state: EpisodeState) -> Float:
-        """The products, (B, V); see ``ScoresViews``."""
+        """Return the products, (B, V); see ``ScoresViews``."""
         gains = self.gain.gains(state)
         free = state.free
         mean = (gains * free).sum(1, keepdims=True) / np.maximum(
@@ -360,7 +358,7 @@ class VisibleGain:
         return visibility_of(state) * (lacking + gains - mean)
 
     def view_values(self, state: EpisodeState) -> Float:
-        """The products less the weighted travel there, (B, V)."""
+        """Return the products minus weighted travel, (B, V)."""
         return self.scores(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
@@ -376,11 +374,11 @@ class VisibleGain:
         return best_view(self.sphere, state, self.view_values(state))
 
 
-# Its file
+# File format
 
 
 class GainTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the card of a gain policy holds beside the sphere; attributes as those of ``Gain``."""
+    """The gain policy's part of a card; attributes as in ``Gain``."""
 
     classes: int
     inputs: tuple[str, ...]
@@ -399,14 +397,14 @@ def read_gain(
     weights: Path,
     sha256: str,
 ) -> Gain:
-    """Open the gain policy that a card describes.
+    """Open the gain policy of a card.
 
     Args:
         sphere: the candidate views.
         table: the policy's part of the card.
         scope: "global" for all views, "local" for the local window.
         weights: path of the ONNX file.
-        sha256: that its content must have.
+        sha256: expected hash of its content.
 
     Returns:
         The policy.
@@ -432,6 +430,6 @@ def read_gain(
         raise ModelError(f"{weights}: has {names}, not {FEATURES_INPUT} and cells")
     for end, size in zip(ends, (width, len(sphere)), strict=True):
         check_end(weights, end, "tensor(float)", (size,))
-    # The graph answers with what is not a number if any weight is not finite, whatever it is given.
+    # If any weight is not finite, the output is NaN for every input.
     score(np.zeros((1, width), np.float32))
     return policy

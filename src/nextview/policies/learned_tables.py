@@ -1,7 +1,8 @@
-"""Policies with tables learned from predictions; they know the ring, not the azimuth.
+"""Policies with tables learned from predictions, which know the ring, but not the azimuth.
 
-So a place is a *cell*: its ring, and how many azimuth steps it lies ahead of the camera, ``cell =
-ring * azimuths + steps``. What no table says is left to the view farthest from all visited.
+A position is therefore a *cell*: its ring, and its number of azimuth steps ahead of the camera,
+``cell = ring * azimuths + steps``. If a table has no entry, the view farthest from all visited ones
+is chosen.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from nextview.types import Float, Index
 
 
 def cells_from(sphere: ViewSphere) -> Index:
-    """The view that lies in each cell, seen from each view, (V, V) int64: ``[view, cell]``."""
+    """Return the view in each cell, relative to each view, (V, V) int64: ``[view, cell]``."""
     n = sphere.azimuths
     return (
         sphere.ring[None] * n
@@ -26,7 +27,7 @@ def cells_from(sphere: ViewSphere) -> Index:
 
 
 def cells_to(sphere: ViewSphere) -> Index:
-    """The cell in which each view lies, seen from each view, (V, V) int64: ``[view, other]``."""
+    """Return the cell of each view, relative to each view, (V, V) int64: ``[view, other]``."""
     n = sphere.azimuths
     return (
         sphere.ring[None] * n
@@ -38,13 +39,13 @@ def cells_to(sphere: ViewSphere) -> Index:
 class FixedSequence:
     """The same moves for every object: a list of cells for each first ring.
 
-    A cell is relative to the view before.
+    A cell is relative to the previous view.
 
     Attributes:
         sphere: of the views.
         moves: cells, (rings, K).
-        scope: where it may go.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        scope: views that may be chosen.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -65,14 +66,14 @@ class FixedSequence:
 
     @cached_property
     def paths(self) -> Index:
-        """The views of the whole sequence from each start, (V, K + 1) int64."""
+        """Views of the whole sequence from each start, (V, K + 1) int64."""
         views = [np.arange(len(self.sphere))]
         for move in self.moves[self.sphere.ring].T:
             views.append(cells_from(self.sphere)[views[-1], move])
         return np.stack(views, 1)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Follow the path of the first view; where that is not possible, choose as ``Spread`` does.
+        """Follow the path of the first view; if that is not possible, choose like ``Spread``.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -84,8 +85,7 @@ class FixedSequence:
         chosen = Spread(self.sphere, self.scope).next_views(state, rng)
         if state.step >= self.paths.shape[1]:
             return chosen
-        # Where the episode began is not told, but what was visited is: the start is the one whose
-        # path led here.
+        # The first view is not part of the state; it is inferred from the visited views.
         so_far = self.paths[:, : state.step]
         deduplicated = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
         led_here = (
@@ -104,13 +104,13 @@ class FixedSequence:
 
 @dataclass(frozen=True)
 class FixedRing:
-    """Straight to one ring, then round it by the same number of azimuth steps each time.
+    """Moves straight to one ring, then around it by a fixed number of azimuth steps.
 
     Attributes:
         sphere: of the views.
-        ring: that it goes to.
-        steps: of azimuth from view to view.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        ring: target ring.
+        steps: azimuth steps from view to view.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -128,7 +128,7 @@ class FixedRing:
             )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the next free view of the ring; as ``Spread`` does once the ring is complete.
+        """Choose the next free view of the ring; like ``Spread`` once the ring is complete.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -154,13 +154,13 @@ class FixedRing:
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The unvisited cell with the highest value for the believed class and current ring.
+    """The unvisited cell with the highest value for the most likely class and the current ring.
 
     Attributes:
         sphere: of the views.
-        values: by believed class, current ring and cell, (classes, rings, V).
-        scope: where it may go.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        values: by class, current ring and cell, (classes, rings, V).
+        scope: views that may be chosen.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -195,7 +195,7 @@ class ClassTable:
     travel_weight = 0.0
 
     def scores(self, state: EpisodeState) -> Float:
-        """The table where it may go; see ``ScoresViews``."""
+        """Return the table in scope; see ``ScoresViews``."""
         return considered(self.sphere, state, self._looked_up(state), self.scope)
 
     def _looked_up(self, state: EpisodeState) -> Float:

@@ -15,8 +15,7 @@ def local_peaks(maps: Floats) -> Mask:
 
     Neighbours are 3x3, and there are none beyond the border.
     """
-    # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start
-    # short.
+    # Like SciPy's maximum_filter, without importing SciPy, to keep the start-up short.
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     return np.asarray(maps) >= np.lib.stride_tricks.sliding_window_view(
         padded,
@@ -32,7 +31,7 @@ def peaks_first(maps: Floats) -> Float:
 
 
 def sphere_peaks(values: Floats) -> Float:
-    """Return such scores for maps of the whole sphere, (B, rings, azimuths).
+    """Return scores that put peaks first for maps of the whole sphere, (B, rings, azimuths).
 
     The last azimuth is next to the first.
     """
@@ -52,8 +51,7 @@ class MapPeak:
     Attributes:
         sphere: of the views.
         map_name: in the evidence, (B, rings, 3).
-        valley_classes: those who are *believed* to be of one of these go to the lowest
-            valley.
+        valley_classes: if the most likely class is one of these, the lowest valley is chosen.
     """
 
     sphere: ViewSphere
@@ -65,7 +63,7 @@ class MapPeak:
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> Float:
-        """The predicted map where it lies on the sphere, (B, V); NaN outside the window."""
+        """Return the predicted map on the sphere, (B, V); NaN outside the window."""
         return in_window(
             self.sphere,
             state,
@@ -75,7 +73,7 @@ class MapPeak:
     travel_weight = 0.0
 
     def scores(self, state: EpisodeState) -> Float:
-        """Peaks, or valleys, before all else; see ``ScoresViews``."""
+        """Return scores that put peaks, or valleys, first; see ``ScoresViews``."""
         return in_window(self.sphere, state, self._climbed(state))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
@@ -91,7 +89,7 @@ class MapPeak:
         return best_in_window(self.sphere, state, self._climbed(state))
 
     def _climbed(self, state: EpisodeState) -> Float:
-        """What makes each cell of the window a better view, (B, rings, 3)."""
+        """Return the map, negated for classes that use valleys, (B, rings, 3)."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
             there = f"the sphere has {self.sphere.rings} rings"
@@ -109,15 +107,15 @@ class MapPeak:
 
 @dataclass(frozen=True)
 class SpherePeak:
-    """The highest unvisited peak of a predicted map of the sphere, then any highest view.
+    """The highest unvisited peak of a predicted map of the sphere, then the highest view.
 
     As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and
-    pose estimation" (Intelligent Service Robotics 16, 2023). But here the map is predicted anew
+    pose estimation" (Intelligent Service Robotics 16, 2023), except that the map is predicted again
     from each view, on the network's grid.
 
     Attributes:
         sphere: of the views.
-        map_name: in the evidence, (B, rings, azimuths), columns once round from the view.
+        map_name: in the evidence, (B, rings, azimuths), columns once around from the view.
     """
 
     sphere: ViewSphere
@@ -129,14 +127,14 @@ class SpherePeak:
         return (self.map_name,)
 
     def view_values(self, state: EpisodeState) -> Float:
-        """The predicted map where it lies on the sphere, (B, V)."""
+        """Return the predicted map on the sphere, (B, V)."""
         return self._on_sphere(
             state,
             np.asarray(state.evidence.maps[self.map_name], np.float64),
         )
 
     def scores(self, state: EpisodeState) -> Float:
-        """Peaks before all else; see ``ScoresViews``."""
+        """Return scores that put peaks first; see ``ScoresViews``."""
         return self._on_sphere(state, sphere_peaks(state.evidence.maps[self.map_name]))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:

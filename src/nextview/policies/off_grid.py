@@ -1,8 +1,8 @@
 """Use a policy of one grid of views with any views and any camera position.
 
-All that a policy on a grid is told counts azimuth from the camera. So the grid is turned until a
-column of it passes through the camera; the policy values the turned grid, and between its views the
-values are interpolated.
+The state of a policy on a grid contains azimuths relative to the camera. The grid is therefore
+rotated until one of its columns passes through the camera; the policy values the rotated grid, and
+its values are interpolated between the grid views.
 """
 
 from dataclasses import dataclass, replace
@@ -27,10 +27,10 @@ from nextview.types import Float, Index
 
 
 def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
-    """Adapt a policy to any viewpoints, and to cameras that stand between them.
+    """Adapt a policy to any viewpoints, and to cameras between them.
 
     Args:
-        policy: of a grid of views, or one that works anywhere.
+        policy: of a grid of views, or one for any views.
         sphere: the candidate views.
 
     Returns:
@@ -49,17 +49,17 @@ def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
 
 @dataclass(frozen=True)
 class OffGrid:
-    """A policy on its grid, for any views. Camera and views on the grid itself make no difference.
+    """A grid policy adapted to any views. It is exact for views and cameras on the grid.
 
-    The scores of one that scores views are interpolated between the four views of the turned grid
-    around each view; a view counts only where all of them do, and where none counts the nearest
-    free one is taken. Any other policy chooses among the cells that have a free view, and goes to
-    the view nearest to the cell.
+    The scores of a policy that scores views are interpolated between the four views of the rotated
+    grid around each candidate. A candidate is considered only if all four are; if none is, the
+    nearest free view is taken. Any other policy chooses among the cells with a free view, and the
+    view nearest to the chosen cell is taken.
 
     Attributes:
         policy: that decides on the grid.
-        grid: that it was made for.
-        sphere: the candidates, anywhere.
+        grid: of the policy.
+        sphere: the candidates, with any positions.
     """
 
     policy: Policy
@@ -106,7 +106,7 @@ class OffGrid:
         turned, ahead = self._turned(state)
         if not isinstance(self.policy, ScoresViews):
             return self._between(self.policy.view_values(turned), ahead)
-        # Travel to the views counts, not that to the grid.
+        # Travel is measured to the views, not to the grid.
         values = self._between(
             self.policy.view_values(
                 replace(turned, travel=np.zeros(turned.visited.shape))
@@ -126,7 +126,7 @@ class OffGrid:
         )
 
     def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
-        """Return the state on the turned grid, and the steps from camera to view, (B, V)."""
+        """Return the state on the rotated grid, and the steps from camera to view, (B, V)."""
         n = self.grid.azimuths
         rows = np.arange(len(state.current))[:, None]
         here = self._here(state)
@@ -149,14 +149,14 @@ class OffGrid:
         cells = np.nonzero(state.free)
         visited[views[0], cell[views]] = True
         reachable[cells[0], cell[cells]] = True
-        visited &= ~reachable  # a cell with several views may have one that is free
+        visited &= ~reachable  # a cell is free if any of its views is
         current = ring * n
         visited[rows[:, 0], current] = True
-        # the only free view lies in the camera's own cell
+        # the only free view is in the camera's own cell
         lost = ~(reachable & ~visited).any(1)
         reachable[lost] = True
         visibility = state.visibility
-        if visibility is not None:  # that of the view nearest to each cell
+        if visibility is not None:  # visibility of the view nearest to each cell
             near = self._grid_directions(state) @ self.sphere.directions.T
             visibility = np.take_along_axis(visibility, near.argmax(2), 1)
         turned = replace(
@@ -170,7 +170,7 @@ class OffGrid:
         return replace(turned, travel=None, places=None), ahead
 
     def _grid_directions(self, state: EpisodeState) -> Float:
-        """Unit vectors towards the views of the turned grid, (B, grid, 3)."""
+        """Return unit vectors towards the views of the rotated grid, (B, grid, 3)."""
         azimuth = azimuth_of(self._here(state))[:, None] + self.grid.azimuth
         elevation = np.broadcast_to(
             np.radians(self.grid.elevations)[self.grid.ring],
@@ -183,7 +183,7 @@ class OffGrid:
         )
 
     def _nearest_to(self, cells: Index, state: EpisodeState) -> Index:
-        """The free view nearest to a cell of the turned grid, (B,)."""
+        """Return the free view nearest to a cell of the rotated grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
         return np.where(
             state.free,
@@ -192,7 +192,7 @@ class OffGrid:
         ).argmin(1)
 
     def _here(self, state: EpisodeState) -> Float:
-        """Unit vectors towards the cameras, (B, 3)."""
+        """Return unit vectors towards the cameras, (B, 3)."""
         return (
             self.sphere.directions[state.current]
             if state.places is None
@@ -200,9 +200,9 @@ class OffGrid:
         )
 
     def _between(self, values: Float, ahead: Float) -> Float:
-        """Interpolate values of the turned grid, (B, grid), at the views, (B, V).
+        """Interpolate values of the rotated grid, (B, grid), at the views, (B, V).
 
-        It is NaN beside a NaN.
+        The result is NaN next to a NaN.
         """
         n = self.grid.azimuths
         order = np.argsort(self.grid.elevations, kind="stable")

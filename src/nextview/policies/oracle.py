@@ -1,4 +1,4 @@
-"""Policies that use the truth: upper bounds, and the choice of the thesis."""
+"""Policies that use the ground truth: upper bounds, and the choice of the thesis."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ from nextview.types import Float, Floats, Index
 
 @dataclass(frozen=True)
 class OracleValley:
-    """The map's peak, or its valley if the *true* class asks for it (section 4.2.3).
+    """The map's peak, or its valley if the *true* class uses valleys (section 4.2.3).
 
     Attributes:
         sphere: of the views.
         labels: of each episode, (E,).
-        valley_classes: those of one of these go to the lowest valley.
+        valley_classes: classes for which the lowest valley is chosen.
         map_name: in the evidence.
     """
 
@@ -32,7 +32,7 @@ class OracleValley:
         return (self.map_name,)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the valley of the map if the true class asks for it, else the peak.
+        """Choose the valley of the map if the true class uses valleys, else the peak.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -54,15 +54,15 @@ class OracleValley:
 class OracleMeasure:
     """The unvisited view with the highest true value, or true peak, of a measure.
 
-    With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a first
-    view that is drawn; with the fused descriptor that of Ding et al.; with peaks of the
-    depth-entropy that of Parisotto et al.
+    With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a random
+    first view; with the fused descriptor that of Ding et al.; with peaks of the depth entropy that
+    of Parisotto et al.
 
     Attributes:
         sphere: of the views.
         values: of each view in each episode, (E, V).
-        peaks: whether only peaks of the values count.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        peaks: whether only peaks of the values are considered.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -71,7 +71,7 @@ class OracleMeasure:
     needs: tuple[str, ...] = ()
 
     def view_values(self, state: EpisodeState) -> Float:
-        """The true values, (B, V)."""
+        """Return the true values, (B, V)."""
         return np.asarray(self.values[state.episodes], np.float64)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
@@ -94,17 +94,17 @@ class OracleMeasure:
 
 @dataclass(frozen=True)
 class OracleGain:
-    """The view after which the belief in the true class is highest: one step ahead.
+    """The view after which the belief in the true class is highest, one step ahead.
 
     Attributes:
         sphere: of the views.
-        log_evidence: of every view of every object, so that it adds up, (N, V, D).
-        classes: how many.
+        log_evidence: additive log-evidence of every view of every object, (N, V, D).
+        classes: number of classes.
         labels: (N,).
         objects: of each episode, (E,).
-        scope: where it may go.
+        scope: views that may be chosen.
         calibration: from summed evidence to the belief.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
+        needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -127,7 +127,7 @@ class OracleGain:
             The next view of each episode, (B,) int64.
         """
         b = len(state.current)
-        # all at once would fill the memory
+        # in parts, to limit the memory
         parts = np.split(np.arange(b), range(500, b, 500))
         gain = np.concatenate([self._gains(state, rows) for rows in parts])
         if self.scope == "global":
@@ -135,7 +135,7 @@ class OracleGain:
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
     def _gains(self, state: EpisodeState, rows: Index) -> Float:
-        """Return the log-belief in the truth after each view, or each of the window."""
+        """Return the log-belief in the true class after each view, or each view of the window."""
         objects = self.objects[state.episodes[rows]]
         current = state.current[rows]
         log_evidence = self.log_evidence[objects].astype(np.float64)

@@ -1,4 +1,4 @@
-"""The card of a learned policy: a JSON file with its table; weights are ONNX beside it."""
+"""The card of a learned policy: a JSON file with its table, next to an ONNX file with weights."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ OptionalHash = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
 class LearnedFrom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Predictions that a policy was learned from: hash of the file, and the models."""
+    """Training data of a policy: hash of the file of predictions, and the models."""
 
     sha256: OptionalHash
     models: dict[str, tuple[str, str]]
@@ -35,7 +35,7 @@ def _table(**fields: Any) -> type:
     )
 
 
-TABLES = {  # what a card's table holds, by its kind
+TABLES = {  # contents of a card's table, by kind
     "fixed-sequence": _table(moves=list[list[int]]),
     "fixed-ring": _table(ring=int, steps=int),
     "class-table": _table(values=list[list[list[float]]]),
@@ -59,16 +59,18 @@ class PolicyCard(
     azimuths: Annotated[int, msgspec.Meta(ge=1)]  # views on each ring
     classes: tuple[str, ...]  # of the recogniser, unique, in the order of its logits
     table: dict[str, Any]  # see TABLES
-    learned_from: str = ""  # in words
+    learned_from: str = ""  # description of the training data
     predictions: tuple[LearnedFrom, ...] = ()
     # temperature and correlation of the beliefs in each part
     calibration: tuple[tuple[float, float], ...] = ()
     settings: dict[str, Any] = {}  # how it was learned
-    commands: tuple[str, ...] = ()  # all that made it from the models, in order
+    commands: tuple[
+        str, ...
+    ] = ()  # all commands that created it from the models, in order
     sha256: OptionalHash = ""  # of the ONNX file; "" if there is none
 
     def make(self, sphere: ViewSphere, weights: Path) -> Policy:
-        """Create the policy that the card describes.
+        """Create the policy of the card.
 
         Args:
             sphere: the candidate views.
@@ -111,7 +113,7 @@ class PolicyCard(
 
 
 def bundled_policies() -> dict[str, Path]:
-    """Cards of the learned policies that ship with the package, by name."""
+    """Return the cards of the learned policies that ship with the package, by name."""
     return {path.stem: path for path in sorted(BUNDLED_POLICIES.glob("*.json"))}
 
 
@@ -140,7 +142,7 @@ def read_policy(
     sphere: Viewpoints,
     classes: Sequence[str] | None = None,
 ) -> Policy:
-    """Open the policy that a card describes.
+    """Open the policy of a card.
 
     Args:
         path: of the card.
@@ -151,7 +153,7 @@ def read_policy(
         The policy.
 
     Raises:
-        OtherUseError: it was learned for other viewpoints or classes.
+        OtherUseError: it was trained for other viewpoints or classes.
         PolicyError: there is no such card, or it is damaged.
     """
     card = read_policy_card(path)

@@ -1,4 +1,4 @@
-"""Policies by name, or by the import path of a user's own."""
+"""Create policies by name, or by the import path of a user's own class."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ from nextview.recognition.map_names import SPHERE_SUFFIX, in_order
 from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
 from nextview.things.memory import open_memory
 
-# those of no map; each map has its own, see ``map_policy``
+# policies without a map; for maps see ``map_policy``
 POLICIES: dict[str, Callable[[Any], Policy]] = {
     "random": Random,
     "random-all": RandomAll,
@@ -40,12 +40,12 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "spread-local": lambda sphere: Spread(sphere, "local"),
     "visibility": MostVisible,
 }
-# entry points by which packages add policies of their own
+# entry points with which other packages add policies
 POLICY_ENTRY_POINTS = "nextview.policies"
-ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
-# before a gain policy's name: its values times the share that is expected to show
+ANYWHERE = ("random-all", "spread", "visibility")  # policies that need no grid
+# prefix of a gain policy whose values are multiplied by the expected visible share
 VISIBLE = "visible-"
-DEFAULT_POLICY = "gain"  # the policy where none is named
+DEFAULT_POLICY = "gain"
 
 
 def make_policy(
@@ -59,24 +59,25 @@ def make_policy(
 
     The name is one of POLICIES; the name of a map ("lem", "lem-peak", "lem-sphere-peak", see
     ``map_policy``); a bundled learned policy; the path of a learned policy's card (.json); a gain
-    policy with "visible-" before its name; a policy of an installed package; or "MODULE:CLASS" for
-    one of your own, which is called with the viewpoints alone. NAME@WEIGHT sets the travel weight.
+    policy with the prefix "visible-"; a policy of an installed package; or "MODULE:CLASS" for your
+    own class, which is called with the viewpoints only. NAME@WEIGHT sets the travel weight.
 
     Args:
         name: of the policy.
         sphere: the candidate views; a ``ViewSphere`` except for policies in ANYWHERE and your own.
         valley_classes: indices of the classes for which a map policy goes to the valley.
-        classes: names of the recogniser's classes; a learned policy for others is refused. None to
-            skip the check.
-        maps: names of maps that are predicted besides those of the bundled networks.
+        classes: names of the recogniser's classes; a learned policy for other classes is rejected.
+            None to skip the check.
+        maps: names of maps that are predicted in addition to those of the bundled networks.
 
     Returns:
         The policy.
 
     Raises:
-        PolicyError: there is no such policy, or it cannot be made.
+        PolicyError: there is no such policy, or it cannot be created.
 
     Example:
+
         >>> make_policy("random-all", ViewSphere.named("40")).needs
         ()
     """
@@ -151,13 +152,13 @@ def make_policy_anywhere(
         viewpoints: the candidate views.
         valley_classes: indices of the classes for which a map policy goes to the valley.
         classes: names of the recogniser's classes; None to skip the check.
-        maps: names of maps that are predicted besides those of the bundled networks.
+        maps: names of maps that are predicted in addition to those of the bundled networks.
 
     Returns:
         The policy.
 
     Raises:
-        PolicyError: there is no such policy, or it cannot be made.
+        PolicyError: there is no such policy, or it cannot be created.
     """
     card = _card(name.partition("@")[0])
     if card is not None and not is_memory(card):
@@ -169,18 +170,18 @@ def make_policy_anywhere(
 
 
 def policy_names() -> list[str]:
-    """POLICIES, and those that installed packages add."""
+    """Return POLICIES and the policies of installed packages."""
     return [*POLICIES, *plugins(POLICY_ENTRY_POINTS)]
 
 
 def _card(name: str) -> Path | None:
-    """The card of a learned policy, also after "visible-"; None if the name is not that of one."""
+    """Return the card of a learned policy, with or without "visible-"; None if there is none."""
     card = name.removeprefix(VISIBLE)
     return Path(card) if card.endswith(".json") else bundled_policies().get(card)
 
 
 def _on_grid(name: str, maps: Collection[str]) -> bool:
-    """Whether it is a policy that knows rings and neighbours."""
+    """Return True if a policy needs rings and neighbours."""
     return (name in POLICIES and name not in ANYWHERE) or map_policy(
         name,
         None,
@@ -201,7 +202,7 @@ def map_policy(
         name: "MAP", "MAP-peak" or "MAP-sphere-peak".
         sphere: the candidate views.
         valley_classes: indices of the classes for which it goes to the valley.
-        maps: names of maps that are predicted besides those of the bundled networks.
+        maps: names of maps that are predicted in addition to those of the bundled networks.
 
     Returns:
         The policy; None if the name is not that of a map policy.
@@ -219,7 +220,7 @@ def map_policy(
 
 
 def map_policy_names(maps: Collection[str]) -> list[str]:
-    """Names of the policies that climb these maps and those of the bundled networks."""
+    """Return the policies that climb these maps and those of the bundled networks."""
     windows = dict.fromkeys(
         name.removesuffix(SPHERE_SUFFIX) for name in in_order((*MAPS, *maps))
     )
@@ -233,7 +234,7 @@ def map_policy_names(maps: Collection[str]) -> list[str]:
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:
     """Replace the name of a policy by the path of its card.
 
-    The name may have "visible-" before it and "@WEIGHT" after it.
+    The name may have the prefix "visible-" and the suffix "@WEIGHT".
 
     Args:
         name: of a policy.
@@ -256,7 +257,7 @@ def _of_memory(
     sphere: Viewpoints,
     classes: tuple[str, ...] | None,
 ) -> Policy:
-    """Return the policy for a memory: by surfaces, or else by remembered views."""
+    """Return the policy for a memory: by surfaces, or else by stored views."""
     by_pictures = Discriminate.from_card(card, sphere, classes)
     _, memory = open_memory(card)
     return DiscriminateGeometry(sphere) if memory.surfaces.counts.any() else by_pictures

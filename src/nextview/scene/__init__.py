@@ -1,1 +1,1 @@
-"""All objects in the frames of a depth camera: which of the known things are where."""
+"""Recognise and locate all known things in the frames of a depth camera."""

@@ -1,4 +1,4 @@
-"""The picture of a scene: the last frame with what was found in it, and the table from above."""
+"""Draw a scene: the last frame with the recognised objects, and a top view of the table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from nextview.session.style import (
 )
 from nextview.types import Float, Floats, Mask
 
-FIGURE_HEIGHT = 5.2  # inches, of both pictures
+FIGURE_HEIGHT = 5.2  # inches, of both panels
 FIGURE_MARGIN = 0.25  # inches
 TOP = 0.75  # inches, for the heading
 OBJECT_COLOURS = (
@@ -46,18 +46,20 @@ OBJECT_COLOURS = (
     "#3c5fbf",
     "#8c4a2f",
 )
-AXIS_COLOURS = ("#d1495b", "#3f9b4f", "#2f6fd0")  # x, y and z, as is usual
-AXIS_LENGTH = 0.7  # of the radius of a thing
-NEAREST_SHADE, FARTHEST_SHADE = 0.25, 0.95  # of grey, where there is no picture
-FIGURE_BORDER = 0.12  # metres around all that is drawn from above
+AXIS_COLOURS = ("#d1495b", "#3f9b4f", "#2f6fd0")  # x, y and z: red, green, blue
+AXIS_LENGTH = 0.7  # as a share of the radius of a thing
+NEAREST_SHADE, FARTHEST_SHADE = 0.25, 0.95  # grey levels, if the frame has no image
+FIGURE_BORDER = 0.12  # metres around the contents of the top view
 NAME_FONT = 10.0  # points
 SMALL_FONT = 8.5  # points, of notes
-POINTS = 72  # an inch
-CONTEXT = 0.1  # of the picture's height and width around what was found
-CLOSED_GAPS = 3  # pixels, of the outline of an object
+POINTS = 72  # per inch
+CONTEXT = (
+    0.1  # margin around the objects, as a share of the height and width of the image
+)
+CLOSED_GAPS = 3  # pixels; gaps in the outline of an object that are closed
 RELIEF_BLUR = 2.5  # pixels over which slopes are smoothed
-FIGURE_CELL = 0.002  # metres, of what is drawn from above
-SHORT_CAMERA = 0.06  # length of the arrow of a camera, of the picture's width
+FIGURE_CELL = 0.002  # metres, side of a cell of the top view
+SHORT_CAMERA = 0.06  # length of the arrow of a camera, as a share of the panel's width
 
 
 def draw_scene(
@@ -66,13 +68,13 @@ def draw_scene(
     target: Float | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw the last frame with outlines, names and axes of poses, and the table from above.
+    """Draw the last frame with outlines, names and axes of poses, and a top view of the table.
 
     Args:
-        tops: what each frame shows, at least one.
-        objects: what was found.
-        target: where the camera is to look next, camera-to-world, (4, 4); None for nowhere.
-        title: of what is shown.
+        tops: support surfaces of each frame, at least one.
+        objects: recognised objects.
+        target: next camera pose, camera-to-world, (4, 4); None for no next view.
+        title: of the figure.
     """
     top = tops[-1]
     number = len(tops) - 1
@@ -128,7 +130,7 @@ def _heading(
     width: float,
     height: float,
 ) -> None:
-    """Say how many objects were found, and in how many frames."""
+    """Write how many objects were found, and in how many frames."""
     named = sum(thing.name != UNKNOWN_NAME for thing in objects)
     said = f"{named} known thing{'s' * (named != 1)}"
     doubtful = sum(
@@ -158,7 +160,7 @@ def _heading(
 
 
 def _part(frame: Frame, masks: Sequence[Mask | None]) -> tuple[slice, slice]:
-    """Rows and columns that hold all that was found, and some of what is around it."""
+    """Return the rows and columns that contain all objects, with some context around them."""
     shown = [mask for mask in masks if mask is not None]
     if not shown:
         return slice(0, frame.shape[0]), slice(0, frame.shape[1])
@@ -174,7 +176,7 @@ def _draw_frame(
     colours: dict[int, str],
     part: tuple[slice, slice],
 ) -> None:
-    """The frame with outlines, names, and axes of the poses."""
+    """Draw the frame with outlines, names, and axes of the poses."""
     axes.imshow(
         grey_picture(frame),
         cmap="gray",
@@ -218,7 +220,7 @@ def _draw_frame(
 
 
 def _without_holes(mask: Mask) -> Mask:
-    """A mask without the gaps that missing depth leaves in it, (H, W)."""
+    """Close the gaps that missing depth leaves in a mask, (H, W)."""
     padded = np.pad(mask, CLOSED_GAPS)
     closed = ndimage.binary_closing(padded, iterations=CLOSED_GAPS)
     inner = (slice(CLOSED_GAPS, -CLOSED_GAPS),) * 2
@@ -226,9 +228,9 @@ def _without_holes(mask: Mask) -> Mask:
 
 
 def grey_picture(frame: Frame) -> Floats:
-    """A grey picture of what a frame shows, (H, W), 0 to 1."""
+    """Return a grey image of a frame, (H, W), 0 to 1."""
     if frame.image is not None:
-        # pale, so that outlines and names can be read on it
+        # pale, so that outlines and names stay readable
         return 0.25 + 0.75 * frame.image / 255
     seen = frame.depth > 0
     nearest = ndimage.distance_transform_edt(
@@ -241,7 +243,7 @@ def grey_picture(frame: Frame) -> Floats:
     low, high = np.quantile(inverse, [0.02, 0.98])
     share = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1)
     grey = FARTHEST_SHADE - 0.35 * share
-    # slopes as a lamp at the upper left shows them
+    # shaded relief, lit from the upper left
     smooth = ndimage.gaussian_filter(depth, RELIEF_BLUR)
     down, right = np.gradient(smooth)
     pitch = smooth / frame.intrinsics[0, 0]
@@ -250,7 +252,7 @@ def grey_picture(frame: Frame) -> Floats:
 
 
 def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
-    """x, y and z of a scan's frame at its centre: red, green, blue."""
+    """Draw the x, y and z axes of a scan's frame at its centre in red, green and blue."""
     pose = thing.pose
     assert pose is not None
     radius = thing.result.radius or 0.05
@@ -274,7 +276,7 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
 
 
 def _name_of(thing: SceneObject) -> str:
-    """Name of an object, with a question mark where it is not confident."""
+    """Return the name of an object, with a question mark if it is not confident."""
     doubt = " ?" * (thing.name != UNKNOWN_NAME and not thing.confident)
     return thing.name.replace("_", " ") + doubt
 
@@ -286,7 +288,7 @@ def _name(
     y: float,
     colours: dict[int, str],
 ) -> None:
-    """Write the name of an object, in italics where it is not confident."""
+    """Write the name of an object, in italics if it is not confident."""
     unknown = thing.name == UNKNOWN_NAME
 
     axes.text(
@@ -312,9 +314,10 @@ def _draw_from_above(
     colours: dict[int, str],
     target: Float | None,
 ) -> None:
-    """Where everything is, seen from above, and where the cameras stood; metres.
+    """Draw the top view: objects and camera positions, metres.
 
-    The last camera looks upwards, so that left and right are those of the frame beside it.
+    The viewing direction of the last camera points up, so that left and right match the frame
+    beside it.
     """
     cameras = np.stack([top.frame.camera_to_world for top in tops])
     up = tops[0].up
@@ -370,17 +373,24 @@ def _draw_from_above(
 
 
 def seen_from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]:
-    """Corners of an object seen from above, (K, 2), metres; and, of a scan, the cells that it
-    covers.
+    """Project an object onto the plane.
 
-    The cells begin at the lowest corner less two cells; the first index is along x.
+    The grid of cells starts two cells before the lowest corner; its first index is along x.
+
+    Args:
+        thing: object to project.
+        upright: rotation from the world to upright axes, (3, 3).
+
+    Returns:
+        The corners of its convex hull, (K, 2), metres; and the grid cells covered by its scan, None
+        without a scan.
     """
     posed = thing.candidates[0] if thing.pose is not None else None
     if posed is None or posed.vertices is None or posed.faces is None:
         flat = thing.seen_points @ upright[:2].T
         try:
             return flat[ConvexHull(flat).vertices], None
-        except QhullError:  # all in a line
+        except QhullError:  # collinear points
             return flat, None
     placed = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
     corners = placed @ upright.T
@@ -411,7 +421,7 @@ def _draw_outline(
     colour: str,
     known: bool,
 ) -> None:
-    """Draw an object as it is seen from above."""
+    """Draw the outline of an object in the top view."""
     style = "-" if known else ":"
     if picture is None:
         face = (*matplotlib.colors.to_rgb(colour), 0.25)
@@ -442,19 +452,19 @@ def _draw_camera(
     colour: str,
     label: str,
 ) -> Float:
-    """Draw an arrow where a camera stood, at the border if it is outside.
+    """Draw an arrow at a camera position, moved to the border if it is outside.
 
     Args:
-        axes: of the picture from above.
-        upright: rotation from the world to the axes of the picture, (3, 3).
+        axes: of the top view.
+        upright: rotation from the world to the axes of the top view, (3, 3).
         pose: camera-to-world, (4, 4), metres.
-        low: least x and y of the picture, metres.
+        low: least x and y of the panel, metres.
         high: greatest x and y.
         colour: of the arrow.
-        label: written behind it.
+        label: text behind the arrow.
 
     Returns:
-        Where it is drawn, (2,).
+        Position of the arrow, (2,).
     """
     place = upright @ pose[:3, 3]
     ahead = upright @ pose[:3, 2]
@@ -491,9 +501,9 @@ def _draw_camera(
 
 
 def _scale_bar(axes: Axes, low: Float, side: float, arrows: Float) -> None:
-    """Ten centimetres, or one where little is shown, or a metre where much is.
+    """Draw a scale bar of 1 cm, 10 cm or 1 m, depending on the extent of the panel.
 
-    The bar lies in the lower corner from which the arrows of the cameras are farther.
+    The bar is in the lower corner that is farther from the camera arrows.
     """
     length = next((step for step in (0.01, 0.1, 1.0) if step > 0.08 * side), 1.0)
     words = {0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m"}[length]

@@ -1,4 +1,4 @@
-"""The same objects in another frame: whose pixels are whose, what moved, and what is gone."""
+"""Track objects from frame to frame: assign pixels, detect moved objects and removed ones."""
 
 from __future__ import annotations
 
@@ -16,22 +16,26 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.tabletop import TableTop
 from nextview.types import Float, Index, Mask
 
-# metres around an object, seen from above, within which pixels may be its own
+# metres around the outline of an object in the top view within which pixels may belong to it
 SEGMENT_MARGIN = 0.012
-# share of a segment over an object, from which it is that object
+# least share of a segment inside an object's outline for the segment to be that object
 SAME_OBJECT_SHARE = 0.5
-SECOND = 0.2  # share of a segment over another object, from which the segment is cut
-SEGMENT_POINTS = 400  # points of a segment that are looked at
-FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
-GONE = 0.6  # share of these through which something behind it is seen
-STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
-THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
-FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
+SECOND = (
+    0.2  # least share of a segment inside another outline for the segment to be divided
+)
+SEGMENT_POINTS = 400  # sampled points of a segment
+FEWEST_TESTED = 30  # least number of tested pixels before an object may be called gone
+GONE = 0.6  # least share of tested pixels that show the background of a gone object
+STEP_BEHIND = 0.02  # metres, least distance of that background behind the object
+THERE = (
+    0.6  # least share of tested pixels that agree with an object that is still there
+)
+FEWEST_AGAINST = 2  # least number of contradicted objects in a frame with a wrong pose
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """An object seen from above.
+    """Outline of an object in the top view.
 
     Attributes:
         sides: lines a x + b y + c <= 0 inside, metres, (K, 3).
@@ -43,10 +47,12 @@ class Outline:
 
     @classmethod
     def of(cls, track: Track, up: Float) -> Outline | None:
-        """That of an object: of its scan where it was named, else of what was seen of it.
+        """Compute the outline of an object.
+
+        It is that of the scan if the object was recognised, and otherwise of its visible points.
 
         Args:
-            track: the object, judged.
+            track: the object, already judged.
             up: direction against gravity in the world, (3,).
         """
         axes = upright_axes(up)[:2]
@@ -65,7 +71,7 @@ class Outline:
         return None
 
     def holds(self, points: Float) -> Mask:
-        """Which points, (N, 3), lie inside of it or beside it, seen from above, (N,) bool."""
+        """Return which points, (N, 3), lie inside the outline or within its margin, (N,) bool."""
         flat = points @ self.axes.T
         return np.asarray(
             (flat @ self.sides[:, :2].T + self.sides[:, 2] <= SEGMENT_MARGIN).all(1)
@@ -80,13 +86,13 @@ def assign(
     """Assign the segments of a frame to objects.
 
     Args:
-        segments: of the frame, (H, W) bool each.
-        tracks: the objects known so far.
-        top: what the frame shows.
+        segments: masks of the frame, (H, W) bool each.
+        tracks: the objects so far.
+        top: support surfaces of the frame.
 
     Returns:
         The pixels of each object in the frame, by its row in ``tracks``; and the segments that
-        belong to no object.
+        belong to no known object.
     """
     outlines = [Outline.of(track, top.up) for track in tracks]
     own: dict[int, Mask] = {}
@@ -118,17 +124,18 @@ def assign(
 
 
 def _seen_in(segment: Mask, tracks: Sequence[Track], frame: Frame) -> int | None:
-    """The object without a scan that a segment shows more of than was seen of it before.
+    """Find the object without a scan that a segment belongs to.
 
-    Of what its last frame and this one see of the segment, most was the object's.
+    The points of the segment are projected into the last frame of each object. Most of those that
+    are visible there must lie in the mask of the object.
 
     Args:
-        segment: the pixels, (H, W) bool.
-        tracks: the objects known so far.
-        frame: that shows the segment.
+        segment: mask, (H, W) bool.
+        tracks: the objects so far.
+        frame: of the segment.
 
     Returns:
-        The row of the object that has most of these points; None where there is none.
+        The row of the object with the most of these points; None if there is none.
     """
     points = _points(segment, frame)
     best = None
@@ -147,7 +154,7 @@ def _seen_in(segment: Mask, tracks: Sequence[Track], frame: Frame) -> int | None
 
 
 def _points(mask: Mask, frame: Frame) -> Float:
-    """Some points that pixels show, (N, 3), world, metres."""
+    """Sample points of a mask, (N, 3), world, metres."""
     rows, columns = np.nonzero(mask & (frame.depth > 0))
     few = slice(None, None, max(1, len(rows) // SEGMENT_POINTS))
     return frame.positions(rows[few], columns[few])
@@ -160,8 +167,10 @@ def _divided(
     outlines: Sequence[Outline | None],
     top: TableTop,
 ) -> dict[int, Mask]:
-    """Divide the pixels of a segment among several objects: each to what explains it, or to the
-    nearest that does.
+    """Divide the pixels of a segment among several objects.
+
+    Each pixel goes to the object that explains it, or else to the object of the nearest explained
+    pixel.
     """
     label = np.zeros(segment.shape, np.int64)
     for row in rows:
@@ -190,12 +199,12 @@ def _divided(
 
 @dataclass(frozen=True)
 class SegmentAgreement:
-    """How a frame agrees with an object that it may show.
+    """Agreement of a frame with an object at its known place.
 
     Attributes:
-        tested: pixels in which the object would show if it stood alone, and a depth was measured.
-        seen: share of them in which it is.
-        through: share of them in which something behind it is seen.
+        tested: number of pixels with depth in which the object would be visible if it stood alone.
+        seen: share of these pixels whose depth agrees with the object.
+        through: share of these pixels whose depth is behind the object.
     """
 
     tested: int
@@ -204,21 +213,21 @@ class SegmentAgreement:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the object cannot be where it was."""
+        """Return True if the object is no longer at its known place."""
         return self.tested >= FEWEST_TESTED and self.through >= GONE
 
     @property
     def confirms(self) -> bool:
-        """Whether the object is where it was."""
+        """Return True if the object is still at its known place."""
         return self.tested >= FEWEST_TESTED and self.seen >= THERE
 
 
 def agreement(track: Track, top: TableTop) -> SegmentAgreement:
-    """How a frame, which was not taken in yet, agrees with an object.
+    """Compare an object with a new frame.
 
     Args:
         track: the object.
-        top: what the frame shows.
+        top: support surfaces of the new frame.
     """
     rendered = render_track(track, top, -1, track.posed)
     if rendered is None:
@@ -236,7 +245,7 @@ def agreement(track: Track, top: TableTop) -> SegmentAgreement:
 
 
 def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
-    """The same for an object of unknown shape, by the points of it that were seen last."""
+    """Compare an object of unknown shape with a frame, using the points of its last sighting."""
     last = track.thing.sightings[-1]
     few = slice(None, None, max(1, len(last.facets.planes) // SEGMENT_POINTS))
     pose = last.frame.camera_to_world
@@ -253,15 +262,15 @@ def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
 
 
 def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
-    """Where points are in the picture of a frame.
+    """Project points into a frame.
 
     Args:
         points: (N, 3), world, metres.
         frame: the frame.
 
     Returns:
-        Row and column of each point that is in the picture, where a depth was measured, (M,) each;
-        and by how much this depth is greater than that of the point, metres, (M,).
+        Row and column of each point that falls on a pixel with depth, (M,) each; and measured depth
+        minus depth of the point, metres, (M,).
     """
     now = frame.camera_to_world
     in_camera = (points - now[:3, 3]) @ now[:3, :3]
@@ -277,14 +286,14 @@ def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]
 
 
 def seen_through(points: Float, frame: Frame) -> float:
-    """Return the share of points through which a frame sees something behind them.
+    """Return the share of points behind which the frame measures something else.
 
     Args:
         points: (N, 3), world, metres.
-        frame: that may show them.
+        frame: the frame.
 
     Returns:
-        The share; 0 where the frame shows too few of them.
+        The share; 0 if too few points fall on pixels with depth.
     """
     _, off = _points_in(points, frame)
     if len(off) < FEWEST_TESTED:
@@ -293,6 +302,6 @@ def seen_through(points: Float, frame: Frame) -> float:
 
 
 def contradicted(found: Sequence[SegmentAgreement]) -> bool:
-    """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
+    """Return True if a frame contradicts so many objects that its pose must be wrong."""
     against = sum(one.contradicts for one in found)
     return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)

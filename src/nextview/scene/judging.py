@@ -1,4 +1,4 @@
-"""What each of several objects is, by all views of it. Networks judge all of them at once."""
+"""Recognise several objects from all of their views, with one batch for the networks."""
 
 from __future__ import annotations
 
@@ -29,37 +29,38 @@ from nextview.types import Floats
 
 
 class Judge:
-    """Says what objects are, by all views of each.
+    """Recogniser of objects from all of their views.
 
-    It keeps what the networks said of an observation as long as that is in use.
+    It caches the network outputs of an observation as long as the observation is in use.
     """
 
     def __init__(self, system: System, threads: int) -> None:
-        """Take over the recogniser and the rules of a system.
+        """Use the recogniser and the rules of a system.
 
         Args:
-            system: with the models, the stopping rule, and the share of unknown objects.
-            threads: objects that are judged at the same time.
+            system: with the models, the stopping rule, and the significance level for unknown
+                objects.
+            threads: number of objects that are judged in parallel.
         """
         self.system = system
         self._threads = threads
         self._said: WeakKeyDictionary[Observation, Evidence] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what the networks said, which is asked anew."""
+        """Leave out the cached network outputs, which are computed again."""
         return vars(self) | {"_said": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _said=WeakKeyDictionary())
 
     def __call__(self, things: Sequence[ObservedObject]) -> list[Recognition]:
-        """Judge some objects.
+        """Recognise objects.
 
         Args:
-            things: each with one view at least.
+            things: each with at least one view.
 
         Returns:
-            What each is, in their order.
+            The recognition of each object, in the same order.
         """
         self._ask([seen for thing in things for seen in thing.observations])
         if len(things) < 2 or self._threads < 2:
@@ -68,7 +69,7 @@ class Judge:
             return list(pool.map(self._judged, things))
 
     def _ask(self, observations: Sequence[Observation]) -> None:
-        """Run the networks on observations that they have not seen."""
+        """Run the networks on observations that are not in the cache."""
         new = [seen for seen in observations if seen.seen and seen not in self._said]
         if not new:
             return
@@ -77,7 +78,7 @@ class Judge:
             self._said[seen] = found.select([row])
 
     def _judged(self, thing: ObservedObject) -> Recognition:
-        """What one object is, by all of its views."""
+        """Recognise one object from all of its views."""
         system = self.system
         recogniser = system.models.recogniser
         seen = [one for one in thing.observations if one.seen]
@@ -102,13 +103,13 @@ class Judge:
         return replace(result, confident=self._confident(result, joint))
 
     def _log_evidence(self, seen: Observation) -> Floats:
-        """What the networks say of a view, in a form that can be summed over views, (D,)."""
+        """Return the network evidence of a view in a form that can be summed over views, (D,)."""
         found = self._said[seen]
         azimuth = azimuth_of(direction_of(seen.pose)[None])
         return np.asarray(log_evidence_of(found.logits, found.azimuth_bins, azimuth)[0])
 
     def _views(self, thing: ObservedObject) -> list[View]:
-        """The views of an object, each with what it says alone and with those before it."""
+        """Return the views of an object, each with its own belief and the belief so far."""
         calibration = self.system.models.recogniser.calibration
         sphere = self.system.sphere
         classes = len(self.system.classes)
@@ -156,7 +157,7 @@ class Judge:
         return 2 * float(card.size.largest)
 
     def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
-        """Whether the belief is high enough, and the object fits what it is taken for."""
+        """Return True if the belief is high enough and the object fits its hypothesis."""
         system = self.system
         if not result.seen or result.unknown or (joint is not None and joint.doubt):
             return False

@@ -1,4 +1,4 @@
-"""Where names are written in a picture, so that they cover each other and the objects least."""
+"""Place labels in a figure with as little overlap as possible."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 
 from nextview.types import Float
 
-LETTER_WIDTH = 0.56  # of the font size, of a letter on average
-LINE_HEIGHT = 1.25  # of the font size
-NAME_GAP = 0.3  # of the line's height, between an object and its name
-OTHER_OBJECT = 0.35  # cost of covering an object, beside 1 for covering a name
-AWAY = 0.02  # cost of each later place
-OUTSIDE = 4.0  # cost of lying outside of the picture
+LETTER_WIDTH = 0.56  # average width of a letter, as a share of the font size
+LINE_HEIGHT = 1.25  # as a share of the font size
+NAME_GAP = 0.3  # between an object and its name, as a share of the line height
+OTHER_OBJECT = 0.35  # cost of covering an object, where covering a name costs 1
+AWAY = 0.02  # cost of each place later in the list of candidates
+OUTSIDE = 4.0  # cost of a label outside the figure
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """An object that gets a name.
+    """An object with a label.
 
     Attributes:
         name: text.
-        low: least x and y of the object in the picture, (2,).
+        low: least x and y of the object in the figure, (2,).
         high: greatest x and y.
     """
 
@@ -39,17 +39,17 @@ def name_places(
     font: float,
     inside: bool = False,
 ) -> list[tuple[float, float]]:
-    """Place the names of objects: in the middle, above, below or beside.
+    """Place the names of objects in their middle, above, below or beside them.
 
     Args:
-        objects: with extents in the units of the picture.
-        low: least x and y of the picture, (2,).
+        objects: with extents in the units of the figure.
+        low: least x and y of the figure, (2,).
         high: greatest x and y.
-        font: size of the letters in the units of the picture.
-        inside: whether a name may be written over its own object.
+        font: font size in the units of the figure.
+        inside: whether a name may cover its own object.
 
     Returns:
-        The middle of each name, x and y.
+        The centre of each name, x and y.
     """
     line = LINE_HEIGHT * font
     taken: list[tuple[Float, Float]] = []
@@ -81,7 +81,7 @@ def name_places(
 
 
 def _candidates(thing: Labelled, half: Float, line: float, inside: bool) -> list[Float]:
-    """Places of the middle of a name, the best first; y may point up or down."""
+    """Return candidate centres of a name, the best first; y may point up or down."""
     middle = (thing.low + thing.high) / 2
     reach = (thing.high - thing.low) / 2 + half + NAME_GAP * line
     near = [middle] if inside else []
@@ -96,7 +96,7 @@ def _candidates(thing: Labelled, half: Float, line: float, inside: bool) -> list
 
 
 def _overlap(one: tuple[Float, Float], other: tuple[Float, Float]) -> float:
-    """Share of a box, given by its lowest and highest corner, that lies in another one."""
+    """Return the share of a box, given by its lowest and highest corner, inside another box."""
     sides = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])
     area = float(np.prod(one[1] - one[0]))
     return float(np.prod(np.maximum(sides, 0.0))) / area

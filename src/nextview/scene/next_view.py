@@ -1,9 +1,9 @@
-"""Where a view tells most of all objects of a scene that are not sure yet, and of what is hidden.
+"""Choose the next view of a scene: most information on uncertain objects and hidden areas.
 
-The information that a view is expected to give is summed over the objects: each is rendered from
-each candidate in its likeliest hypotheses, behind what is known to stand before it, see
-``things.expected_views``. Behind objects there may be others. So the part of the table that no
-frame has shown counts too, by how densely things stand on the part that was seen.
+The expected information of a view is summed over the objects. Each object is rendered from each
+candidate view in its likeliest hypotheses, behind everything known to stand in front of it; see
+``things.expected_views``. Occluded areas may contain further objects. The part of the table that no
+frame has shown therefore counts too, weighted with the density of objects on the visible part.
 """
 
 from __future__ import annotations
@@ -26,29 +26,31 @@ from nextview.session.system import System
 from nextview.types import Float, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table
-OBJECT_MARGIN = 0.08  # metres around the objects within which the table is looked at
-HIDDEN_STEP = 0.015  # metres by which something stands before a cell that it hides
-RAY_STEPS = 48  # places along a ray at which something may stand in its way
-FEWEST_HIDDEN = 12  # cells that nobody saw, below which nothing can hide there
+OBJECT_MARGIN = 0.08  # metres of table around the objects that count
+HIDDEN_STEP = 0.015  # metres, least distance of an occluder in front of a hidden cell
+RAY_STEPS = 48  # samples along a ray that is tested for occluders
+FEWEST_HIDDEN = 12  # connected hidden cells; fewer cannot hide an object
 
 LOWEST_SCENE_CAMERA = 0.10  # metres above the plane
-SAME_VIEW_ANGLE = np.radians(15.0)  # between two views that show the same
-UNKNOWN_WORTH = 1.0  # nats that another view of an unknown object is worth, from behind
-SURE_WORTH = 0.1  # the same of one that is sure: it may be two, or hide another
-SOME_POINTS = 60  # of an object, for which it is asked whether others hide it
-ENOUGH_VIEWS = 2  # of an object that fits none of the known things
+SAME_VIEW_ANGLE = np.radians(15.0)  # between two views with the same information
+UNKNOWN_WORTH = (
+    1.0  # nats, information of a view of an unknown object from the far side
+)
+SURE_WORTH = 0.1  # the same for a settled object, which may be two or hide another one
+SOME_POINTS = 60  # sampled points of an object for the occlusion test
+ENOUGH_VIEWS = 2  # after which an unknown object is settled
 
 
 @dataclass(frozen=True, eq=False)
 class TableGround:
-    """The table seen from above, in cells.
+    """Top view of the table as a grid of cells.
 
     Attributes:
-        points: middle of each cell on the plane, (C, 3), world, metres.
-        top: how high above the plane anything was seen over each, (C,), metres; 0 for nothing.
-        hidden: cells that something hides in every picture that they lie in, (C,) bool.
+        points: centre of each cell on the plane, (C, 3), world, metres.
+        top: height of the highest point over each cell, above the plane, (C,), metres; 0 if empty.
+        hidden: cells that are occluded in every frame that contains them, (C,) bool.
         shape: rows and columns of cells; C is their product.
-        low: of the first cell, along the axes, (2,), metres.
+        low: corner of the first cell, along the axes, (2,), metres.
         axes: upright, rows x, y and z in the world, (3, 3).
         floor: height of the plane along z, metres.
     """
@@ -63,10 +65,10 @@ class TableGround:
 
     @classmethod
     def of(cls, tops: Sequence[TableTop], tracks: Sequence[Track]) -> TableGround:
-        """Lay a grid over all that was seen on the plane.
+        """Lay a grid over the visible part of the plane.
 
         Args:
-            tops: what the frames show, at least one.
+            tops: support surfaces of the frames, at least one.
             tracks: the objects, at least one.
         """
         axes = upright_axes(tops[0].up)
@@ -90,7 +92,7 @@ class TableGround:
             [low + (at + 0.5) * TABLE_CELL, np.full(len(at), floor)]
         )
         level = middle @ axes
-        # the plane may lean a little
+        # the plane may be slightly tilted
         points = level - plane.height(level)[:, None] * axes[2] / (
             plane.normal @ axes[2]
         )
@@ -107,47 +109,47 @@ class TableGround:
 
     @property
     def largest_hidden(self) -> int:
-        """Cells of the largest connected part of the table that is hidden."""
+        """Number of cells in the largest connected hidden area of the table."""
         label, count = ndimage.label(self.hidden.reshape(self.shape))
         return int(np.bincount(label.ravel())[1:].max()) if count else 0
 
     def visible(self, camera: Float) -> Mask:
-        """Which cells a camera would see past all that is known, (C,) bool.
+        """Return which cells would be visible from a camera position, (C,) bool.
 
         Args:
-            camera: where it stands, (3,), world.
+            camera: position, (3,), world.
         """
         own = np.full(len(self.points), TABLE_CELL / 2)
         return self.clear(camera, self.points, (self.points @ self.axes.T)[:, 2], own)
 
     def share_visible(self, camera: Float, track: Track) -> float:
-        """Share of what was seen of an object that a camera would see past all others.
+        """Return the share of the known surface of an object that would be visible past the others.
 
         Args:
-            camera: where it stands, (3,), world.
+            camera: position, (3,), world.
             track: the object.
         """
         points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
         points = points[:: max(1, len(points) // SOME_POINTS)]
         middle = points.mean(0)
         aside = np.linalg.norm((points - middle) @ self.axes[:2].T, axis=1)
-        # its own body does not count, in whatever direction the camera stands
+        # the object does not occlude itself, whatever the direction of the camera
         own = aside + aside.max() + TABLE_CELL
         floor = np.full(len(points), self.floor)
         return float(self.clear(camera, points, floor, own).mean())
 
     def clear(self, camera: Float, points: Float, floor: Float, own: Float) -> Mask:
-        """Which points a camera would see past all that is known, (N,) bool.
+        """Return which points would be visible from a camera position, (N,) bool.
 
         Args:
-            camera: where it stands, (3,), world.
-            points: that are looked at, (N, 3), world, metres.
-            floor: height of the plane below each, (N,), metres.
-            own: metres around each, to the side, within which nothing hides it, (N,).
+            camera: position, (3,), world.
+            points: to test, (N, 3), world, metres.
+            floor: height of the plane below each point, (N,), metres.
+            own: horizontal distance around each point without occluders, (N,), metres.
         """
         start = self.axes @ camera
         ends = points @ self.axes.T
-        # Nothing stands higher than the highest, so only the last part of each ray is looked at.
+        # Only the part of each ray below the highest object can be blocked.
         highest = float(self.top.max()) if len(self.top) else 0.0
         rise = max(start[2] - self.floor, 1e-6)
         last = min(1.0, (highest + TABLE_CELL) / rise)
@@ -171,7 +173,7 @@ def _raise_over(
     shape: tuple[int, int],
     axes: Float,
 ) -> None:
-    """Note how high what a frame shows above the plane reaches over each cell."""
+    """Raise the height of each cell to the points of a frame above the plane."""
     rows, columns = np.nonzero(one.above)
     few = slice(None, None, max(1, len(rows) // 20_000))
     points = one.frame.positions(rows[few], columns[few])
@@ -186,7 +188,7 @@ def _raise_over(
 
 
 def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
-    """Which points, (C, 3), lie in a frame's picture; and which it shows, or something beyond."""
+    """Return which points, (C, 3), are inside the image of a frame, and which are not occluded."""
     pose = frame.camera_to_world
     in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = in_camera[:, 2] > 0.01
@@ -204,7 +206,7 @@ def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
 
 
 def is_sure(track: Track) -> bool:
-    """Whether another view would change little of what an object is taken for."""
+    """Return True if another view would hardly change the recognition of an object."""
     result = track.result
     if result is None:
         return False
@@ -220,8 +222,8 @@ class Candidates:
 
     Attributes:
         poses: camera-to-world, (V, 4, 4), OpenCV axes, metres.
-        directions: from the middle of the scene to each, (V, 3), upright axes.
-        free: which may be taken, (V,) bool.
+        directions: from the centre of the scene to each view, (V, 3), upright axes.
+        free: views that may be taken, (V,) bool.
     """
 
     poses: Float
@@ -235,13 +237,13 @@ def candidates(
     around: Float,
     distance: float | None,
 ) -> Candidates:
-    """Views from around a scene, all at one distance from its middle.
+    """Create candidate views around a scene, all at the same distance from its centre.
 
     Args:
         system: with the directions of the candidates.
-        tops: what the frames show.
-        around: corners of what is looked at, (N, 3), world, metres.
-        distance: of the cameras from the middle, metres; None: that of the last camera.
+        tops: support surfaces of the frames.
+        around: corners of the region of interest, (N, 3), world, metres.
+        distance: of the cameras from the centre, metres; None for that of the last camera.
     """
     axes = upright_axes(tops[0].up)
     middle = (around.min(0) + around.max(0)) / 2
@@ -266,12 +268,13 @@ def values(
     tracks: Sequence[Track],
     views: Candidates,
 ) -> Float:
-    """What each candidate view is expected to tell of the whole scene, nats, (V,).
+    """Return the expected information of each candidate view about the whole scene, nats, (V,).
 
     Args:
-        system: that knows the things.
-        tops: what the frames show, at least one.
-        tracks: the objects, judged. Without any, a view is worth by how far it is from others.
+        system: with the taught things.
+        tops: support surfaces of the frames, at least one.
+        tracks: the objects, already judged. If there are none, the value of a view is its distance
+            from the other views.
         views: the candidates.
     """
     if not tracks:
@@ -280,7 +283,7 @@ def values(
     ground = TableGround.of(tops, tracks)
     for track in tracks:
         told = None if is_sure(track) else _information(system, track, views)
-        if told is None:  # nothing foretells what another side shows
+        if told is None:  # no hypothesis predicts the other sides
             told = _from_another_side(track, tops, views)
             for row in np.flatnonzero(views.free):
                 told[row] *= ground.share_visible(views.poses[row, :3, 3], track)
@@ -299,8 +302,10 @@ def values(
 
 
 def _information(system: System, track: Track, views: Candidates) -> Float | None:
-    """What each view is expected to tell of a known object, behind what stands before it, nats,
-    (V,); None where no hypothesis tells.
+    """Return the expected information of each view about a recognised object, nats, (V,).
+
+    Occluders in front of the object are taken into account. Returns None if no hypothesis can be
+    rendered.
     """
     recogniser = system.models.recogniser
     result = track.result
@@ -322,7 +327,7 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
 
 
 def _from_elsewhere(tops: Sequence[TableTop], views: Candidates) -> Float:
-    """What each view is worth by how far it is from those of all frames, nats, (V,)."""
+    """Return the value of each view by its distance from the views of all frames, nats, (V,)."""
     turned = np.full(len(views.poses), np.pi)
     for top in tops:
         ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
@@ -335,9 +340,7 @@ def _from_another_side(
     tops: Sequence[TableTop],
     views: Candidates,
 ) -> Float:
-    """What each view is worth by how far it is from those that an object was seen from, nats,
-    (V,).
-    """
+    """Return the value of each view by its distance from the views of one object, nats, (V,)."""
     frame = track.thing.object_frame
     inside = frame.pose_in_object(views.poses)
     towards = inside[:, :3, 3] / np.linalg.norm(inside[:, :3, 3], axis=1, keepdims=True)
@@ -352,12 +355,12 @@ def _from_another_side(
 
 
 def best(views: Candidates, worth: Float, here: Float) -> int | None:
-    """Choose the free view that tells most, the nearer one of two that tell nearly the same.
+    """Choose the free view with the most information; of two similar ones, the nearer.
 
     Args:
         views: the candidates.
-        worth: what each tells, (V,), nats.
-        here: where the camera stands, (3,), world, metres.
+        worth: expected information of each view, (V,), nats.
+        here: position of the camera, (3,), world, metres.
 
     Returns:
         Its row; None without a free view.

@@ -1,4 +1,4 @@
-"""One object of a scene, as users see it."""
+"""One object of a scene, as part of the public interface."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ UNKNOWN_NAME = "unknown"
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """An object that was found.
+    """An object found in a scene.
 
     Attributes:
-        number: stays the same from frame to frame.
-        name: which of the known things it is; "unknown" for none of them.
+        number: identifies the object in all frames.
+        name: of the known thing; "unknown" if it matches none.
         confidence: belief in the name, 0 to 1; 0 for an unknown object.
         confident: whether the belief is high enough to act on.
-        place: of its centre, (3,), metres, in the world; of a single frame without a pose in the
-            camera's frame.
-        size: extents of what was seen of it, (3,), metres: two sides and the height.
-        pixels: its pixels in each frame that shows it, (H, W) bool, by the number of the frame.
-        seen_points: corners of the hull of what each frame shows of it, (N, 3), metres.
-        touches: numbers of the objects that it touches in the picture and in depth.
-        result: all that is known of it.
+        place: centre of the object, (3,), metres, in the world frame; for a single frame without a
+            pose, in the camera frame.
+        size: extents of the visible part, (3,), metres: two sides and the height.
+        pixels: mask in each frame that shows the object, (H, W) bool, by frame number.
+        seen_points: vertices of the convex hull of each view of the object, (N, 3), metres.
+        touches: numbers of the objects that it touches in the image and in depth.
+        result: full recognition result.
     """
 
     number: int
@@ -48,10 +48,10 @@ class SceneObject:
 
     @classmethod
     def of(cls, track: Track, touching: Collection[tuple[int, int]]) -> SceneObject:
-        """What users see of an object.
+        """Create the public view of a tracked object.
 
         Args:
-            track: the object, judged.
+            track: the object, already judged.
             touching: numbers of all pairs of objects that touch.
         """
         result = track.result
@@ -77,7 +77,7 @@ class SceneObject:
 
     @property
     def pose(self) -> Float | None:
-        """From the frame of its scan file into the world, (4, 4), metres; None for an unknown one.
+        """Pose of the scan in the world, scan-to-world, (4, 4), metres; None for an unknown object.
 
         See ``Recognition.pose``.
         """
@@ -85,22 +85,22 @@ class SceneObject:
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
-        """How far off ``pose`` may be; None where there is none."""
+        """Uncertainty of ``pose``; None without a pose."""
         return self.result.pose_uncertainty
 
     @property
     def candidates(self) -> tuple[PoseCandidate, ...]:
-        """The things and poses that it may be, the likeliest first."""
+        """Candidate things and poses of the object, the likeliest first."""
         return self.result.pose_candidates
 
     @property
     def symmetry(self) -> Any:
-        """Turns after which it looks the same; None where they are not known."""
+        """Rotations after which the thing looks the same; None if they are not known."""
         return self.result.symmetry
 
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
-        """What is likely to be wrong with it; usually nothing."""
+        """Likely problems with this object; usually empty."""
         return tuple(warning for view in self.result.views for warning in view.warnings)
 
     def __repr__(self) -> str:

@@ -1,9 +1,9 @@
-"""Which pixels belong together, by what explains them: hypotheses join segments and cut them.
+"""Refine the segmentation of a frame with registered scans: merge and split segments.
 
-Edges alone do not tell where one object ends: the sides of a bowl are parted by its hollow, and
-two boxes side by side have no edge between them. What a scan in its pose explains does. So where
-an object is not explained well, other ways to part the pixels are tried, and kept where the scans
-explain more of the picture.
+Edges alone do not determine where one object ends: the hollow of a bowl separates its sides, and
+two boxes side by side share no edge. A registered scan does determine it. If a scan does not
+explain an object well, other segmentations are tried, and kept if the scans then explain more
+pixels of the image.
 """
 
 from __future__ import annotations
@@ -25,16 +25,22 @@ from nextview.sensing.tabletop import NEAR_TABLE, TableTop
 from nextview.session.result import Recognition
 from nextview.types import Float, Index, Mask
 
-GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from which none is in doubt
-LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at least
-# the same where an unknown object is cut: any surface has small parts that some thing explains
+GOOD_FIT = (
+    0.85  # explained share of an object's pixels above which its mask is accepted
+)
+LEAST_GAIN = (
+    0.03  # least gain in the explained share for another segmentation to be kept
+)
+# the same for splitting an unknown object, as small parts of any surface fit some thing
 LEAST_OF_UNKNOWN = 0.3
-# share of an object's pixels that are explained, from which it is a known one
+# least explained share of the pixels of a known object
 KNOWN_SHARE = 0.5
-MOST_PLANE_SHARE = 0.25  # share of an object's pixels that may be the plane's
+MOST_PLANE_SHARE = (
+    0.25  # largest share of an object's pixels that may belong to the plane
+)
 LEAST_TRIMMED = 0.02
-SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
-# metres between segments in the picture that are tried as one object, at most
+SHARED = 0.5  # least share of a segment explained by another object's scan to try merging them
+# metres, largest gap in the image between segments that are tried as one object
 NEAR_GAP = 0.02
 NEAR_STEP = (
     0.1  # metres between their depths there, at most: across the hollow of a bowl
@@ -51,15 +57,15 @@ IN_EACH_OTHER = 0.5  # radii of the smaller of two scans between their centres, 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What partings are tried on: one frame.
+    """One frame on which segmentations are compared.
 
     Attributes:
-        top: what the frame shows.
+        top: support surfaces of the frame.
         number: of the frame.
-        judge: says what objects are.
-        rendered: objects as they were rendered so far, by ``id`` of their results, in which frames
-            they were seen, and whether as what they are most like; each with its result, which
-            keeps its ``id`` to itself.
+        judge: recognises objects.
+        rendered: cache of rendered objects, by ``id`` of their result, the frames of their
+            sightings, and whether the likeliest hypothesis was rendered. The result is stored too,
+            so that its ``id`` is not reused.
     """
 
     top: TableTop
@@ -71,15 +77,15 @@ class Bench:
     ] = field(default_factory=dict, repr=False)
 
     def render(self, track: Track) -> RenderedObject | None:
-        """What the frame would see of an object that was named."""
+        """Render a recognised object into the frame."""
         return self._rendered(track, likeliest=False)
 
     def render_likeliest(self, track: Track) -> RenderedObject | None:
-        """What the frame would see of an object if it were what it is most like."""
+        """Render the likeliest hypothesis of an object into the frame."""
         return self._rendered(track, likeliest=True)
 
     def _rendered(self, track: Track, likeliest: bool) -> RenderedObject | None:
-        """What the frame would see of an object, rendered once."""
+        """Render an object into the frame, with a cache."""
         if track.result is None:
             return None
         key = (id(track.result), track.frames, likeliest)
@@ -90,7 +96,7 @@ class Bench:
         return self.rendered[key][1]
 
     def fit(self, track: Track) -> tuple[int, int]:
-        """How many of an object's pixels its scan explains, and how many there are."""
+        """Return the number of an object's pixels that its scan explains, and their total."""
         rendered = self.render(track)
         mask = track.mask_in(self.number)
         assert mask is not None
@@ -104,7 +110,7 @@ class Bench:
         return sum(one for one, _ in fits) / max(sum(every for _, every in fits), 1)
 
     def is_good(self, track: Track) -> bool:
-        """Whether an object is explained so well that its pixels are not in doubt."""
+        """Return True if an object is explained so well that its mask is accepted."""
         return self.share([track]) >= GOOD_FIT
 
 
@@ -113,12 +119,12 @@ def part(
     bench: Bench,
     before: Mapping[int, Track],
 ) -> list[Track]:
-    """Merge and cut the objects of one frame where the scans then explain more of it.
+    """Merge and split the objects of one frame if the scans then explain more of it.
 
     Args:
-        tracks: all objects that the frame shows, verified.
+        tracks: all objects in the frame, verified.
         bench: the frame.
-        before: the objects as they were before this frame, by their numbers.
+        before: the objects before this frame, by number.
 
     Returns:
         The objects, verified. New ones have negative numbers.
@@ -134,16 +140,17 @@ def part(
 
 
 def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
-    """Give pixels of earlier frames to the objects whose scans explain them.
+    """Reassign pixels of earlier frames to the objects whose scans explain them.
 
-    Two things that one frame shows as one are told apart once another frame shows them apart.
+    Two objects that one frame shows as one are thereby separated once another frame shows them
+    apart.
 
     Args:
-        tracks: all objects, judged.
+        tracks: all objects, already judged.
         benches: all frames, in order.
 
     Returns:
-        The objects; those whose pixels changed are judged anew.
+        The objects; those whose pixels changed are judged again.
     """
     found = list(tracks)
     changed: set[int] = set()
@@ -172,13 +179,13 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
 
 
 def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
-    """Make one of two objects whose scans stand in each other, as no two things can.
+    """Merge two objects whose scans intersect, which is physically impossible.
 
-    That happens where two frames show two sides of one thing. Two objects are kept where they
-    explain more of the pictures than one.
+    This happens if two frames show two sides of one thing. Two objects are kept if they explain
+    more pixels than one.
 
     Args:
-        tracks: all objects, judged.
+        tracks: all objects, already judged.
         benches: all frames, in order.
     """
     pairs = []
@@ -204,7 +211,7 @@ def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
 
 
 def _in_each_other(one: PoseCandidate | None, other: PoseCandidate | None) -> bool:
-    """Whether two things, where they were found, stand in each other."""
+    """Return True if two things intersect in their estimated poses."""
     first, second = _sphere_of(one), _sphere_of(other)
     if first is None or second is None:
         return False
@@ -213,7 +220,7 @@ def _in_each_other(one: PoseCandidate | None, other: PoseCandidate | None) -> bo
 
 
 def _sphere_of(posed: PoseCandidate | None) -> tuple[Float, float] | None:
-    """Middle, (3,), world, and radius of a thing that was found, metres; None without a scan."""
+    """Return centre, (3,), world, and radius of a posed thing, metres; None without a scan."""
     if posed is None or posed.vertices is None:
         return None
     low = posed.vertices.min(0)
@@ -223,7 +230,7 @@ def _sphere_of(posed: PoseCandidate | None) -> tuple[Float, float] | None:
 
 
 def _explained(tracks: Sequence[Track], benches: Sequence[Bench]) -> float:
-    """Share of the pixels of some objects that their scans explain, over all frames."""
+    """Return the share of some objects' pixels that their scans explain, over all frames."""
     fits = [
         bench.fit(track)
         for bench in benches
@@ -234,17 +241,17 @@ def _explained(tracks: Sequence[Track], benches: Sequence[Bench]) -> float:
 
 
 def bench_judged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
-    """Judge objects, if there is any frame.
+    """Judge objects with the recogniser of the first frame, if there is one.
 
     Args:
         tracks: objects, not judged yet.
-        benches: what parts the pixels of each frame.
+        benches: the frames.
     """
     return benches[-1].judge(tracks) if tracks else []
 
 
 def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | None:
-    """Two objects after one has taken over what its scan explains; None where that is little."""
+    """Let one object take over the pixels of another that its scan explains; None if too few."""
     mask = loser.mask_in(bench.number)
     rendered = bench.render(taker)
     if mask is None or rendered is None:
@@ -284,8 +291,10 @@ def _trimmed(
     bench: Bench,
     before: Mapping[int, Track],
 ) -> list[Track]:
-    """Take away pixels beside the outline of what objects are most like: low ones, which the plane
-    explains; and, of an object that was named before this frame, all, which may be another one's.
+    """Remove pixels outside the rendered outline of objects.
+
+    For new objects only low pixels are removed, which the plane explains. For objects that were
+    recognised before this frame all are removed, as they may belong to another object.
     """
     smaller = {}
     known = []
@@ -327,7 +336,7 @@ def _trimmed(
 
 
 def _largest(masks: Mapping[int, Mask]) -> list[int]:
-    """Rows of some masks, (H, W) bool each, those with the most pixels first."""
+    """Return the rows of masks, (H, W) bool each, by decreasing number of pixels."""
     return sorted(masks, key=lambda row: -np.count_nonzero(masks[row]))
 
 
@@ -384,7 +393,7 @@ def _joined_once(
 
 
 def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
-    """Rows of objects that touch and may be one: pairs, and all that hang together."""
+    """Return the rows of touching objects that may be one: pairs, and connected groups."""
     masks = [track.mask_in(bench.number) for track in tracks]
     good = np.array([bench.is_good(track) for track in tracks], bool)
     linked = np.zeros((len(tracks), len(tracks)), bool)
@@ -409,7 +418,7 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
 
 
 def _components(linked: Mask) -> tuple[Index, int]:
-    """The connected component of each of N nodes, (N,), and how many there are."""
+    """Return the connected component of each of N nodes, (N,), and the number of components."""
     from scipy.sparse.csgraph import connected_components
 
     if not len(linked):
@@ -419,7 +428,7 @@ def _components(linked: Mask) -> tuple[Index, int]:
 
 
 def _shares(track: Track, mask: Mask, bench: Bench) -> bool:
-    """Whether the scan of one object explains most of another one's pixels, (H, W) bool."""
+    """Return True if the scan of an object explains most pixels of another mask, (H, W) bool."""
     rendered = bench.render(track)
     if rendered is None:
         return False
@@ -428,10 +437,10 @@ def _shares(track: Track, mask: Mask, bench: Bench) -> bool:
 
 
 def _union(tracks: Sequence[Track], bench: Bench) -> Track:
-    """Some objects as one, with the pixels of all of them in every frame.
+    """Combine objects into one, with the pixels of all of them in every frame.
 
     Raises:
-        ObservationError: too little is seen of it.
+        ObservationError: too little of it is visible.
     """
     first = min(tracks, key=lambda track: track.number if track.number >= 0 else np.inf)
     seen: dict[int, list[Sighting]] = {}
@@ -462,7 +471,7 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
 
 
 def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Cut objects into the pieces of the segmentation where several scans explain them better."""
+    """Split objects into the pieces of the segmentation if several scans explain them better."""
     parts: dict[int, list[Mask]] = {}
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
@@ -473,7 +482,7 @@ def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
 
 
 def _doubtful(tracks: Sequence[Track], bench: Bench) -> list[int]:
-    """Rows of objects that may be parted otherwise, those with the most pixels first."""
+    """Return the rows of objects that may be split, those with the most pixels first."""
     masks = {
         row: mask
         for row, track in enumerate(tracks)
@@ -485,7 +494,7 @@ def _doubtful(tracks: Sequence[Track], bench: Bench) -> list[int]:
 
 
 def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Take out what each scan explains; the pieces of what stays of its pixels are objects."""
+    """Separate the pixels that a scan explains from the rest, whose pieces become new objects."""
     parts: dict[int, list[Mask]] = {}
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
@@ -500,20 +509,20 @@ def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
 
 
 def _parts(track: Track, masks: Sequence[Mask], bench: Bench) -> list[Track]:
-    """Objects of some pixels each; the first goes on as the object that they were cut from."""
+    """Create objects from masks; the first one continues the original object."""
     first = track.with_mask(bench.number, masks[0], bench.top)
     return [first, *(new_track(mask, bench) for mask in masks[1:])]
 
 
 def new_track(mask: Mask, bench: Bench) -> Track:
-    """An object that no earlier frame showed.
+    """Create an object that no earlier frame showed.
 
     Args:
         mask: its pixels in the frame, (H, W) bool.
-        bench: what parts the pixels of the frame.
+        bench: the frame.
 
     Raises:
-        ObservationError: too little is seen of it.
+        ObservationError: too little of it is visible.
     """
     top = bench.top
     up = None if top.frame.pose is None else top.up
@@ -525,10 +534,10 @@ def _better(
     parts: Mapping[int, Sequence[Mask]],
     bench: Bench,
 ) -> list[Track]:
-    """The objects, each as it is or as its parts, whichever scans explain better.
+    """Replace objects by their parts if the scans then explain more pixels.
 
-    ``parts`` are the pixels of the parts of some of them, by their rows, in the order in which
-    they are tried.
+    ``parts`` holds the masks of the parts of some objects by row, in the order in which they are
+    tried.
     """
     tries: dict[int, list[Track]] = {}
     left = MOST_CUT

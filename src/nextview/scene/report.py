@@ -1,4 +1,4 @@
-"""What was found in a scene: rows of a table, and JSON."""
+"""Report the objects of a scene as rows of a table and as JSON."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from nextview.session.pose_json import pose_as_json
 from nextview.types import Mask
 
 REPORT_COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")
-MOST_CANDIDATES = 3  # other things that are shown beside a name
-LEAST_LISTED = 0.01  # of what is shown
+MOST_CANDIDATES = 3  # alternatives listed beside a name
+LEAST_LISTED = 0.01  # least value of a listed alternative
 
 
 def row_of(thing: SceneObject) -> list[str]:
-    """One row of a table, in ``REPORT_COLUMNS``.
+    """Return the table row of an object, in ``REPORT_COLUMNS``.
 
     Args:
         thing: an object of a scene.
@@ -46,10 +46,10 @@ def row_of(thing: SceneObject) -> list[str]:
 
 
 def doubts_of(scene: Scene) -> list[str]:
-    """A sentence on each object whose name is not confident: what else it may be.
+    """Return a sentence with the alternatives for each object that is not confident.
 
     Args:
-        scene: what was found.
+        scene: with the objects.
     """
     said = []
     for thing in scene.objects:
@@ -68,12 +68,12 @@ def scene_as_json(
     looks: Mapping[str, Look],
     left_out: Mapping[str, str],
 ) -> dict[str, Any]:
-    """All that was found, for JSON.
+    """Return all results as a dictionary for JSON.
 
     Args:
-        scene: what was found.
-        looks: what each frame changed, by its name.
-        left_out: why frames were not read, by their names.
+        scene: with the objects.
+        looks: changes made by each frame, by frame name.
+        left_out: reasons for unused frames, by frame name.
     """
     names = [name for name, one in looks.items() if one.taken]
     objects = []
@@ -120,7 +120,7 @@ def scene_as_json(
 
 
 def _box_of(mask: Mask) -> list[int]:
-    """Left, top, width and height of what a mask holds, pixels, as BOP has it."""
+    """Return left, top, width and height of a mask, pixels, as in BOP."""
     rows, columns = np.nonzero(mask)
     left, top = int(columns.min()), int(rows.min())
     return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]

@@ -1,6 +1,4 @@
-"""All objects in the frames of a depth camera: which of the known things are where, and where to
-look next.
-"""
+"""Recognise and locate all known things in the frames of a depth camera, and choose next views."""
 
 from __future__ import annotations
 
@@ -43,8 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-ENOUGH_FRAMES = 2  # of an object that is sure, after which it is not judged anew
-CORES = 2  # objects that are judged at the same time
+ENOUGH_FRAMES = 2  # frames after which a settled object is not judged again
+CORES = 2  # objects that are judged in parallel
 WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"
@@ -62,16 +60,16 @@ MOVED_OR_POSE = ViewWarning(
 
 @dataclass(frozen=True)
 class Look:
-    """What one frame changed.
+    """Changes that one frame made to a scene.
 
     Attributes:
-        taken: whether the frame was taken in.
-        appeared: numbers of objects that were not known before.
-        moved: numbers of objects that stand elsewhere now.
-        gone: numbers of objects that are no longer there.
-        joined: number of each object that turned out to be a part of another one, and the number of
-            that one: the first is used no more.
-        warnings: what is likely to be wrong with the frame; usually nothing.
+        taken: whether the frame was used.
+        appeared: numbers of new objects.
+        moved: numbers of objects that have moved.
+        gone: numbers of objects that have disappeared.
+        joined: pairs of numbers: an object that turned out to be a part of another one, and that
+            other object. The first number is not used again.
+        warnings: likely problems with the frame; usually empty.
     """
 
     taken: bool
@@ -83,27 +81,28 @@ class Look:
 
 
 class Scene:
-    """All objects on a table, or a floor, as a depth camera sees them in one or more frames.
+    """All objects on a table or floor, updated with the frames of a depth camera.
 
     >>> scene = nextview.Scene("ycb")                                           # doctest: +SKIP
     >>> scene.update(Frame(depth, intrinsics, pose))  # of nextview.sensing     # doctest: +SKIP
     >>> for thing in scene.objects:                                             # doctest: +SKIP
     ...     print(thing.name, thing.confidence, thing.pose)
 
-    Threads that share one wait for each other.
+    A scene can be shared between threads; calls wait for each other.
 
     Args:
-        models: a system of ``nextview.load``, or what it takes as models.
-        up: direction against gravity in the world, (3,); z by default. None: the normal of the
-            support plane, as always for frames without a pose.
-        region: upright box in the world; what is outside is left out.
-        distance: of the camera from the middle of the scene in ``target``, metres; by default that
+        models: a system returned by ``nextview.load``, or its argument ``models``.
+        up: direction against gravity in the world, (3,); z by default. With None, and always for
+            frames without a pose, the normal of the support plane is used.
+        region: upright box in the world; everything outside is ignored.
+        distance: of the camera from the centre of the scene in ``target``, metres; by default that
             of the last frame.
-        reachable: says of a camera-to-world pose, (4, 4), whether the camera can be brought there.
-        segmentation: a segmentation of your own: from a frame to the pixels of each thing,
-            (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. None for
-            the bundled network, which also tells the surfaces where another one does not. What
-            stands on no surface is left out.
+        reachable: function that returns True if the camera can reach a pose, camera-to-world,
+            (4, 4).
+        segmentation: your own segmentation: a function from a frame to masks of the objects,
+            (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. With None
+            the bundled network is used; it also provides the support surfaces if your own
+            segmentation does not. Objects that stand on no surface are ignored.
     """
 
     def __init__(
@@ -131,7 +130,7 @@ class Scene:
         self._lock = RLock()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the lock: a scene can be copied and pickled."""
+        """Leave out the lock, so that a scene can be copied and pickled."""
         return {name: value for name, value in vars(self).items() if name != "_lock"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -139,32 +138,33 @@ class Scene:
 
     @property
     def objects(self) -> tuple[SceneObject, ...]:
-        """What is on the table, in the order in which it was found."""
+        """Objects on the table, in the order in which they were found."""
         state = self._state
         tracks = sorted(state.tracks, key=lambda track: track.number)
         return tuple(SceneObject.of(track, state.touching) for track in tracks)
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
-        """What is left open: small objects that were not verified, what is no object, no ground."""
+        """Open issues: unverified small objects, unexplained points, no visible ground."""
         return self._state.remarks
 
     @property
     def tops(self) -> tuple[TableTop, ...]:
-        """What each frame that was taken in shows on the plane."""
+        """Support surfaces of each frame that was used."""
         return self._state.tops
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """The frames that were taken in."""
+        """Frames that were used."""
         return tuple(top.frame for top in self._state.tops)
 
     @property
     def done(self) -> bool:
-        """Whether more views would tell little, or as many were taken as the system may take.
+        """True if further views would add little, or the largest number of views is reached.
 
-        They would where an object is not sure; where much of what stands in ``region``, or on the
-        ground that is seen, is no object yet; and where something hides much of the ground.
+        Further views help if the recognition of an object is uncertain, if many points in
+        ``region`` or on the visible ground belong to no object, or if a large part of the ground is
+        occluded.
         """
         state = self._state
         if len(state.tops) >= self.system.stopping.max_views:
@@ -173,11 +173,11 @@ class Scene:
 
     @property
     def target(self) -> Float | None:
-        """Where to look next so that all objects are sure soonest, camera-to-world, (4, 4).
+        """Next view that is expected to settle all objects soonest, camera-to-world, (4, 4).
 
-        The sum of what a view is expected to tell of each object that is not sure, and of the part
-        of the table that is hidden in all frames, less a little for the way. None before the first
-        frame, where nothing was found, or no view is left.
+        It maximises the expected information about uncertain objects and about the part of the
+        table that is hidden in all frames, minus a small cost of travel. None before the first
+        frame, if nothing was found, or if no view is left.
         """
         with self._lock:
             state = self._state
@@ -195,21 +195,21 @@ class Scene:
             return self._target
 
     def update(self, frame: Frame) -> Look:
-        """Take in what the camera sees.
+        """Update the scene with a frame.
 
-        Where this raises, nothing is taken in: the scene is as it was.
+        If an error is raised, the scene is unchanged.
 
         Args:
-            frame: of a depth camera; all frames but a single one need a pose. Its mask, if it has
-                one, limits where is looked.
+            frame: of a depth camera. A pose is needed unless it is the only frame. Its mask, if it
+                has one, limits the search.
 
         Returns:
-            What the frame changed. A frame whose pose does not fit, and one that was handed in
-            before, is left out with a warning.
+            The changes. A frame with an inconsistent pose, and a repeated frame, is left out with a
+            warning.
 
         Raises:
-            ObservationError: no support plane is seen, this is no frame, or has no pose, or it
-                cannot be of the same world as what is known; or ``segmentation`` returned no masks.
+            ObservationError: the frame is invalid or has no pose, it shows no support plane, it
+                does not fit the known world, or ``segmentation`` returned no masks.
         """
         with self._lock:
             known = self._known_frames
@@ -228,15 +228,15 @@ class Scene:
             return look
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
-        """Draw the last frame with outlines, names and axes of the poses, and all from above.
+        """Draw the last frame with outlines, names and axes of the poses, and a top view.
 
         Args:
-            path: file that it is written to, PNG, PDF or SVG; one of that name is replaced.
-            title: of what is shown.
+            path: output file, PNG, PDF or SVG; an existing file is replaced.
+            title: of the figure.
 
         Raises:
-            SessionError: no frame was taken in yet.
-            UsageError: the file is of another format.
+            SessionError: there is no frame yet.
+            UsageError: the file has another format.
             ResultsError: the path is a link or a folder, or cannot be written.
         """
         from nextview.scene.figure import draw_scene
@@ -254,7 +254,7 @@ class Scene:
 
     @property
     def _known_frames(self) -> KnownFrames:
-        """What is known before another frame."""
+        """Frames, planes and region against which a new frame is checked."""
         tops = self._state.tops
         box = None if self.region is None else self.region.object_frame
         return KnownFrames(
@@ -271,10 +271,10 @@ class Scene:
         instances: Instances,
         before: Sequence[TableTop],
     ) -> TableTop:
-        """What a frame shows on its surfaces.
+        """Find the support surfaces of a frame.
 
         Raises:
-            ObservationError: it shows none.
+            ObservationError: there are none.
         """
         earlier = before[-1] if before else None
         return TableTop.of(
@@ -282,10 +282,10 @@ class Scene:
         )
 
     def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
-        """The scene after a frame, which is left out where it does not fit.
+        """Return the scene after a frame; a frame that does not fit is left out.
 
         Raises:
-            ObservationError: it shows nothing where it was.
+            ObservationError: neither the ground nor any known object is visible.
         """
         found = [agreement(track, top) for track in before.tracks]
         if contradicted(found):
@@ -305,7 +305,7 @@ class Scene:
         top: TableTop,
         found: Sequence[SegmentAgreement],
     ) -> tuple[SceneState, Look]:
-        """The scene after a frame that fits."""
+        """Return the scene after a frame that fits."""
         number = len(before.tops)
         bench = Bench(top, number, self._judged)
         pairs = list(zip(before.tracks, found, strict=True))
@@ -325,7 +325,7 @@ class Scene:
                 continue
             try:
                 shown.append(track.with_mask(number, mask, top))
-            except ObservationError:  # too little of it shows to say anything
+            except ObservationError:  # too little of it is visible
                 hidden.append(track)
         of_new = verified[len(doubtful) :]
         for mask, chosen in zip(new, of_new, strict=True):
@@ -348,9 +348,9 @@ class Scene:
         top: TableTop,
         number: int,
     ) -> Track | None:
-        """An object with its pixels in another frame, if these change nothing.
+        """Add a mask to a settled object that already explains it; otherwise return None.
 
-        What is sure by some frames already, and is seen where it should be, is not judged anew.
+        A settled object that is visible at its known place is not judged again.
         """
         if is_sure(track) and len(track.frames) >= ENOUGH_FRAMES:
             rendered = render_track(track, top, number, track.posed)
@@ -361,12 +361,12 @@ class Scene:
         return None
 
     def _judged_if_new(self, tracks: Sequence[Track]) -> list[Track]:
-        """The same objects with what each is; those of which that is known stay as they are."""
+        """Judge the objects that have no result yet; the others are unchanged."""
         asked = iter(self._judged([track for track in tracks if track.result is None]))
         return [next(asked) if track.result is None else track for track in tracks]
 
     def _judged(self, tracks: Sequence[Track]) -> list[Track]:
-        """The same objects with what each is."""
+        """Judge all objects."""
         results = self._judge([track.thing for track in tracks])
         return [
             replace(track, result=result)
@@ -375,14 +375,14 @@ class Scene:
 
 
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
-    """Whether each mask, (H, W) bool, is one of the largest, which are verified in a frame."""
+    """Return which masks, (H, W) bool, are among the largest, which are verified in a frame."""
     order = sorted(range(len(masks)), key=lambda row: -np.count_nonzero(masks[row]))
     largest = set(order[:MOST_VERIFIED])
     return [row in largest for row in range(len(masks))]
 
 
 def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
-    """An object that remembers whether it had a name before a frame that shows it."""
+    """Record in an object whether it had a name before a frame that shows it."""
     if track.number not in known or track.mask_in(number) is None:
         return track
     before = known[track.number].result
@@ -395,12 +395,12 @@ def _numbered(
     tracks: Sequence[Track],
     lost: Sequence[Track],
 ) -> tuple[SceneState, Look]:
-    """Give new objects their numbers: what is lost in one place may be found in another.
+    """Number new objects; a lost object that reappears elsewhere keeps its number.
 
     Args:
-        state: with the last frame, and the objects as they were before it.
+        state: with the last frame, and the objects before it.
         tracks: the objects.
-        lost: those that are not where they were.
+        lost: objects that are no longer at their known place.
     """
     away = {track.result.answer: track for track in lost if track.result is not None}
     number = state.next_number
@@ -443,7 +443,7 @@ def _touching(
     top: TableTop,
     number: int,
 ) -> set[tuple[int, int]]:
-    """Numbers of all pairs of objects that touch in a frame, the smaller number first."""
+    """Return the pairs of objects that touch in a frame, the smaller number first."""
     masks = [track.mask_in(number) for track in tracks]
     found = set()
     for row, beside in top.neighbours(masks):

@@ -1,4 +1,4 @@
-"""All that a scene knows after some frames; each frame makes another one of it."""
+"""Immutable state of a scene; each frame creates a new one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
-# objects that are verified in a frame at most, those with the most pixels first
+# largest number of objects verified per frame, those with the most pixels first
 MOST_VERIFIED = 20
 EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 UNSEEN_GROUND = ViewWarning(
@@ -27,15 +27,15 @@ UNSEEN_GROUND = ViewWarning(
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """A scene after some frames.
+    """State of a scene after some frames.
 
     Attributes:
-        region: where is looked; None: everywhere.
-        tops: what each frame shows on the plane.
+        region: search region; None for everywhere.
+        tops: support surfaces of each frame.
         tracks: the objects.
         touching: numbers of all pairs of objects that touch, the smaller number first.
-        next_number: of the next object that is found.
-        left_unknown: how many small objects of the last frame were not verified.
+        next_number: number of the next new object.
+        left_unknown: number of small objects in the last frame that were not verified.
     """
 
     region: Box | None = None
@@ -47,17 +47,17 @@ class SceneState:
 
     @cached_property
     def unexplained(self) -> list[UnexplainedPatch]:
-        """What is neither ground nor an object."""
+        """Points that are neither ground nor an object."""
         return unexplained(self.tops, self.tracks, self.region)
 
     @cached_property
     def ground_seen(self) -> bool:
-        """Whether so much of the ground is seen that nothing else can stand there."""
+        """True if enough of the ground is visible to rule out further objects."""
         return ground_seen(self.tops, self.region)
 
     @cached_property
     def settled(self) -> bool:
-        """Whether more views would tell little, by one frame at least."""
+        """True if there is at least one frame and further views would add little."""
         if self.unexplained or not all(is_sure(track) for track in self.tracks):
             return False
         if not self.tracks:
@@ -67,14 +67,14 @@ class SceneState:
 
     @property
     def around(self) -> Float:
-        """Corners of all that is found, or else of what is unexplained, (N, 3), world, metres."""
+        """Corners of all objects, or else of unexplained points, (N, 3), world, metres."""
         of_objects = [one.hull for each in self.tracks for one in each.thing.sightings]
         corners = of_objects or [patch.points for patch in self.unexplained]
         return np.concatenate([np.zeros((0, 3)), *corners])
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
-        """What the frames leave open, or that nothing is there; none before the first frame."""
+        """Open issues, or a remark that nothing was found; empty before the first frame."""
         remarks = []
         if self.left_unknown:
             small = number_of(self.left_unknown, "small object")

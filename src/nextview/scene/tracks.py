@@ -1,4 +1,4 @@
-"""Objects under way: the pixels of each in every frame, what it is, and what that explains."""
+"""Tracked objects of a scene: their masks, recognition results and explained pixels."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.types import Float, Float32, Mask
 
-# rows and columns in which a scan is rendered into a frame, at most
+# largest number of rows and columns in which a scan is rendered into a frame
 RENDERED_ROWS = 120
-AGREES = 0.006  # metres by which depth may be off from a scan, beside the noise
-AGREES_NOISE = 3.0  # standard deviations of the noise by which it may
-# metres by which a frame may show a thing displaced that was not aligned with it
+AGREES = 0.006  # metres, tolerance of the depth of a scan in addition to the noise
+AGREES_NOISE = 3.0  # tolerance in standard deviations of the noise
+# metres, additional tolerance in frames that were not used for the registration
 OTHER_VIEW = 0.008
-EDGE_WIDTH = 4  # pixels around a scan's outline in which depth says nothing
-WINDOW_EDGE = 12  # pixels of a window around an outline
+EDGE_WIDTH = 4  # pixels around the outline of a scan in which depth is unreliable
+WINDOW_EDGE = 12  # pixels, margin of a window around an outline
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One object of a scene.
+    """One tracked object of a scene.
 
     Attributes:
-        number: stays the same as long as the object is there.
-        thing: the object as the frames show it.
-        frames: number of the frame of each of its sightings.
-        result: what it is.
-        tries: in how many frames its pixels were parted otherwise in vain.
-        again: frames that show it where it was known to be, with its pixels in each: they were not
-            taken in as sightings.
-        absorbed: numbers of objects whose pixels all became its own since the last frame.
+        number: identifies the object as long as it is there.
+        thing: the observed object.
+        frames: frame number of each of its sightings.
+        result: of the recognition; None if it is not judged yet.
+        tries: number of frames in which splitting its mask failed.
+        again: frame numbers and masks of frames that show the object at its known place; they are
+            not used as sightings.
+        absorbed: numbers of objects that became part of this one since the last frame.
         lately_named: whether it had a name before the last frame that shows it.
     """
 
@@ -59,12 +59,12 @@ class Track:
 
     @property
     def confident(self) -> bool:
-        """Whether its name may be acted on."""
+        """True if its name is confident enough to act on."""
         return self.result is not None and self.result.confident
 
     @property
     def posed(self) -> PoseCandidate | None:
-        """The likeliest pose of the thing that it was named as; None for an unknown object."""
+        """Likeliest pose of the named thing; None for an unknown object."""
         result = self.result
         if result is None or result.answer is None or result.pose is None:
             return None
@@ -73,7 +73,7 @@ class Track:
 
     @property
     def likeliest(self) -> PoseCandidate | None:
-        """The likeliest pose of all, also of an object that is called unknown."""
+        """Likeliest pose among all hypotheses, even if the object is called unknown."""
         result = self.result
         if result is None or not result.pose_candidates:
             return None
@@ -81,13 +81,13 @@ class Track:
 
     @property
     def pixels(self) -> dict[int, Mask]:
-        """Its pixels in all frames that show it, (H, W) bool, by the number of the frame."""
+        """Masks in all frames that show the object, (H, W) bool, by frame number."""
         taken = zip(self.frames, self.thing.sightings, strict=True)
         every = {number: sighting.mask for number, sighting in taken} | dict(self.again)
         return dict(sorted(every.items()))
 
     def mask_in(self, number: int) -> Mask | None:
-        """Its pixels in a frame, (H, W) bool; None where the frame does not show it."""
+        """Return its mask in a frame, (H, W) bool; None if the frame does not show it."""
         for frame, mask in self.again:
             if frame == number:
                 return mask
@@ -101,29 +101,29 @@ class Track:
         frames: Sequence[int],
         up: Float,
     ) -> Track:
-        """The same object by other sightings, not judged yet.
+        """Return the object with other sightings, not judged yet.
 
         Args:
             sightings: at least one.
-            frames: the number of the frame of each.
+            frames: frame number of each sighting.
             up: direction against gravity, (3,), world.
 
         Raises:
-            ObservationError: what is seen of the object has no size.
+            ObservationError: the visible part of the object has no extent.
         """
         thing = copy(self.thing)
         thing.take_sightings(sightings, up)
         return replace(self, thing=thing, frames=tuple(frames), result=None)
 
     def without(self, number: int, up: Float) -> Track | None:
-        """The same object without what a frame shows of it; None if no other frame shows it.
+        """Return the object without its sighting in a frame; None if no other frame shows it.
 
         Args:
             number: of the frame.
             up: direction against gravity in the world, (3,).
 
         Raises:
-            ObservationError: what is seen of the object has no size.
+            ObservationError: the visible part of the object has no extent.
         """
         pairs = zip(self.frames, self.thing.sightings, strict=True)
         kept = [(frame, one) for frame, one in pairs if frame != number]
@@ -132,15 +132,15 @@ class Track:
         return self.seen_as([one for _, one in kept], [frame for frame, _ in kept], up)
 
     def with_mask(self, number: int, mask: Mask, top: TableTop) -> Track:
-        """The same object with other pixels in a frame, which it may be new in.
+        """Return the object with a new or changed mask in a frame.
 
         Args:
             number: of the frame.
             mask: its pixels, (H, W) bool.
-            top: what the frame shows.
+            top: support surfaces of the frame.
 
         Raises:
-            ObservationError: too little is seen of the object.
+            ObservationError: too little of the object is visible.
         """
         sighting = top.sighting(mask)
         kept = [
@@ -164,15 +164,15 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class RenderedObject:
-    """What a frame would see of an object that was named, where it was found.
+    """The scan of an object rendered into a frame, and its comparison with the depth.
 
     Attributes:
-        part: rows and columns of the frame that hold its outline.
-        depth: of its scan there, (h, w) float32, metres; infinity where it does not show.
-        agrees: pixels there whose depth is that of the scan, (h, w) bool.
-        hidden: pixels there in which something nearer hides the scan, (h, w) bool.
-        through: pixels there in which what is behind the scan is seen, (h, w) bool.
-        near: pixels there that are on the scan's outline or inside of it, (h, w) bool.
+        part: rows and columns of the frame that contain its outline.
+        depth: of the scan in this part, (h, w) float32, metres; infinity outside the scan.
+        agrees: pixels whose depth agrees with the scan, (h, w) bool.
+        hidden: pixels in which something nearer occludes the scan, (h, w) bool.
+        through: pixels whose depth is behind the scan, (h, w) bool.
+        near: pixels on the scan, inside it or at its outline, (h, w) bool.
     """
 
     part: Part
@@ -183,25 +183,26 @@ class RenderedObject:
     near: Mask = field(repr=False)
 
     def explained(self, shape: tuple[int, int]) -> Mask:
-        """Pixels of the whole frame that the scan explains, (H, W) bool."""
+        """Return the pixels of the whole frame that the scan explains, (H, W) bool."""
         found = np.zeros(shape, bool)
         found[self.part] = self.agrees
         return found
 
     def around(self, shape: tuple[int, int]) -> Mask:
-        """Pixels of the whole frame on the scan or at its outline, (H, W) bool."""
+        """Return the pixels of the whole frame on the scan or at its outline, (H, W) bool."""
         found = np.zeros(shape, bool)
         found[self.part] = self.near
         return found
 
     def fit(self, mask: Mask) -> tuple[int, int]:
-        """How well a scan explains some pixels.
+        """Count the pixels of a mask that the scan explains.
 
         Args:
-            mask: that are taken for the object, (H, W) bool.
+            mask: of the object, (H, W) bool.
 
         Returns:
-            How many of them it explains; and how many are either of them or would have to be.
+            The number of explained pixels; and the number of pixels in the mask or predicted by the
+            scan.
         """
         own = mask[self.part]
         agreeing = int(np.count_nonzero(own & self.agrees))
@@ -219,12 +220,12 @@ def render_track(
 
     Args:
         track: the object.
-        top: what the frame shows.
+        top: support surfaces of the frame.
         number: of the frame.
         posed: the thing in its pose, one of ``Track.posed`` and ``Track.likeliest``.
 
     Returns:
-        What would be seen; None without a pose, or where it is out of the picture.
+        The rendered object; None without a pose, or if it is outside the image.
     """
     if posed is None or posed.vertices is None or posed.faces is None:
         return None
@@ -259,7 +260,7 @@ def render_track(
 
 
 def _window(corners: Float, intrinsics: Float, shape: tuple[int, int]) -> Part | None:
-    """Rows and columns that hold points, (N, 3), camera frame; None if they are out of view."""
+    """Return rows and columns that contain points, (N, 3), camera frame; None if out of view."""
     ahead = corners[corners[:, 2] > 0.01]
     if not len(ahead):
         return None
@@ -278,7 +279,7 @@ def _cast(
     rays: tuple[Float32, Float32],
     part: Part,
 ) -> Float32:
-    """Depth of a scan in a part of a frame, (h, w) float32, metres; infinity where it is not."""
+    """Return the depth of a scan in a part of a frame, (h, w) float32, metres; infinity outside."""
     assert posed.vertices is not None
     assert posed.faces is not None
     x = rays[0][part[1]]
@@ -306,7 +307,7 @@ def _cast(
 
 
 class _Triangles:
-    """Vertices and faces as a key. Two are equal if their numbers are."""
+    """Vertices and faces as a dictionary key, compared by value."""
 
     def __init__(self, vertices: Float32, faces: NDArray[np.int32]) -> None:
         self.vertices = vertices
@@ -324,11 +325,11 @@ class _Triangles:
 
 @lru_cache(maxsize=256)
 def _caster(name: str, triangles: _Triangles) -> SurfaceCaster:
-    """A scan, ready for casting."""
+    """Prepare a scan for ray casting."""
     return SurfaceCaster([Surface(name, triangles.vertices, triangles.faces)])
 
 
 def _rim(depth: Float32) -> Mask:
-    """Pixels at the outline of a scan, (h, w) bool."""
+    """Return the pixels at the outline of a scan, (h, w) bool."""
     shows = np.isfinite(depth)
     return shows & ~ndimage.binary_erosion(shows, iterations=EDGE_WIDTH)

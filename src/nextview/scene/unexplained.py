@@ -1,5 +1,6 @@
-"""What a frame shows that is neither ground nor an object: as long as there is much, no scene is
-empty, and none is done.
+"""Find points that are neither ground nor an object.
+
+A scene with many of them is not empty, and not done.
 """
 
 from __future__ import annotations
@@ -19,24 +20,26 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
 from nextview.types import Float, Mask
 
-NEAR_DEVIATIONS = 4.0  # of the noise by which the ground's pixels deviate, at most
-# metres at a distance of 1 m, standard deviation: what is noisier is no noise, but many small steps
+NEAR_DEVIATIONS = (
+    4.0  # largest deviation of ground pixels, in standard deviations of the noise
+)
+# largest standard deviation of the noise at 1 m, metres; a larger estimate comes from clutter
 NOISIEST_CAMERA = 0.005
-CONSIDERABLE_AREA = 1e-3  # square metres that are seen: a patch of 3 cm
-PATCH_GAP = 0.02  # metres between the parts of a patch, at most
-PATCH_POINTS = 400  # points of a patch that are looked at
-GROUND_POINTS = 2000  # points of the ground whose outline is taken
-REGION_CELL = 0.02  # metres, side of a cell of a region's ground
-SEEN_OF_REGION = 0.5  # share of these cells that show ground where the ground is seen
+CONSIDERABLE_AREA = 1e-3  # square metres, visible area of a relevant patch, 3 cm wide
+PATCH_GAP = 0.02  # metres, largest gap inside a patch
+PATCH_POINTS = 400  # sampled points of a patch
+GROUND_POINTS = 2000  # sampled points of the ground, for its convex hull
+REGION_CELL = 0.02  # metres, side of a cell of the ground in a region
+SEEN_OF_REGION = 0.5  # least share of cells with visible ground for a visible ground
 
 
 @dataclass(frozen=True, eq=False)
 class UnexplainedPatch:
-    """A part of a picture that is neither ground nor an object.
+    """A part of an image that is neither ground nor an object.
 
     Attributes:
-        points: some of what it shows, (N, 3), world, metres.
-        area: square metres, as the camera sees it.
+        points: sampled points, (N, 3), world, metres.
+        area: visible area, square metres.
     """
 
     points: Float
@@ -48,16 +51,16 @@ def unexplained(
     tracks: Sequence[Track],
     region: Box | None,
 ) -> list[UnexplainedPatch]:
-    """Find the considerable parts of all pictures that are neither ground nor an object.
+    """Find the larger parts of all frames that are neither ground nor an object.
 
-    It does not matter how the objects were found. With a region all that lies in it counts, above
-    and below the ground; without one what stands on the ground that is seen. What lies over an
-    object, and what a later frame sees through, is explained.
+    The test does not depend on how the objects were found. With a region, all points inside count,
+    above and below the ground; without a region, points above the visible ground. Points over an
+    object, and points that a later frame sees through, are explained.
 
     Args:
-        tops: what the frames show.
+        tops: support surfaces of the frames.
         tracks: the objects.
-        region: where is looked; None: everywhere.
+        region: search region; None for everywhere.
     """
     outlines = [Outline.of(track, tops[0].up) for track in tracks]
     found = []
@@ -74,11 +77,11 @@ def unexplained(
 
 
 def ground_seen(tops: Sequence[TableTop], region: Box | None) -> bool:
-    """Whether so much of the ground is seen that nothing else can stand there.
+    """Return True if enough of the ground is visible to rule out further objects.
 
     Args:
-        tops: what the frames show.
-        region: where is looked; None: everywhere.
+        tops: support surfaces of the frames.
+        region: search region; None for everywhere.
     """
     if region is None:
         return any(top.shows_ground for top in tops)
@@ -95,7 +98,7 @@ def ground_seen(tops: Sequence[TableTop], region: Box | None) -> bool:
 
 
 def _near_ground(top: TableTop) -> Mask:
-    """Pixels so near to the ground that they are likely to be its own, (H, W) bool."""
+    """Return the pixels that are close enough to the ground to belong to it, (H, W) bool."""
     depth = top.frame.depth
     near = np.maximum(NEAR_TABLE, LOWEST_SHARE * depth)
     sigma = np.minimum(top.noise.at(depth), NOISIEST_CAMERA) * depth**2
@@ -109,7 +112,7 @@ def _patches(
     tracks: Sequence[Track],
     region: Box | None,
 ) -> list[UnexplainedPatch]:
-    """The considerable parts of one picture that are neither ground nor an object."""
+    """Find the larger parts of one frame that are neither ground nor an object."""
     frame = top.frame
     left = ~_near_ground(top) & (frame.depth > 0)
     if region is not None:
@@ -132,7 +135,7 @@ def _patches(
     away = float(np.median(frame.depth[left]))
     half = max(1, round(float(np.sqrt(focal)) * THINNEST / 2 / away))
     left = ndimage.binary_opening(left, np.ones((3, 3), bool), half)
-    # what lies side by side is one patch: so is a heap of small things
+    # neighbouring parts form one patch, for example a heap of small objects
     beside = round(float(np.sqrt(focal)) * PATCH_GAP / 2 / away)
     label, _ = ndimage.label(ndimage.binary_dilation(left, iterations=max(beside, 1)))
     label[~left] = 0
@@ -153,7 +156,7 @@ def _patches(
 
 
 def _ground_of(top: TableTop) -> Float:
-    """Some points of the ground that a frame shows, (N, 3), world, metres."""
+    """Sample points of the ground in a frame, (N, 3), world, metres."""
     shown = _near_ground(top) & (top.frame.depth > 0) & ~top.other_surfaces
     rows, columns = np.nonzero(shown)
     few = slice(None, None, max(1, len(rows) // GROUND_POINTS))
@@ -161,14 +164,14 @@ def _ground_of(top: TableTop) -> Float:
 
 
 def _on_ground(points: Float, ground: Float) -> Mask:
-    """Which points, (N, 2), lie within the convex hull of what is seen of the ground, (N,) bool.
+    """Return which points, (N, 2), lie within the convex hull of the visible ground, (N,) bool.
 
     Args:
-        points: along the ground.
-        ground: points of it, (M, 2).
+        points: horizontal coordinates.
+        ground: points of the ground, (M, 2).
     """
     try:
         sides = ConvexHull(ground).equations
-    except (QhullError, ValueError):  # only a line is seen of it, or nothing
+    except (QhullError, ValueError):  # too few or collinear points
         return np.ones(len(points), bool)
     return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))

@@ -1,4 +1,4 @@
-"""From a sensor frame to an observation: plane, segmentation, object frame, denoising."""
+"""Turn sensor frames into observations: support plane, segmentation, object frame, denoising."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import ``ObservedObject`` when it is used, because it takes SciPy."""
+    """Import ``ObservedObject`` lazily, because it needs SciPy."""
     if name == "ObservedObject":
         from nextview.sensing.observed_object import ObservedObject
 

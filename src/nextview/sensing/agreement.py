@@ -1,15 +1,15 @@
-"""Whether posed depth frames agree about one rigid scene.
+"""Test whether posed depth frames agree with one rigid scene.
 
-Points on the surfaces of each frame are looked up in the pictures of all others. A point is
-confirmed where another frame measures the same depth, and contradicted where another frame looks
-through it. Points that are hidden, outside of the picture or not measured say nothing.
+Surface points of each frame are projected into all other frames. A point is confirmed if the other
+frame measures the same depth, and contradicted if the other frame measures a greater one. Points
+that are occluded, outside the image or without measured depth do not count.
 
-Every point is judged twice, roughly and sharply: roughly, the errors of a usual calibration are no
-contradiction; sharply, poses differ that are a few degrees apart. The score of frames is the share
-of all these judgements that confirm.
+Every point is tested twice: with a rough tolerance that accepts usual calibration errors, and with
+a sharp tolerance that detects pose errors of a few degrees. The score of the frames is the share of
+all these judgements that are confirmed.
 
-Points that stand out of the largest plane of a frame can be judged on their own: a table looks the
-same after any turn about its normal, so its points agree where the object's do not.
+Points above the largest plane of a frame can be tested separately: a table looks the same after any
+rotation about its normal, so its points agree even if those of the object do not.
 """
 
 from collections.abc import Sequence
@@ -26,27 +26,27 @@ from nextview.sensing.planes import find_plane, sample
 from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
-AGREEMENT_POINTS = 200  # points of each frame that are looked up in the others
-QUICK_POINTS = 500  # the same of a frame that is compared with the last one only
+AGREEMENT_POINTS = 200  # points of each frame that are projected into the others
+QUICK_POINTS = 500  # the same for a frame that is compared only with the last one
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
-# part of the depth by which it may vary around a point that is looked up: no edges
+# largest relative variation of the depth around a projected point, to avoid edges
 SMOOTH_STEP = 0.05
-# height over the largest plane, as a part of the depth, from which a point is not on it
+# relative height above the largest plane from which a point is not on it
 ABOVE_PLANE = 0.012
-# times the depth in the middle of the picture: what lies farther is background
+# multiple of the depth in the centre of the image beyond which points are background
 FAR_BEHIND = 1.5
-SMALLEST_MIDDLE = 20  # grid points in the middle of the picture that tell its depth
-LEAST_DEPTH = 1e-6  # metres before a camera from which a point can be in its picture
+SMALLEST_MIDDLE = 20  # least number of valid grid points in the centre of the image
+LEAST_DEPTH = 1e-6  # metres in front of a camera
 
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How closely two frames have to agree.
+    """Tolerance of the comparison of two frames.
 
     Attributes:
-        columns: of the picture in which points are looked up. A point agrees with any depth in the
-            block that it falls on and in the blocks around that.
-        depth_tolerance: part of the depth by which two frames may differ, beside the noise of both.
+        columns: of the image in which points are looked up. A point agrees with any depth in its
+            block of pixels and in the neighbouring blocks.
+        depth_tolerance: relative difference of depth, in addition to the noise of both frames.
     """
 
     columns: int
@@ -54,13 +54,11 @@ class Sharpness:
 
 
 ROUGH = Sharpness(160, 0.02)
-"""Forgives the errors of a usual calibration, 4 mm and half a degree: what is contradicted is
-wrong altogether.
-"""
+"""Tolerates usual calibration errors, 4 mm and half a degree; contradictions are gross errors."""
 SHARP = Sharpness(320, 0.006)
-"""Tells poses apart that differ by a few degrees.
+"""Separates poses that differ by a few degrees.
 
-Right poses leave contradictions, too, where they are not exact.
+Correct but inexact poses also leave some contradictions.
 """
 
 
@@ -69,13 +67,13 @@ class Picture:
     """The depth image of a frame in blocks of pixels.
 
     Attributes:
-        intrinsics: pinhole matrix, pixels are blocks, (3, 3).
-        nearest: least depth in each block and around it, (h, w), metres; infinite where nothing was
-            measured.
-        farthest: greatest depth in each block and around it, (h, w), metres; 0 where nothing was
-            measured.
-        complete: whether something was measured in each block and in all around it, (h, w).
-        object_near: blocks on the object's mask or beside it, (h, w); None without a mask.
+        intrinsics: pinhole matrix in units of blocks, (3, 3).
+        nearest: least depth in each block and its neighbours, (h, w), metres; infinite without
+            valid depth.
+        farthest: greatest depth in each block and its neighbours, (h, w), metres; 0 without valid
+            depth.
+        complete: whether each block and all of its neighbours have valid depth, (h, w).
+        object_near: blocks on or next to the object's mask, (h, w); None without a mask.
     """
 
     intrinsics: Float
@@ -87,14 +85,13 @@ class Picture:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """A frame as it is compared with others.
+    """A frame prepared for comparison with others.
 
     Attributes:
         pictures: the depth image for each sharpness.
-        points: on the surfaces, (N, 3), camera frame, metres.
-        noise: error of the depth of each point that noise explains, (N,), metres.
-        standing: which points stand out of the largest plane, (N,); all of them if there is a mask
-            or no plane.
+        points: surface points, (N, 3), camera frame, metres.
+        noise: depth error of each point due to noise, (N,), metres.
+        standing: points above the largest plane, (N,); all of them with a mask or without a plane.
     """
 
     pictures: dict[Sharpness, Picture]
@@ -103,11 +100,11 @@ class SurfaceView:
     standing: Mask
 
     def tolerance(self, sharpness: Sharpness) -> Float:
-        """Difference in depth up to which another frame confirms each point, (N,), metres."""
+        """Largest depth difference with which another frame confirms each point, (N,), metres."""
         return sharpness.depth_tolerance * self.points[:, 2] + self.noise
 
     def some(self, which: Mask) -> "SurfaceView":
-        """The frame with some of its points, (N,) bool."""
+        """Return the frame with a subset of its points, (N,) bool."""
         return replace(
             self,
             points=self.points[which],
@@ -116,7 +113,7 @@ class SurfaceView:
         )
 
     def with_focal_length(self, times: float) -> "SurfaceView":
-        """The frame as it would be if its focal lengths were so many times as long."""
+        """Return the frame with its focal lengths multiplied by a factor."""
         pictures = {}
         for sharpness, picture in self.pictures.items():
             intrinsics = picture.intrinsics.copy()
@@ -127,7 +124,7 @@ class SurfaceView:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How often points of a frame (row) are confirmed or contradicted by another (column).
+    """Number of points of a frame (row) that another frame (column) confirms or contradicts.
 
     Attributes:
         confirmed: number of judgements, (N, N).
@@ -139,30 +136,30 @@ class Agreement:
 
     @property
     def judged(self) -> float:
-        """How many judgements there are in all."""
+        """Total number of judgements."""
         return float(self.confirmed.sum() + self.contradicted.sum())
 
     @property
     def share(self) -> float:
-        """Share of the judgements that confirm; 1 if there are none."""
+        """Confirmed share of the judgements; 1 if there are none."""
         return 1.0 if self.judged == 0 else float(self.confirmed.sum()) / self.judged
 
     def among(self, pairs: Mask) -> "Agreement":
-        """That of some pairs of frames, (N, N)."""
+        """Return the agreement of some pairs of frames, (N, N)."""
         return Agreement(
             np.where(pairs, self.confirmed, 0),
             np.where(pairs, self.contradicted, 0),
         )
 
     def of_frames(self, which: Index | Mask) -> "Agreement":
-        """That of some frames with each other."""
+        """Return the agreement among some frames."""
         return Agreement(
             self.confirmed[which][:, which],
             self.contradicted[which][:, which],
         )
 
     def of_each(self) -> tuple[Float, Float]:
-        """Confirmed share and number of judgements of each frame, both ways, (N,) each."""
+        """Return confirmed share and number of judgements of each frame, both ways, (N,) each."""
         confirmed = self.confirmed.sum(0) + self.confirmed.sum(1)
         judged = confirmed + self.contradicted.sum(0) + self.contradicted.sum(1)
         share = np.where(judged > 0, confirmed / np.maximum(judged, 1), 1.0)
@@ -172,12 +169,12 @@ class Agreement:
 def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
     """Prepare a frame for comparison.
 
-    Points are taken from the object's mask. Without one they are taken from the middle of the
-    picture: one half from the largest plane, the other half from what stands out of it.
+    Points are taken from the object's mask. Without a mask they are taken from the centre of the
+    image: one half from the largest plane, the other half from points above it.
 
     Args:
         frame: its pose is not used.
-        rng: draws the points.
+        rng: for drawing the points.
     """
     noise = noise_of(frame)
     points = _surface_points(frame)
@@ -196,13 +193,13 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
 
 
 def quick_view(frame: Frame) -> SurfaceView:
-    """Prepare a frame for a comparison that has to be quick, by a small picture of it.
+    """Prepare a frame for a fast comparison, at low resolution.
 
     Args:
-        frame: its pose is not used; its mask neither, as all that it shows is compared.
+        frame: its pose is not used, nor is its mask, as the whole image is compared.
     """
     side = max(1, frame.shape[1] // ROUGH.columns)
-    # The pixels that are kept lie in the corners of squares that become one pixel.
+    # Each square becomes one pixel with the depth of its corner.
     intrinsics = frame.intrinsics.copy()
     intrinsics[:2, 2] -= 0.5
     intrinsics[:2] /= side
@@ -225,13 +222,13 @@ def compare(
     poses: Float,
     looked_up_with: Float | None = None,
 ) -> Agreement:
-    """Look up the points of every frame in all others, roughly and sharply.
+    """Project the points of every frame into all others, with both tolerances.
 
     Args:
         views: N frames.
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
-        looked_up_with: poses of the cameras in whose pictures the points are looked up, (N, 4, 4);
-            by default the same.
+        looked_up_with: poses of the cameras into which the points are projected, (N, 4, 4); by
+            default the same.
     """
     count = len(views)
     owner = np.repeat(np.arange(count), [len(view.points) for view in views])
@@ -274,7 +271,7 @@ def _looked_up(
     points: Float,
     tolerance: Float,
 ) -> tuple[Index, Mask, Mask]:
-    """Return which points, (P, 3), lie in a picture, and are confirmed or contradicted."""
+    """Return which points, (P, 3), are inside an image, and confirmed or contradicted by it."""
     height, width = picture.nearest.shape
     ahead = points[:, 2] > LEAST_DEPTH
     z = np.where(ahead, points[:, 2], 1.0)
@@ -282,7 +279,7 @@ def _looked_up(
     at = camera.project(np.column_stack([points[:, :2], z]))
     column, row = np.floor(np.clip(at, -1, (width, height))).astype(np.int64).T
 
-    # At the border a small error of the pose leads out of the picture.
+    # A small pose error moves points near the border out of the image.
     inside = (
         ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
     )
@@ -299,15 +296,14 @@ def _looked_up(
     if picture.object_near is not None:
         on_object = picture.object_near[row, column]
         hidden = nearest < z - limit
-        # Where nothing nearer hides it, a point of the object has to be in the mask, measured or
-        # not.
+        # Unless it is occluded, a point of the object must be inside the mask, even without depth.
         looks_through = np.where(on_object, looks_through, ~hidden)
         agrees &= on_object
     return which, agrees, looks_through
 
 
 def _picture(frame: Frame, columns: int) -> Picture:
-    """The depth image of a frame in blocks of pixels, about so many across."""
+    """Return the depth image of a frame in blocks of pixels, with about this many columns."""
     side = max(1, frame.shape[1] // columns)
     measured = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     block_nearest = _blockwise(measured, side, np.minimum)
@@ -331,7 +327,7 @@ def _picture(frame: Frame, columns: int) -> Picture:
 
 
 def _surface_points(frame: Frame) -> Float:
-    """Return a grid of points on the object, or on smooth surfaces in the middle, (N, 3)."""
+    """Return a grid of points on the object, or on smooth surfaces in the centre, (N, 3)."""
     side = max(1, frame.shape[1] // POINT_GRID)
     first = side // 2
     grid = frame.depth[first::side, first::side]
@@ -345,7 +341,7 @@ def _surface_points(frame: Frame) -> Float:
 
 
 def _is_smooth(grid: Float32) -> Mask:
-    """Where the depth, (h, w), varies little from one grid point to all around it."""
+    """Return where the depth, (h, w), varies little between neighbouring grid points."""
     measured = np.where(grid > 0, grid, np.float32(np.inf))
     nearest = ndimage.minimum_filter(measured, 3, mode="nearest")
     farthest = ndimage.maximum_filter(grid, 3, mode="nearest")
@@ -369,7 +365,7 @@ def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
 
 
 def _in_the_middle(grid: Float32) -> Mask:
-    """Return the middle of a picture, (h, w), without what lies far behind it."""
+    """Return the centre of a depth image, (h, w), without the far background."""
     height, width = grid.shape
     middle = grid[height // 3 : height - height // 3, width // 3 : width - width // 3]
     measured = middle[middle > 0]
@@ -386,8 +382,8 @@ def _half_off_the_plane(
     noise: Noise,
     rng: np.random.Generator,
 ) -> tuple[Float, Mask]:
-    """Return some points, half of them out of the largest plane if possible."""
-    # The plane is searched in the camera's frame: the pose may be wrong.
+    """Draw points, half of them above the largest plane if possible."""
+    # The plane is searched in the camera frame, because the pose may be wrong.
     unposed = Frame(frame.depth, frame.intrinsics, pixel_centre=0.5)
     plane = find_plane(sample(unposed, unposed.depth > 0, noise), rng)
     if plane is None or not len(points):
@@ -406,7 +402,7 @@ def _half_off_the_plane(
 
 
 def _some(points: Float, most: int, rng: np.random.Generator) -> Float:
-    """At most so many of the points, drawn at random."""
+    """Draw at most this many of the points at random."""
     if len(points) <= most:
         return points
     return points[rng.permutation(len(points))[:most]]

@@ -1,4 +1,4 @@
-"""Which instance of a frame is the object that is looked at."""
+"""Select the instance of a frame that is the object."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Index, Mask
 
 Parting = Literal["instance", "touching", "piece"]
-"""What of the segmentation is one object: an instance; an instance with all that touches it; or a
-piece of one."""
+"""Part of the segmentation that is one object: an instance, an instance with everything that
+touches it, or a piece of an instance."""
 
-# of a thing that stands alone: what touches it belongs to it
+# for an object that stands alone, so that everything that touches it belongs to it
 ALONE: Parting = "touching"
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
 )
-NEAREST_POINT = 0.01  # metres between the camera and a point on an object, at least
-POINTS_COMPARED = 1000  # of an instance with the point that chooses one
-# picture widths from the optical axis at which an instance counts for 1 / e of its pixels
+NEAREST_POINT = (
+    0.01  # metres, least distance between the camera and a point on an object
+)
+POINTS_COMPARED = 1000  # sampled points of an instance
+# image widths from the optical axis at which pixels have the weight 1 / e
 AIM_SPREAD = 0.08
 
 
@@ -39,20 +41,20 @@ def choose_instance(
     parting: Parting = "instance",
     pieces: Index | None = None,
 ) -> Mask:
-    """Choose the instance that an object is in a frame.
+    """Select the instance of a frame that is the object.
 
-    It is the one where the object was found so far; in a first frame the one nearest to a point,
-    or the one at which the camera is aimed.
+    It is the one at the known place of the object; in a first frame, the one nearest to a point, or
+    the one at which the camera is aimed.
 
     Args:
-        supports: the instances of the frame, and what carries them.
-        point: on the object, (3,), world, metres; None if it was not given.
-        known: where the object is by earlier frames; None in a first one.
-        parting: what of the segmentation is one object.
-        pieces: of the segmentation, (H, W) int, 0 for none; None where it tells none.
+        supports: instances and support surfaces of the frame.
+        point: on the object, (3,), world, metres; None if not given.
+        known: object frame from earlier frames; None in a first frame.
+        parting: part of the segmentation that is one object.
+        pieces: of the segmentation, (H, W) int, 0 for none; None if there are none.
 
     Returns:
-        Its pixels, (H, W) bool.
+        Its mask, (H, W) bool.
 
     Raises:
         ObservationError: there is no such instance.
@@ -70,7 +72,7 @@ def choose_instance(
 
 
 def _chosen(supports: Supports, point: Float | None, known: ObjectFrame | None) -> Mask:
-    """The instance where the object was found, at its point, or before the camera."""
+    """Return the instance at the known place, at the point, or on the optical axis."""
     if known is not None:
         return _seen_before(supports, known)
     if point is not None:
@@ -79,7 +81,7 @@ def _chosen(supports: Supports, point: Float | None, known: ObjectFrame | None) 
 
 
 def _with_neighbours(chosen: Mask, supports: Supports) -> Mask:
-    """An instance with all that touches it, directly or through others, (H, W) bool."""
+    """Return an instance with everything that touches it, directly or indirectly, (H, W) bool."""
     found = chosen
     left = [mask for mask in supports.masks if not (mask & chosen).any()]
     while True:
@@ -94,7 +96,7 @@ def _with_neighbours(chosen: Mask, supports: Supports) -> Mask:
 
 
 def _at_point(supports: Supports, point: Float) -> Mask:
-    """The instance nearest to a point, (3,), world, metres, on its surface or inside of it."""
+    """Return the instance nearest to a point, (3,), world, metres, on its surface or inside it."""
     frame = supports.frame
     away = float(np.linalg.norm(point - frame.camera_to_world[:3, 3]))
     if away < NEAREST_POINT:
@@ -109,7 +111,10 @@ def _at_point(supports: Supports, point: Float) -> Mask:
 
 
 def _distance(mask: Mask, frame: Frame, point: Float) -> float:
-    """Metres from a point to an instance; 0 behind its surface, no deeper than it is wide."""
+    """Return the distance from a point to an instance, metres.
+
+    It is 0 behind the visible surface, down to a depth equal to the width of the instance.
+    """
     rows, columns = np.nonzero(mask & (frame.depth > 0))
     few = slice(None, None, max(1, len(rows) // POINTS_COMPARED))
     points = frame.positions(rows[few], columns[few])
@@ -131,7 +136,7 @@ def _distance(mask: Mask, frame: Frame, point: Float) -> float:
 
 
 def _seen_before(supports: Supports, known: ObjectFrame) -> Mask:
-    """The instance that fills most of where the object was found, and is not much elsewhere."""
+    """Return the instance that fills most of the known place and is mostly inside it."""
     frame = supports.frame
     inside = inside_sphere(frame, known.centre, SPHERE_MARGIN * known.radius)
     shown = _of_size(supports)
@@ -142,15 +147,15 @@ def _seen_before(supports: Supports, known: ObjectFrame) -> Mask:
 
 
 def _overlap(mask: Mask, inside: Mask) -> float:
-    """Pixels of an instance in a place, times the share of its pixels that these are."""
+    """Return the pixels of an instance inside a region, weighted by their share of the instance."""
     there = int(np.count_nonzero(mask & inside))
     return there**2 / max(int(np.count_nonzero(mask)), 1)
 
 
 def _aimed_at(supports: Supports) -> Mask:
-    """The largest instance near the optical axis; of those that a surface carries, if there are.
+    """Return the largest instance near the optical axis, preferably on a support surface.
 
-    Its pixels count the less, the farther it lies from the axis.
+    Pixels are weighted by their distance from the axis.
     """
     shown = _of_size(supports)
     pairs = zip(supports.masks, supports.carriers, strict=True)
@@ -162,7 +167,7 @@ def _aimed_at(supports: Supports) -> Mask:
 
 
 def _weight(mask: Mask, frame: Frame) -> float:
-    """Pixels of an instance, less the farther it lies from the optical axis."""
+    """Return the number of pixels of an instance, weighted by distance from the optical axis."""
     rows, columns = np.nonzero(mask)
     column, row = frame.intrinsics[:2, 2]
     away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]
@@ -170,7 +175,7 @@ def _weight(mask: Mask, frame: Frame) -> float:
 
 
 def _of_size(supports: Supports) -> list[Mask]:
-    """The instances that show in enough pixels."""
+    """Return the instances with enough pixels."""
     measured = supports.frame.depth > 0
     return [
         mask

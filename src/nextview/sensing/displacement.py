@@ -1,11 +1,11 @@
-"""By how much a frame shows an object beside the place where earlier frames show it.
+"""Measure the displacement of an object in a frame relative to earlier frames.
 
-A camera on an arm does not stand exactly where it is said to: the hand-eye calibration, the joints
-and the time stamp err, and the object may have been nudged. The surfaces of both frames are drawn
-together along their normals (point to plane, Chen and Medioni, "Object modelling by registration
-of multiple range images", 1992), and into each other's outlines, by robust Gauss-Newton steps. An
-error of the camera's direction turns the object, too, but so little against its size that the
-shift is all that is searched for.
+The pose of a camera on an arm has errors: hand-eye calibration, joint angles and time stamps are
+inexact, and the object may have been pushed. The surfaces of both frames are aligned along their
+normals (point to plane, Chen and Medioni, "Object modelling by registration of multiple range
+images", 1992) and by their outlines, with robust Gauss-Newton steps. An error of the camera's
+orientation also rotates the object, but so little for its size that only a translation is
+estimated.
 """
 
 from __future__ import annotations
@@ -24,51 +24,57 @@ if TYPE_CHECKING:
     from nextview.sensing.sighting import Sighting
 
 
-CAMERA_PLACE = 0.003  # metres, standard deviation of a camera's place
-CAMERA_AIM = 0.006  # radians, standard deviation of the direction in which it looks
-FARTHEST_SHIFT = 5.0  # standard deviations from which it is no error of an arm
-DISPLACEMENT_POINTS = 200  # of a surface that are looked up in another frame
-FACETS = 3000  # of a surface in which points are looked up
-COMPARED_FRAMES = 2  # earlier frames, those from the nearest directions
-ALIKE = 60.0  # so many points are as good as all that are looked up: neighbours err together
-RELATIVE_DEPTH_ERROR = 0.003  # of a depth, as a part of it, beside the noise
-PLANE_ERROR = 0.002  # of the height of a support plane, as a part of the distance
-OUTLINE_PITCHES = 1.5  # distances of facets that an outline is blurred by
-NOT_HIDDEN = 0.02  # part of the depth by which a frame has to look past a point
-SAME_SIDE = 0.8  # cosine of the angle between the normals of one surface in two frames
+CAMERA_PLACE = 0.003  # metres, standard deviation of the camera position
+CAMERA_AIM = 0.006  # radians, standard deviation of the viewing direction
+FARTHEST_SHIFT = (
+    5.0  # standard deviations beyond which a shift is not a calibration error
+)
+DISPLACEMENT_POINTS = 200  # points of a surface that are compared with another frame
+FACETS = 3000  # of a surface to which points are compared
+COMPARED_FRAMES = 2  # earlier frames with the most similar viewing directions
+ALIKE = 60.0  # effective number of independent points, as neighbouring errors are correlated
+RELATIVE_DEPTH_ERROR = 0.003  # relative error of the depth, in addition to the noise
+PLANE_ERROR = 0.002  # error of the height of a support plane, relative to the distance
+OUTLINE_PITCHES = 1.5  # uncertainty of an outline, in spacings of the facets
+NOT_HIDDEN = (
+    0.02  # least relative depth of the background behind a point that is seen past
+)
+SAME_SIDE = (
+    0.8  # cosine of the largest angle between normals of one surface in two frames
+)
 REACHES = (4.0, 2.5, 1.5, 1.0, 1.0)
-"""Standard deviations of a point at which a pull counts half, in each step."""
+"""Standard deviations at which a residual has half its weight, in each step."""
 FURTHER = (1.0, 0.6, 0.3, 0.0, 0.0)
-"""Parts of the shift to be expected by which points may still be off, in each step."""
+"""Additional tolerance of the points in each step, as a share of the expected shift."""
 WORST_FIT = np.log(2)
-"""Mean of log(1 + squared deviation) that surfaces may have after the last step: one standard
-deviation. Nothing fits what has moved far."""
-FEWEST_PULLS = 20  # from which a shift is told
+"""Largest mean of log(1 + squared deviation) after the last step: one standard deviation. Surfaces
+that have moved far do not fit."""
+FEWEST_PULLS = 20  # least number of residuals
 DEPTH_ERROR = 0.01
-"""Metres at a distance of 1 m, standard deviation of a shift by errors that a depth camera has in
-common for all pixels; they grow with the square of the distance. Of a real Kinect whose poses are
-exact a twentieth of the shifts is larger than twice that.
+"""Metres at a distance of 1 m, standard deviation of a shift due to depth errors common to all
+pixels; it grows with the square of the distance. For a real Kinect with exact poses one shift in
+twenty is larger than twice this value.
 """
-# standard deviations that noise does not explain, from which a shift is allowed for
+# a shift is corrected if it exceeds the noise by so many standard deviations
 MENDED_DEVIATIONS = 3.0
-# parts of the distance from the camera: smaller shifts are left as they are
+# relative to the distance from the camera: smaller shifts are not corrected
 LEAST_MENDED = 0.006
-NOT_WORTH = 0.3  # parts of the least shift that is mended
-# standard deviations that noise and depth errors do not explain
+NOT_WORTH = 0.3  # as a share of the smallest shift that is corrected
+# a shift is reported if it exceeds noise and depth errors by so many standard deviations
 DISPLACEMENT_NOTICED = 2.5
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Where a frame shows an object against earlier frames.
+    """Displacement of an object in a frame relative to earlier frames.
 
     Attributes:
-        shift: of what it shows, (3,), world, metres.
-        further: the same against the last of the earlier frames, by the poses that both were
-            handed in with, (3,), metres.
+        shift: of the visible surface, (3,), world, metres.
+        further: shift relative to the last of the earlier frames, with the original poses of both,
+            (3,), metres.
         covariance: of the shift, (3, 3), square metres.
         distance: of the object from the camera, metres.
-        lasting: whether it is there where the last of the earlier frames showed it displaced.
+        lasting: whether the object is where the last of the earlier frames showed it displaced.
     """
 
     shift: Float
@@ -79,12 +85,12 @@ class Displacement:
 
     @property
     def length(self) -> float:
-        """Of ``further``, metres."""
+        """Length of ``further``, metres."""
         return float(np.linalg.norm(self.further))
 
     @property
     def mended(self) -> bool:
-        """Whether it is more than the noise of the frames explains, and is to be allowed for."""
+        """True if the shift exceeds the noise of the frames and is to be corrected."""
         large = float(np.linalg.norm(self.shift)) > LEAST_MENDED * self.distance
         return large and (
             self.lasting or _deviations(self.shift, self.covariance) > MENDED_DEVIATIONS
@@ -92,7 +98,7 @@ class Displacement:
 
     @property
     def noticed(self) -> bool:
-        """Whether ``further`` is more than noise and the errors of depth cameras explain."""
+        """True if ``further`` exceeds noise and depth errors, and is to be reported."""
         common = (DEPTH_ERROR * self.distance**2) ** 2 * np.eye(3)
         return (
             self.mended
@@ -102,13 +108,13 @@ class Displacement:
 
 
 def _deviations(shift: Float, covariance: Float) -> float:
-    """How many standard deviations a shift is long."""
+    """Return the length of a shift in standard deviations."""
     return float(np.sqrt(shift @ np.linalg.solve(covariance, shift)))
 
 
 @dataclass(frozen=True)
 class _ShiftEquations:
-    """Equations ``directions @ shift = distances`` of some points, with standard deviations.
+    """Linear equations ``directions @ shift = distances`` with standard deviations.
 
     ``directions`` is (N, 3), the others (N,); metres.
     """
@@ -119,15 +125,15 @@ class _ShiftEquations:
 
 
 def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement | None:
-    """By how much a frame shows an object displaced against earlier frames.
+    """Estimate the displacement of an object relative to earlier frames.
 
     Args:
-        latest: what the frame shows of the object.
-        earlier: what those before show of it, in order, one at least. The search begins at 0, and
-            where the last of them shows the object: what was nudged stays where it is.
+        latest: sighting in the new frame.
+        earlier: sightings in earlier frames, in order, at least one. The search starts at 0 and at
+            the displacement of the last of them, since a pushed object stays displaced.
 
     Returns:
-        The shift; None where too little of the object is seen in both, or it is no small one.
+        The displacement; None if the common surface is too small or the displacement too large.
     """
     there = [sighting for sighting in earlier if len(sighting.facets.planes)]
     if not there or not len(latest.facets.planes):
@@ -159,7 +165,7 @@ def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement 
 
 @dataclass(frozen=True)
 class _Surface:
-    """The facets of a sighting in the world, and where they are in its picture."""
+    """The facets of a sighting in the world frame, with their pixels."""
 
     sighting: Sighting
     facets: Facets
@@ -203,20 +209,20 @@ class _Surface:
 
     @property
     def distance(self) -> float:
-        """From the camera, metres."""
+        """Distance from the camera, metres."""
         camera = self.sighting.frame.camera_to_world[:3, 3]
         return float(np.linalg.norm(np.median(self.points, 0) - camera))
 
     def pulls(self, other: _Surface, shift: Float, reach: float) -> _ShiftEquations:
-        """Return how the points of another surface, moved by a shift, disagree with this one.
+        """Return the residuals between this surface and the shifted points of another surface.
 
         Args:
             other: the other surface.
             shift: of the other surface, world, (3,), metres.
-            reach: distance beyond which points do not count, metres.
+            reach: distance beyond which points are ignored, metres.
 
         Returns:
-            The deviations.
+            The equations for the shift.
         """
         pose = self.sighting.frame.camera_to_world
         points = other.points[other.sample] + shift
@@ -244,7 +250,10 @@ class _Surface:
         )
 
     def _looks_past(self, rays: Float, z: Float) -> Mask:
-        """Where the frame measured something behind points with these rays, (N, 2), and depths."""
+        """Return where the frame measures something behind points.
+
+        The points are given by their rays, (N, 2), and depths.
+        """
         frame = self.sighting.frame
         at = frame.camera.project(np.column_stack([rays, np.ones(len(rays))]))
         column, row = np.floor(at).astype(int).T
@@ -256,7 +265,7 @@ class _Surface:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A shift, (3,), metres, its covariance, (3, 3), and how badly the surfaces then fit."""
+    """An estimated shift, (3,), metres, its covariance, (3, 3), and its residual."""
 
     shift: Float
     covariance: Float
@@ -268,7 +277,10 @@ def _searched(
     earlier: Sequence[_Surface],
     start: Float,
 ) -> _Fit | None:
-    """The best shift near one; None where too little tells, it leads far away, or nothing fits."""
+    """Optimise a shift from a start value.
+
+    Returns None if there are too few residuals, the shift is too large, or the surfaces do not fit.
+    """
     expected = float(np.hypot(CAMERA_PLACE, CAMERA_AIM * latest.distance))
     looked_up = sum(len(one.sample) + len(latest.sample) for one in earlier)
     moved = -start
@@ -296,7 +308,7 @@ def _searched(
             part == FURTHER[1]
             and np.linalg.norm(moved) < NOT_WORTH * LEAST_MENDED * latest.distance
         ):
-            break  # two steps lead nowhere: further ones would find no shift that is mended
+            break  # after two small steps no shift that is corrected would be found
         cost = float(np.log1p((distances / deviations) ** 2).mean())
     shift = -moved
     if np.linalg.norm(shift - start) > FARTHEST_SHIFT * expected or cost > WORST_FIT:
@@ -305,7 +317,7 @@ def _searched(
 
 
 def _reversed(pulls: _ShiftEquations) -> _ShiftEquations:
-    """The same pulls on the other surface."""
+    """Return the same residuals for the shift of the other surface."""
     return _ShiftEquations(-pulls.directions, pulls.distances, pulls.deviations)
 
 
@@ -314,7 +326,7 @@ def _heights(
     earlier: Sequence[_Surface],
     moved: Float,
 ) -> _ShiftEquations:
-    """How far the support plane of a frame, moved so, is below those of earlier ones."""
+    """Return the height differences of the shifted support plane to those of earlier frames."""
     plane = latest.sighting.plane
     here = latest.points.mean(0)
     others = [one.sighting.plane for one in earlier if one.sighting.plane is not None]

@@ -1,4 +1,4 @@
-"""Voxels around an object by depth frames, and its expected visibility from elsewhere."""
+"""Occupancy grid around an object from depth frames, and its expected visibility."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# of a voxel; of several frames the largest counts
+# states of a voxel; the maximum over all frames counts
 UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 
 
@@ -45,7 +45,7 @@ class VoxelGrid:
 
     @cached_property
     def axes(self) -> Float32:
-        """Where the middles of the voxels lie along x, y and z, (3, n)."""
+        """Coordinates of the voxel centres along x, y and z, (3, n)."""
         steps = (np.arange(self.n) + 0.5) * self.pitch - self.half
         return (np.array(self.centre)[:, None] + steps).astype(np.float32)
 
@@ -55,7 +55,7 @@ class VoxelGrid:
         return np.stack(np.meshgrid(*self.axes, indexing="ij")).reshape(3, -1)
 
     def within(self, radius: float) -> Mask:
-        """Voxels whose middle is no farther than this from that of the cube, (n, n, n) bool."""
+        """Return the voxels within a radius of the grid's centre, (n, n, n) bool."""
         x, y, z = (
             (axis - middle) ** 2
             for axis, middle in zip(self.axes, self.centre, strict=True)
@@ -63,7 +63,7 @@ class VoxelGrid:
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: Floats) -> tuple[Index, Mask]:
-        """Return the index of the voxel of each point, (P, 3), and whether there is one."""
+        """Return the voxel index of each point, (P, 3), and whether it is inside the grid."""
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(
             np.int64
         )
@@ -74,10 +74,10 @@ class VoxelGrid:
 
 @dataclass(frozen=True)
 class Occupancy:
-    """What is known of each voxel of a grid. Immutable: ``seen`` returns a new one.
+    """State of each voxel of a grid. Immutable: ``seen`` returns a new one.
 
-    An occupied voxel stays occupied: a leg is thinner than a voxel, so the middle of its voxel may
-    be seen to be free.
+    An occupied voxel stays occupied: a chair leg is thinner than a voxel, so the centre of its
+    voxel may be observed as free.
 
     Attributes:
         grid: the voxels.
@@ -93,7 +93,7 @@ class Occupancy:
 
         Args:
             grid: the voxels.
-            region: voxels that are unknown, (n, n, n) bool; all others are free. None for all.
+            region: unknown voxels, (n, n, n) bool; all others are free. None for all.
 
         Returns:
             The occupancy.
@@ -115,16 +115,16 @@ class Occupancy:
     ) -> "Occupancy":
         """Return the occupancy after one more depth frame.
 
-        Voxels that contain points of the frame are occupied. Voxels are free if their middle lies
-        in front of what their pixel shows. So pixels must be finer than voxels, or surfaces get
+        Voxels that contain points of the frame are occupied. Voxels are free if their centre is in
+        front of the depth of its pixel. Pixels must therefore be finer than voxels, or surfaces get
         holes.
 
         Args:
-            depth: (H, W), in the unit of the grid; 0 where nothing was measured.
+            depth: (H, W), in the unit of the grid; 0 without valid depth.
             pose: camera-to-world, (4, 4), in the frame of the grid.
             intrinsics: pinhole matrix, (3, 3), pixels.
-            object_mask: pixels of the object, (H, W) bool; None if all are.
-            background_free: whether nothing is there where nothing was measured, as in renders.
+            object_mask: pixels of the object, (H, W) bool; None for all.
+            background_free: whether pixels without depth show free space, as in renders.
 
         Returns:
             The occupancy.
@@ -132,7 +132,7 @@ class Occupancy:
         depth = np.asarray(depth).astype(np.float32, copy=False)
         grid = self.grid
         cells = self.cells.copy().reshape(-1)
-        # what was free before is so without being looked at again
+        # free voxels stay free and need no test
         unseen = np.flatnonzero(cells == UNSEEN)
         reach = np.where(
             depth > 0,
@@ -164,7 +164,7 @@ class Occupancy:
         return Occupancy(grid, cells.reshape(self.cells.shape))
 
     def and_also(self, other: "Occupancy") -> "Occupancy":
-        """What both say together, of one grid."""
+        """Combine two occupancies of the same grid."""
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
 
 
@@ -174,7 +174,7 @@ def _in_front(
     pose: Floats,
     intrinsics: Floats,
 ) -> Mask:
-    """Which points, (3, P), fall on a pixel and are nearer than its reach, (H, W)."""
+    """Return which points, (3, P), project to a pixel and are in front of its depth, (H, W)."""
     height, width = reach.shape
     to_image = (intrinsics @ pose[:3, :3].T).astype(np.float32)
     x, y, z = to_image @ points - (to_image @ pose[:3, 3].astype(np.float32))[:, None]
@@ -189,28 +189,28 @@ def _in_front(
     return inside & (z < reach.reshape(-1).take(pixel))
 
 
-# around the object, in object radii: what stands beside it has a place there
+# around the object, in object radii, with room for its neighbours
 VISIBILITY_GRID = VoxelGrid(64, 2.0)
-BLOCK = 4  # voxels along the side of the blocks that stand for parts of the object
+BLOCK = 4  # voxels along the side of the blocks that represent parts of the object
 UNSEEN_PART = 0.01
-"""Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before
-anything of the object was seen they are all there is."""
-# how often unseen space is filled, per object radius: between the two bounds
+"""Weight of an unseen voxel in the object's unit ball, where an object voxel has weight 1. Before
+the object is visible, only unseen voxels contribute."""
+# density of occluders in unseen space, per object radius
 DENSITY = 0.2
-SOLID = 1e3  # a density, per voxel, through which nothing is seen
-LINES_TOGETHER = 400  # lines that are drawn at once
-# share of a frame's points that may lie below the height of the table: noise
+SOLID = 1e3  # density of an opaque voxel
+LINES_TOGETHER = 400  # lines of sight that are processed at once
+# largest share of a frame's points below the table, due to noise
 LOW_POINTS = 0.02
 
 
 @dataclass(frozen=True)
 class SeenScene:
-    """The space around a target after some frames, in the object frame and object radii.
+    """Occupancy around a target after some frames, in the object frame and object radii.
 
-    The table and other things are occluders.
+    The table and other objects are occluders.
 
     Attributes:
-        occupancy: what is known of the space.
+        occupancy: state of each voxel.
         floor: height below which nothing belongs to the target; infinity at first.
 
     >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
@@ -222,12 +222,12 @@ class SeenScene:
 
     @classmethod
     def unseen(cls, grid: VoxelGrid = VISIBILITY_GRID) -> Self:
-        """Before the first frame."""
+        """Return the scene before the first frame."""
         return cls(Occupancy.unseen(grid))
 
     @classmethod
     def of(cls, views: Iterable[SceneView], grid: VoxelGrid = VISIBILITY_GRID) -> Self:
-        """Return what some frames show of a scene.
+        """Combine some frames of a scene.
 
         Args:
             views: the frames.
@@ -239,7 +239,7 @@ class SeenScene:
         return reduce(cls.seen, views, cls.unseen(grid))
 
     def seen(self, view: SceneView) -> Self:
-        """With what one more frame says."""
+        """Return the scene after one more frame."""
         occupancy = self.occupancy.seen(
             view.depth,
             view.pose,
@@ -265,7 +265,7 @@ class SeenScene:
         )
 
     def and_also(self, other: "SeenScene") -> Self:
-        """As if all frames of both had been seen, of one grid."""
+        """Combine two scenes on the same grid."""
         return type(self)(
             self.occupancy.and_also(other.occupancy),
             min(self.floor, other.floor),
@@ -274,12 +274,12 @@ class SeenScene:
 
 @dataclass(frozen=True)
 class Visibility:
-    """Visible share of an object from V positions, (V,) float64, by what unseen space is.
+    """Visible share of an object from V positions, (V,) float64, under three assumptions.
 
     Attributes:
-        least: all of it solid.
-        expected: as often filled as on the average.
-        most: all of it free.
+        least: all unseen space is solid.
+        expected: unseen space is filled at the average density.
+        most: all unseen space is free.
     """
 
     least: Float
@@ -295,18 +295,18 @@ def expected_visibility(
 ) -> Visibility:
     """Return the expected visible share of the object from each position.
 
-    The object is what was seen of it, and the unseen voxels of its unit ball above the table, with
-    a lower weight. It does not hide itself. Unseen space elsewhere lets a line of sight of length s
-    pass with probability exp(-density * s).
+    The object consists of its observed voxels and, with a lower weight, the unseen voxels of its
+    unit ball above the table. It does not occlude itself. Elsewhere, a line of sight passes through
+    a length s of unseen space with probability exp(-density * s).
 
     Args:
         seen: the scene so far.
         positions: of the cameras, (V, 3), object frame, object radii.
-        density: of things in unseen space, per object radius.
-        unseen_part: weight of unseen voxels that may be the object's.
+        density: of occluders in unseen space, per object radius.
+        unseen_part: weight of unseen voxels that may belong to the object.
 
     Returns:
-        Shares of the object whose line of sight is clear of other things.
+        Shares of the object with a free line of sight.
     """
     lines = sight_lines(
         seen.occupancy.grid,
@@ -317,21 +317,21 @@ def expected_visibility(
 
 @lru_cache(maxsize=64)
 def sight_lines(grid: VoxelGrid, positions: bytes) -> "SightLines":
-    """Return sight lines, which are kept because the same ones are needed again and again.
+    """Return lines of sight, cached because they are used repeatedly.
 
     Args:
         grid: the voxels.
         positions: bytes of the camera positions, (V, 3) float64.
 
     Returns:
-        The sight lines.
+        The lines of sight.
     """
     return SightLines(grid, np.frombuffer(positions).reshape(-1, 3))
 
 
 @dataclass(frozen=True)
 class SightLines:
-    """The voxels between the parts of an object and the cameras; computed once.
+    """The voxels between the parts of an object and the cameras, computed once.
 
     Attributes:
         grid: the voxels.
@@ -343,12 +343,12 @@ class SightLines:
 
     @cached_property
     def own(self) -> Mask:
-        """Voxels where the object can be, (n, n, n)."""
+        """Voxels that may belong to the object, (n, n, n)."""
         return self.grid.within(1.0)
 
     @cached_property
     def blocks(self) -> Index:
-        """The block of each of these (Q,), as an index of all blocks."""
+        """Block index of each of these voxels, (Q,)."""
         m = self.grid.n // BLOCK
         return np.ravel_multi_index(
             tuple(np.stack(self.own.nonzero()) // BLOCK),
@@ -357,15 +357,15 @@ class SightLines:
 
     @cached_property
     def parts(self) -> Index:
-        """The blocks that the object can have a part in, (P,)."""
+        """Blocks that may contain a part of the object, (P,)."""
         return np.unique(self.blocks)
 
     @cached_property
     def passed(self) -> "csr_array":
-        """How often the line from each part to each camera is in each voxel, (P * V, n^3)."""
+        """Unit steps of the line from each part to each camera in each voxel, (P * V, n^3)."""
         from scipy.sparse import (
             csr_array,
-        )  # slow to import, and few sessions are about scenes
+        )  # slow to import, and rarely needed
 
         grid = self.grid
         m = self.grid.n // BLOCK
@@ -398,7 +398,7 @@ class SightLines:
 
     @cached_property
     def asked(self) -> Mask:
-        """The voxels that the answer depends on, (n, n, n)."""
+        """Voxels that affect the visibility, (n, n, n)."""
         found = self.own.copy()
         found.reshape(-1)[self.passed.indices] = True
         return found
@@ -413,8 +413,8 @@ class SightLines:
 
         Args:
             seen: the scene so far.
-            density: of things in unseen space, per object radius.
-            unseen_part: weight of unseen voxels that may be the object's.
+            density: of occluders in unseen space, per object radius.
+            unseen_part: weight of unseen voxels that may belong to the object.
 
         Returns:
             The visibility from each position.
@@ -428,13 +428,13 @@ class SightLines:
             np.bincount(self.blocks[above & (mine == what)], minlength=most)
             for what in (OBJECT, UNSEEN)
         )
-        # how much of the object each part is expected to hold
+        # expected share of the object in each part
         weights = (known + unseen_part * maybe)[self.parts]
         if not weights.any():
             return Visibility(*np.ones((3, len(self.positions))))
         cost = ((cells == UNSEEN) & ~own).astype(np.float32)
         cost[cells == OCCLUDER] = SOLID
-        # thousands are occluders, else unseen
+        # multiples of SOLID come from occluders, the remainder from unseen space
         passed = (self.passed @ cost.reshape(-1)).reshape(len(weights), -1)
         free = passed < SOLID
         share = weights / weights.sum()

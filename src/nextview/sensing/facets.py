@@ -1,10 +1,10 @@
 """Fit a small plane to every pixel of the object.
 
-The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and
-Image Processing 15, 1981), on inverse depth, where planes of the world are planes of the image: 1/z
-= n . (x, y, 1) for the ray (x, y, 1) of a pixel, so n . P = 1 for every point P of the plane. Noise
-is averaged, holes are filled, normals come with it, and edges stay sharp because a pixel may take
-the plane of a window beside it.
+This is the sloped facet model of Haralick and Watson (A facet model for image data, Computer
+Graphics and Image Processing 15, 1981), applied to inverse depth, where planes in the world are
+planes in the image: 1/z = n . (x, y, 1) for the ray (x, y, 1) of a pixel, so n . P = 1 for every
+point P of the plane. The fit averages noise, fills holes and yields normals. Edges stay sharp
+because a pixel may use the plane of a neighbouring window.
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-SIZE = 224  # side of the observations' images: what the bundled networks take
-# standard deviations of noise that a window may deviate from its plane
+SIZE = 224  # side of the observation images, the input size of the bundled networks
+# largest deviation of a window from its plane, in standard deviations of the noise
 CLOSE_ENOUGH = 1.5
-# error of the slope (tangent) that noise may leave: six degrees of the normal
+# largest error of the slope (tangent) due to noise: six degrees of the normal
 STEEPEST_ERROR = 0.1
-LEAST_NOISE = 2e-4  # relative noise of depth that even the best frame is taken to have
-# slope towards the ray beyond which neighbouring pixels are taken for two surfaces
+LEAST_NOISE = 2e-4  # relative noise of depth assumed for noise-free frames
+# slope towards the ray beyond which neighbouring pixels belong to two surfaces
 STEEPEST_FACET = np.tan(np.radians(85.0))
 BINS = 4  # ranges of depth in which the noise is measured, with equally many pixels
-ROWS_MEASURED = 20  # about so many rows of a picture are enough to measure it
-# distances of the pixels that are compared: in many sensors neighbours err together
+ROWS_MEASURED = 20  # approximate number of image rows used to measure it
+# distances of the compared pixels, as the errors of neighbours are often correlated
 LAGS = (1, 2, 4, 6)
 
 
@@ -39,7 +39,7 @@ class Noise:
     Attributes:
         depths: ascending, metres, (D,).
         sigmas: standard deviation of inverse depth at each, 1/metres, (D,).
-        grain: distance within which pixels err together, pixels.
+        grain: distance within which the errors of pixels are correlated, pixels.
     """
 
     depths: Float
@@ -47,12 +47,12 @@ class Noise:
     grain: int = 1
 
     def at(self, depth: Floats | float) -> Float:
-        """Standard deviation of inverse depth at some depths, same shape, 1/metres."""
+        """Return the standard deviation of inverse depth at some depths, same shape, 1/metres."""
         return np.asarray(np.interp(depth, self.depths, self.sigmas))
 
 
 def noise_of(frame: Frame) -> Noise:
-    """The noise of all that a frame shows."""
+    """Measure the noise of a whole frame."""
     few = slice(None, None, max(1, frame.shape[0] // ROWS_MEASURED))
     return estimate_noise(frame.depth[few], frame.depth[few] > 0)
 
@@ -96,11 +96,11 @@ def estimate_noise(depth: Float32, usable: Mask) -> Noise:
 
 
 def _sigma(second: Floats) -> float:
-    """Standard deviation of the noise from the sizes of second differences."""
+    """Estimate the standard deviation of the noise from second differences."""
     middle = (len(second) - 1) // 2, len(second) // 2
     median = np.partition(second, middle)[
         list(middle)
-    ].mean()  # there is no NaN to look for
+    ].mean()  # faster than a median that checks for NaN
     return float(median) / (0.6745 * np.sqrt(6))
 
 
@@ -128,7 +128,7 @@ class Facets:
         return self.rays / np.einsum("ni,ni->n", self.planes, self.rays)[:, None]
 
     def some(self, which: slice | Mask | Index) -> "Facets":
-        """Those of some of the pixels."""
+        """Return the facets of some of the pixels."""
         return Facets(
             self.planes[which],
             self.rays[which],
@@ -189,8 +189,7 @@ def fit_facets(
 ) -> Facets:
     """Fit facets to the pixels of an object in a depth image, or in a part of it.
 
-    There is one for each square of ``coarse`` pixels, and none where there are too few pixels to
-    fit one.
+    There is one facet per square of ``coarse`` pixels, except where too few pixels are valid.
 
     Args:
         depth: (H, W) float32, metres; of the frame or of a part of it.
@@ -218,7 +217,7 @@ def fit_facets(
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
         near = ndimage.maximum_filter(usable, 5, mode="constant")
         closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
-        # what was not measured, or dropped, too
+        # includes pixels without depth and dropped pixels
         wanted = usable | (closed & (mask | (depth == 0)))
     if not usable.any():
         none = np.zeros(0, np.int64)
@@ -254,7 +253,7 @@ def fit_facets(
     else:
         planes = _fit(sums, 1, 1)[rows * sums.shape[2] + columns, :3]
         planes[:, 2] = own - (planes[:, :2] * here).sum(1)
-    # Back from coordinates about the middle:
+    # Convert back from centred coordinates.
     planes[:, 2] += middle[2] - planes[:, 0] * middle[0] - planes[:, 1] * middle[1]
     rays = np.stack([x[columns], y[rows], np.ones(len(rows))], 1)
     # inverse depth; NaN where there is no plane
@@ -282,7 +281,7 @@ def _typical_noise(
 
 
 def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
-    """Moments for a fit of planes, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
+    """Return the moments for plane fits, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
     x = x[None, :]
     y = y[:, None]
     moments = np.empty((10, *weight.shape))
@@ -305,7 +304,7 @@ def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
 
 
 def _blocks(images: Float, side: int) -> Float:
-    """Sums over squares of pixels; those at the end may be cut off by the image."""
+    """Return sums over squares of pixels; squares at the border may be incomplete."""
     for axis in (1, 2):
         every = np.moveaxis(images, axis, 0)
         sums = every[::side].copy(order="K")
@@ -319,10 +318,11 @@ def _blocks(images: Float, side: int) -> Float:
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
     """Return half sides of two windows that grow with the noise, pixels, larger first.
 
-    The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation
-    sigma sqrt(12) / k^2 per pixel; where grains of g x g pixels err together it is g times that.
+    The slope of a plane fitted to k x k pixels with independent errors has the standard deviation
+    sigma sqrt(12) / k^2 per pixel; if errors are correlated in grains of g x g pixels, it is g
+    times as large.
     """
-    # of depth, in units of the distance between pixels on the surface
+    # noise of depth in units of the pixel spacing on the surface
     per_pixel = noise / inverse / pitch.mean()
     side = np.sqrt(np.sqrt(12) * grain * per_pixel / STEEPEST_ERROR)
     small = int(np.clip(np.ceil((side - 1) / 2), 1, 8))
@@ -347,7 +347,7 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
         (qq, q, q),
     ):
         square -= a * b
-    # pixels in one line have no plane: a level one
+    # collinear pixels determine no plane: regularise towards zero slope
     ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30
     xx = xx + ridge
     yy = yy + ridge
@@ -375,10 +375,18 @@ def _choose(
 ) -> Float:
     """Return the plane of the largest window on each cell's own surface, (N, 3), or NaN.
 
-    First the windows around the cell, the larger one before the smaller; then small ones that have
-    it at their rim. Windows lie so densely that one is centred within half the small radius of
-    every cell. From the moments (10, H, W), and of the wanted cells inverse depth (N,), NaN in
-    holes, rows, columns, and x and y ``here`` (N, 2).
+    Windows around the cell are tried first, the larger before the smaller; then small windows with
+    the cell at their border. Windows are so dense that one is centred within half the small radius
+    of every cell.
+
+    Args:
+        sums: moments, (10, H, W).
+        own: inverse depth of the wanted cells, (N,), NaN in holes.
+        rows: of the wanted cells, (N,).
+        columns: of the wanted cells, (N,).
+        here: x and y of the wanted cells, (N, 2).
+        noise: of inverse depth, 1/metres.
+        radii: half sides of the windows, larger first.
     """
     step = max(1, radii[1] // 2)
     if step > 1:
@@ -396,7 +404,7 @@ def _choose(
         )
         guess = windows[rows[left] * w + columns[left]]
         good = guess[:, 3] < (CLOSE_ENOUGH * noise) ** 2
-        # NaN: a hole takes what there is
+        # NaN: holes accept any plane
         good &= ~(np.abs(_deviation(guess, here[left], own[left])) > 3 * noise)
         found[left[good]] = guess[good, :3]
         left = left[~good]

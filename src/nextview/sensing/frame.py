@@ -1,4 +1,4 @@
-"""One frame of a depth camera, in the units and axes of nextview, or refused in words."""
+"""One frame of a depth camera, validated and converted to the units and axes of nextview."""
 
 from copy import copy
 from dataclasses import InitVar, dataclass, field
@@ -14,11 +14,11 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-Part = tuple[slice, slice]  # rows and columns of a picture
+Part = tuple[slice, slice]  # rows and columns of an image
 WHOLE = slice(None), slice(None)
-# metres: float depth beyond is nothing; uint16 millimetres reach as far
+# metres; larger depths are invalid, as they exceed the range of uint16 millimetres
 FARTHEST_DEPTH = 65.0
-# metres; a depth image beyond is of another unit: inches are 39 times as many
+# metres; a depth image with a larger median is in another unit, such as inches
 LARGEST_MEDIAN = 20.0
 NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
 ASPECTS = (
@@ -27,42 +27,41 @@ ASPECTS = (
     16 / 10,
     512 / 424,
     640 / 576,
-)  # width over height of whole pictures
+)  # width over height of uncropped images
 CAMERA_AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
-"""Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and
-those of a robot's body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named
-ones."""
+"""Axes conventions of camera poses: OpenCV (x right, y down, z forward), OpenGL (x right, y up,
+z backward) and ROS body axes (x forward, y left, z up; REP 103). The columns are the OpenCV axes in
+the named convention."""
 # weights of red, green and blue in a grey image (ITU-R BT.601)
 LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The output of a depth camera at one moment; only depth and intrinsics are needed.
+    """One frame of a depth camera; only depth and intrinsics are required.
 
-    ObservationError names likely mistakes.
+    An ObservationError names the likely mistake in invalid input.
 
     Attributes:
-        depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero
-            and negative numbers mean nothing, or as uint16 millimetres, where 0 and 65535 do. What
-            a masked array hides means nothing, too. Becomes float32, metres, 0 = nothing; gaps that
-            come again every few pixels are filled.
-        intrinsics: pinhole matrix, (3, 3), pixels. Becomes float64, with the first pixel's centre
-            at 0.5.
-        pose: camera-to-world, (4, 4), metres, any world frame; becomes OpenCV's axes. None: the
-            camera itself is the world; good for a single frame only.
-        mask: where the object is, (H, W) bool; None if that is to be found.
-        image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
-        colour: the image as it was handed in, (H, W, 3) uint8, RGB; None if it is grey.
-        counted: whether the depth was handed in as uint16, in steps that may be other than
-            millimetres.
-        axes: of the pose handed in: "opencv", "opengl" or "ros", see CAMERA_AXES.
-        pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for
-            OpenGL and for nextview's own ``Observation``.
+        depth: along the optical axis, (H, W). Input is either float metres, where NaN, infinity,
+            zero and negative numbers are invalid, or uint16 millimetres, where 0 and 65535 are
+            invalid. Masked entries of a masked array are invalid too. Stored as float32, metres, 0
+            = invalid; regular gaps between pixels are filled.
+        intrinsics: pinhole matrix, (3, 3), pixels. Stored as float64, with the centre of the first
+            pixel at 0.5.
+        pose: camera-to-world, (4, 4), metres, any world frame; stored with OpenCV axes. None: the
+            camera frame is the world frame, which only works for a single frame.
+        mask: of the object, (H, W) bool; None if the object is to be found.
+        image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; stored as grey.
+        colour: the original image, (H, W, 3) uint8, RGB; None if it is grey.
+        counted: whether the input depth is uint16, whose unit may differ from millimetres.
+        axes: of the input pose: "opencv", "opengl" or "ros", see CAMERA_AXES.
+        pixel_centre: coordinate of the first pixel's centre in the input intrinsics: 0 for OpenCV
+            and ROS, 0.5 for OpenGL and for nextview's own ``Observation``.
     """
 
     depth: Float32
@@ -136,43 +135,43 @@ class Frame:
         return self.depth.shape[0], self.depth.shape[1]
 
     def shifted(self, shift: Float) -> "Frame":
-        """The same frame from a place that is shifted in the world, (3,), metres; it has a pose."""
+        """Return the frame with its pose, which must exist, shifted in the world, (3,), metres."""
         pose = self.camera_to_world.copy()
         pose[:3, 3] += shift
-        moved = copy(self)  # what was checked is right
+        moved = copy(self)  # skips validation
         object.__setattr__(moved, "pose", pose)
         return moved
 
     def with_depth(self, depth: Float32) -> "Frame":
-        """The same frame with another depth image, (H, W) float32, metres."""
-        other = copy(self)  # what was checked is right
+        """Return the frame with another depth image, (H, W) float32, metres."""
+        other = copy(self)  # skips validation
         object.__setattr__(other, "depth", depth)
         return other
 
     def with_mask(self, mask: Mask) -> "Frame":
-        """The same frame with a mask of its object, (H, W) bool, that holds pixels with depth."""
-        other = copy(self)  # what was checked is right
+        """Return the frame with a mask of its object, (H, W) bool, with some valid depth."""
+        other = copy(self)  # skips validation
         object.__setattr__(other, "mask", mask)
         return other
 
     @property
     def camera(self) -> PinholeCamera:
-        """The pinhole camera that took the frame."""
+        """Pinhole camera of the frame."""
         return PinholeCamera.of(self.intrinsics, self.shape)
 
     @property
     def camera_to_world(self) -> Float:
-        """The pose, or the identity if there is none."""
+        """Pose of the camera, or the identity if there is none."""
         return np.eye(4) if self.pose is None else self.pose
 
     @property
     def rays(self) -> tuple[Float32, Float32]:
-        """x and y of the rays (x, y, 1) through the columns (W,) and the rows (H,), float32."""
+        """x and y of the rays (x, y, 1) through the columns, (W,), and the rows, (H,), float32."""
         x, y = self.camera.image_slopes
         return x.astype(np.float32), y.astype(np.float32)
 
     def positions(self, rows: Index, columns: Index) -> Float:
-        """Return the positions that pixels show in the world.
+        """Return the world positions of pixels.
 
         Args:
             rows: of the pixels, (N,) int64.
@@ -185,7 +184,7 @@ class Frame:
         return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
 
     def positions_in_camera(self, rows: Index, columns: Index) -> Float:
-        """Return the positions that pixels show in the camera frame.
+        """Return the positions of pixels in the camera frame.
 
         Args:
             rows: of the pixels, (N,) int64.
@@ -204,7 +203,7 @@ class Frame:
         offset: float = 0.0,
         part: Part = WHOLE,
     ) -> Float32:
-        """Return ``direction @ position + offset`` of what every pixel shows.
+        """Return ``direction @ position + offset`` of every pixel.
 
         Args:
             direction: world, (3,).
@@ -222,7 +221,7 @@ class Frame:
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
-    """Return the rows and columns of an image that hold all that it shows.
+    """Return the rows and columns of an image that contain all nonzero pixels.
 
     Args:
         shown: depth image or mask, (H, W).
@@ -241,7 +240,7 @@ def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
 
 
 def holes_of(shown: Mask) -> Mask:
-    """The pixels that a mask, (H, W), surrounds and does not hold, (H, W) bool."""
+    """Return the enclosed holes of a mask, (H, W), as a mask, (H, W) bool."""
     beside, _ = ndimage.label(np.pad(~shown, 1, constant_values=True))
     around = beside[0, 0]
     beside = beside[1:-1, 1:-1]
@@ -249,12 +248,12 @@ def holes_of(shown: Mask) -> Mask:
 
 
 def spans(low: Floats, high: Floats, shape: tuple[int, ...]) -> Part:
-    """Return the rows and columns of a rectangle, clipped to the picture.
+    """Return the rows and columns of a rectangle, clipped to the image.
 
     Args:
         low: first row and column, (2,).
-        high: row and column behind the last, (2,).
-        shape: rows and columns of the picture.
+        high: row and column after the last, (2,).
+        shape: rows and columns of the image.
 
     Returns:
         Slices of the rows and columns.
@@ -274,7 +273,7 @@ def _metres(depth: NDArray) -> Float32:
         )
     elif np.issubdtype(depth.dtype, np.floating):
         metres = depth.astype(np.float32)
-        # no NaN passes a comparison
+        # comparisons with NaN are False
         metres = np.where((metres > 0) & (metres < np.inf), metres, np.float32(0))
     else:
         raise ObservationError(
@@ -341,7 +340,7 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:
         raise ObservationError(
             f"{point} far off an image of {width} x {height}: intrinsics of another resolution?"
         )
-    # 1 in the middle
+    # 1 at the image centre
     across = 2 * k[0, 2] / width
     down = 2 * k[1, 2] / height
     scale = (across + down) / 2
@@ -362,7 +361,7 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:
 
 
 def check_pose(pose: ArrayLike) -> Float:
-    """Copy a rigid pose, (4, 4); ObservationError names the likely mistake."""
+    """Copy and check a rigid pose, (4, 4); an ObservationError names the likely mistake."""
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         sentence = (
@@ -387,6 +386,6 @@ def check_pose(pose: ArrayLike) -> Float:
         )
 
     u, _, vt = np.linalg.svd(rotation)
-    pose[:3, :3] = u @ vt  # poses from text files are rounded
+    pose[:3, :3] = u @ vt  # removes rounding errors of poses from text files
 
     return pose

@@ -1,39 +1,39 @@
-"""Fill regular gaps in depth images, as aligning a low resolution to a high one leaves them.
+"""Fill regular gaps in depth images, which result from aligning a low to a high resolution.
 
-Gaps that come again every few pixels are an artefact of the grid; all other holes are left as they
-are: what a sensor could not measure says something.
+Gaps that repeat every few pixels are an artefact of the grid. All other holes are kept, because
+missing measurements carry information.
 """
 
 import numpy as np
 
 from nextview.types import Float32, Index, Mask
 
-LONGEST_PERIOD = 8  # pixels after which gaps come again, at most
-# so many gaps begin in a row or a column for each measured pixel, at least
+LONGEST_PERIOD = 8  # pixels, largest period of the gaps
+# least number of gaps per measured pixel
 FEWEST_GAPS = 0.01
-# share of the gaps after which another one begins one period later, at least
+# least share of gaps that are followed by another one after one period
 SAME_STEP = 0.35
-# times as often as after some other distance: random gaps begin anywhere
+# least ratio to the share for other distances, as random gaps have no period
 DISTINCT = 2.0
-# part by which inverse depth may change from pixel to pixel on one surface
+# largest relative change of inverse depth between neighbouring pixels of one surface
 ONE_SURFACE = 0.015
-PASSES = 2  # first between two measured pixels, then between rows or columns that were filled
+PASSES = 2  # first between measured pixels, then between filled rows or columns
 
 
 def fill_regular_gaps(depth: Float32) -> tuple[Float32, Index | None]:
-    """Fill gaps that come again every few pixels; an image without any is given back as it is.
+    """Fill gaps that repeat every few pixels; an image without such gaps is returned unchanged.
 
-    Between two pixels of one surface inverse depth is interpolated. Between two surfaces the gap
-    takes the depth of the nearer pixel of the two: no depth in between is made up. Outside of what
-    was measured, and in holes that are larger than the gaps, nothing is filled.
+    Between two pixels of one surface, inverse depth is interpolated. Between two surfaces, the gap
+    is assigned to the surface of the nearer pixel; no depths in between are created. Nothing is
+    filled outside the measured area, or in holes larger than the gaps.
 
     Args:
-        depth: (H, W) float32, metres, 0 where nothing was measured.
+        depth: (H, W) float32, metres, 0 without valid depth.
 
     Returns:
-        The depth image, and for each pixel the index of the measured pixel that it takes the
-        surface of, row * W + column, (H, W): its own unless it was filled. None if there are no
-        regular gaps.
+        The depth image; and for each pixel the index of the measured pixel whose surface it belongs
+        to, row * W + column, (H, W): its own unless it was filled. The indices are None if there
+        are no regular gaps.
     """
     measured = depth > 0
     period = max(_period(measured), _period(measured.T))
@@ -49,7 +49,7 @@ def fill_regular_gaps(depth: Float32) -> tuple[Float32, Index | None]:
 
 
 def filled_mask(mask: Mask, source: Index) -> Mask:
-    """Fill the gaps of a mask where the image had the same gaps.
+    """Fill the gaps of a mask that coincide with the gaps of the depth image.
 
     Args:
         mask: (H, W) bool.
@@ -58,13 +58,13 @@ def filled_mask(mask: Mask, source: Index) -> Mask:
     added = mask.ravel()[source] & (
         source != np.arange(source.size).reshape(source.shape)
     )
-    # A mask from a colour image has no gaps: it knows better where the object ends.
+    # A mask from a colour image has no gaps and more exact edges, so it is kept.
     has_gaps = np.count_nonzero(added & ~mask) > np.count_nonzero(added & mask)
     return mask | added if has_gaps else mask.copy()
 
 
 def _period(measured: Mask) -> int:
-    """After how many columns gaps come again; 0 if they do not, or there are next to none."""
+    """Return the period of the gaps in columns; 0 if they are not periodic, or too few."""
     begins = measured[:, :-1] & ~measured[:, 1:]
     count = np.count_nonzero(begins)
     if count < FEWEST_GAPS * np.count_nonzero(measured) or count == 0:
@@ -77,7 +77,7 @@ def _period(measured: Mask) -> int:
 
 
 def _fill_once(inverse: Float32, source: Index, widest: int) -> None:
-    """Fill holes in rows and columns in place, at most ``widest`` pixels wide."""
+    """Fill holes of at most ``widest`` pixels in rows and columns, in place."""
     best_span = np.full(inverse.size, np.iinfo(np.int32).max, np.int32)
     best_value = inverse.ravel().copy()
     best_source = source.ravel().copy()
@@ -88,13 +88,13 @@ def _fill_once(inverse: Float32, source: Index, widest: int) -> None:
         span = before + after
 
         one_surface = np.abs(one - other) <= ONE_SURFACE * span * np.minimum(one, other)
-        # Of two that are equally near, the one farther from the camera: no thing grows.
+        # At equal distance the background is preferred, so that objects do not grow.
         nearer_first = (before < after) | ((before == after) & (one < other))
         on_plane = (one * after + other * before) / span
         value = np.where(one_surface, on_plane, np.where(nearer_first, one, other))
         taken = source.ravel()[np.where(nearer_first, first, second)]
 
-        # Two surfaces count only where the other direction does not lie on one.
+        # A gap between two surfaces is used only if the other direction is not on one surface.
         span = np.where(one_surface, span, span + 2 * LONGEST_PERIOD)
         better = span < best_span[hole]
         at = hole[better]
@@ -106,10 +106,10 @@ def _fill_once(inverse: Float32, source: Index, widest: int) -> None:
 
 
 def _gaps(inverse: Float32, widest: int, along_rows: bool) -> tuple[Index, ...]:
-    """Holes with a measured pixel before and after them in their row, or their column.
+    """Find holes with a measured pixel before and after them in their row, or their column.
 
     Returns:
-        Indices of the holes, of the pixels before and after them, and how far off these are, (N,)
+        Indices of the holes, of the pixels before and after them, and the distances to these, (N,)
         each.
     """
     measured = inverse > 0

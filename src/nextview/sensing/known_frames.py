@@ -1,4 +1,4 @@
-"""The one check of a frame against what is known, whether one object is looked at or a scene."""
+"""Check a new frame against the known world, for sessions and scenes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from nextview.types import Float
 
 @dataclass(frozen=True)
 class KnownFrames:
-    """What is known before a frame.
+    """Known world before a new frame.
 
     Attributes:
-        frames: that were taken in, in order, with the poses that they were handed in with.
-        planes: the support plane as each of them shows it; None where it does not.
-        up: direction against gravity in the world, (3,); None if the support plane tells it.
-        target: where an object is expected, (3,), world, metres; None if no place is known.
+        frames: used frames, in order, with their original poses.
+        planes: the support plane in each of them; None if it is not visible.
+        up: direction against gravity in the world, (3,); None for the normal of the support plane.
+        target: expected position of an object, (3,), world, metres; None if not known.
         radius: of that object, metres.
     """
 
@@ -43,14 +43,14 @@ class KnownFrames:
     radius: float = 0.0
 
     def refuse(self, frame: Frame) -> None:
-        """Refuse what cannot be another frame of the same world, whatever it shows.
+        """Reject input that cannot be another frame of the same world, whatever it shows.
 
         Args:
-            frame: that was handed in.
+            frame: new frame.
 
         Raises:
-            ObservationError: it is no frame, it lacks a pose, it is too far from what is known, or
-                its depth is several times too large.
+            ObservationError: the type is wrong, the pose is missing, the camera is too far away, or
+                the depth is several times too large.
         """
         if not isinstance(frame, Frame):
             raise ObservationError(
@@ -64,14 +64,14 @@ class KnownFrames:
         refuse_far(frame, last, self.target, self.radius)
 
     def check(self, frame: Frame, plane: Plane | None) -> list[ViewWarning]:
-        """What is likely to be wrong with a frame that was not refused; usually nothing.
+        """Return likely problems of a frame that was not rejected; usually empty.
 
         Args:
-            frame: that was handed in.
-            plane: the support plane as it shows it; None where it does not.
+            frame: new frame.
+            plane: the support plane in this frame; None if it is not visible.
 
         Raises:
-            ObservationError: its pose is in millimetres.
+            ObservationError: the pose is in millimetres.
         """
         warnings = check_frame(frame)
         if self.frames:
@@ -86,10 +86,10 @@ class KnownFrames:
         return warnings + self._check_lean(frame, plane)
 
     def repeats(self, frame: Frame) -> bool:
-        """Whether a frame shows, to the last bit, what an earlier one did.
+        """Return True if a frame is bitwise identical to an earlier one.
 
         Args:
-            frame: that was handed in.
+            frame: new frame.
         """
         return any(
             np.array_equal(one.depth, frame.depth) and _same_mask(one, frame)
@@ -97,7 +97,7 @@ class KnownFrames:
         )
 
     def _check_lean(self, frame: Frame, plane: Plane | None) -> list[ViewWarning]:
-        """Whether the planes of all frames lean; of one alone that may be an error of depth."""
+        """Warn if the planes of all frames are tilted; a single one may have depth errors."""
         frames = (*self.frames, frame)
         planes = (*self.planes, plane)
         shown = [
@@ -114,9 +114,9 @@ class KnownFrames:
     def _of_one_surface(
         self, shown: list[tuple[Plane, Float]]
     ) -> list[tuple[Plane, Float]]:
-        """Planes, with poses, that are the lowest of them where the object is expected.
+        """Return the planes, with poses, of the lowest surface below the object.
 
-        By its box the seat of a chair may be found in one frame, and in another one the floor.
+        With a box, one frame may yield the seat of a chair as its plane, and another the floor.
         """
         if self.target is None or not shown:
             return shown
@@ -129,7 +129,7 @@ class KnownFrames:
 
 
 def _same_mask(one: Frame, other: Frame) -> bool:
-    """Whether two frames of one shape are looked at in the same pixels."""
+    """Return True if two frames of the same shape have the same mask."""
     if one.mask is None or other.mask is None:
         return one.mask is other.mask
     return np.array_equal(one.mask, other.mask)

@@ -1,4 +1,4 @@
-"""By how much the support plane leans against the direction that is taken for up."""
+"""Estimate the tilt of the support plane against the assumed up direction."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from nextview.sensing.planes import Plane
 from nextview.types import Float
 
 DEPTH_LEAN = np.radians(2.0)
-"""By how much errors of a depth camera lean a plane, standard deviation, always the same way as
-the camera sees it: of fifty frames of a real Kinect whose poses are exact, half lean by 1.3 degrees
-or more, and a tenth by 2.7.
+"""Standard deviation of the tilt caused by systematic depth errors, constant in the camera frame.
+
+In fifty frames of a real Kinect with exact poses, the median tilt is 1.3 degrees, and the largest
+tenth exceeds 2.7 degrees.
 """
-# by how much the pose of a single frame leans it, beside its noise
+# standard deviation of the tilt caused by the pose of a single frame, in addition to noise
 FRAME_LEAN = np.radians(0.5)
-UNKNOWN_LEAN = np.radians(30.0)  # deviation of a lean of which nothing is known
-LEAN_NOTICED = 3.0  # standard deviations that errors do not explain
-LEAST_LEAN = np.radians(1.0)  # below which it does not matter
+UNKNOWN_LEAN = np.radians(30.0)  # standard deviation of an unknown tilt
+LEAN_NOTICED = 3.0  # standard deviations from which a tilt is reported
+LEAST_LEAN = np.radians(1.0)  # smaller tilts are not reported
 
 
 @dataclass(frozen=True)
 class Lean:
-    """The lean of a support plane in the world.
+    """Tilt of a support plane in the world.
 
     Attributes:
-        lean: horizontal part of its unit normal, (2,), about radians.
-        deviation: standard deviation of each of both, radians.
+        lean: horizontal components of its unit normal, (2,), approximately radians.
+        deviation: standard deviation of each component, radians.
     """
 
     lean: Float
@@ -36,24 +37,24 @@ class Lean:
 
     @property
     def degrees(self) -> float:
-        """Of the plane against up."""
+        """Angle between the plane's normal and up, degrees."""
         return float(np.degrees(np.linalg.norm(self.lean)))
 
     @property
     def noticed(self) -> bool:
-        """Whether it is more than errors of the camera explain, and matters."""
+        """True if the tilt is relevant and not explained by camera errors."""
         size = float(np.linalg.norm(self.lean))
         return size > max(LEAN_NOTICED * self.deviation, LEAST_LEAN)
 
 
 def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> Lean:
-    """What some frames together say of the lean of the support plane.
+    """Estimate the tilt of the support plane from several frames.
 
-    A camera whose depth errs leans the plane with itself: it leans another way in the world when
-    the camera looks from another side. What stays the same in the world is the plane's own.
+    Depth errors tilt the plane in a direction fixed to the camera, which changes in the world with
+    the viewing direction. The tilt that is constant in the world belongs to the plane.
 
     Args:
-        planes: the support plane as each frame shows it.
+        planes: the support plane in each frame.
         cameras: camera-to-world poses, (4, 4) each.
         axes: rows x, y and z (up), (3, 3).
     """
@@ -64,7 +65,7 @@ def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> L
     ahead = np.array([axes[:2] @ pose[:3, 2] for pose in cameras])
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
 
-    # As complex numbers: lean = own + ahead * of_camera + error of the frame.
+    # In complex numbers: lean = own + ahead * of_camera + error of the frame.
     measured = leans @ [1, 1j]
     turned = ahead @ [1, 1j]
     matrix = np.stack([np.ones(len(measured)), turned], 1)
@@ -73,7 +74,7 @@ def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> L
     covariance = np.linalg.inv(information)
     found = covariance @ ((matrix.conj().T * weights) @ measured)
 
-    # Frames that disagree by more than their poses should say less.
+    # Increase the uncertainty if frames disagree by more than their pose errors.
     left = np.abs(measured - matrix @ found) ** 2 * weights / 2
     disagree = max(1.0, float(np.sqrt(left.sum() / max(1, len(left) - 1))))
     deviation = disagree * float(np.sqrt(covariance[0, 0].real))

@@ -1,8 +1,8 @@
-"""Level surfaces that a segmentation tells: floors, tables, boards, and what each of them carries.
+"""Level support surfaces of a frame, such as floors, tables and shelf boards, and their loads.
 
-A segmentation says which pixels are surfaces. The planes through these pixels are found here, and
-for each instance the one that it stands on. A plane carries things only where it is seen or hidden
-by them: a person behind a table stands above the plane of its top, but not on it.
+A segmentation labels the surface pixels. This module fits planes to them and finds the plane that
+carries each instance. A plane carries objects only where it is visible or hidden by them: a person
+behind a table is above the plane of its top, but does not stand on it.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
 MOST_LEVELS = 6
-# share of all surface pixels below which no further level is looked for
+# share of all surface pixels below which the search for further levels ends
 LEAST_LEFT = 0.003
-OUTLINE_MARGIN = 0.05  # metres around what is seen of a surface that may be hidden
-INSTANCE_POINTS = 500  # points of an instance that are compared with levels
-# share of an instance's points that lie over what carries it, at least
+OUTLINE_MARGIN = 0.05  # metres around the visible part of a surface that may be hidden
+INSTANCE_POINTS = 500  # sampled points of an instance
+# least share of an instance's points above its carrier
 MOST_INSIDE = 0.5
-# share of an instance's points that may lie lower than its bottom: noise
+# largest share of an instance's points below its bottom, due to noise
 BOTTOM_SHARE = 0.04
-# height over a plane of the bottom of what stands on it, as a part of the distance, at most
+# largest height of an instance's bottom above its carrier, relative to the distance
 BOTTOM_MARGIN = 0.02
-# neighbouring pixels of one surface differ by at most this part of their depth, and noise
+# largest relative depth step between neighbouring pixels of one surface, in addition to noise
 SURFACE_STEP = 0.04
-RING_WIDTH = 3  # pixels around the bottom of an instance that tell what is below it
-HANGING_SHARE = 0.8  # share of these that lie behind an instance that hangs in the air
+RING_WIDTH = 3  # pixels around the bottom of an instance that show the surface below it
+HANGING_SHARE = 0.8  # least share of these far behind an instance that hangs in the air
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceLevel:
-    """A plane surface that carries things.
+    """A plane support surface.
 
     Attributes:
-        plane: through it, its normal on the side of the camera.
+        plane: the plane, with its normal on the side of the camera.
         axes: two directions along it, (2, 3).
-        sides: of the convex outline of what is seen of it, (K, 3): a point (x, y) along the axes,
-            metres, is inside where ``sides @ (x, y, 1)`` is nowhere above 0.
-        tolerance: metres from the plane within which its samples lie.
-        pixels: of the frame that show it, (H, W) bool.
+        sides: of the convex hull of its visible part, (K, 3): a point (x, y) along the axes,
+            metres, is inside if no element of ``sides @ (x, y, 1)`` is above 0.
+        tolerance: largest distance of its samples from the plane, metres.
+        pixels: of the frame on the surface, (H, W) bool.
     """
 
     plane: Plane
@@ -69,7 +69,7 @@ class SurfaceLevel:
     pixels: Mask
 
     def holds(self, points: Float) -> Mask:
-        """Which points lie over what is seen of it, or closely beside, (N,) bool.
+        """Return which points are over the visible part of the surface, or close to it, (N,) bool.
 
         Args:
             points: (N, 3), world, metres.
@@ -81,15 +81,15 @@ class SurfaceLevel:
 
 @dataclass(frozen=True, eq=False)
 class Supports:
-    """What a frame shows of surfaces, and what stands on them.
+    """Support surfaces of a frame and the instances on them.
 
     Attributes:
         frame: the frame.
-        masks: pixels of each instance, (H, W) bool each.
+        masks: mask of each instance, (H, W) bool each.
         surface: pixels of all surfaces, (H, W) bool.
-        levels: planes of the surfaces, those that carry most pixels of instances first.
+        levels: planes of the surfaces, by decreasing number of carried pixels.
         carriers: the level that carries each instance, a surface or the top of another instance;
-            None where none that is seen does.
+            None if there is no visible one.
     """
 
     frame: Frame
@@ -108,16 +108,16 @@ class Supports:
         up: Float | None,
         earlier: Sequence[SurfaceLevel] = (),
     ) -> Supports:
-        """Find the levels of a frame, and what each instance stands on.
+        """Find the levels of a frame and the carrier of each instance.
 
         Args:
             frame: of a depth camera.
-            masks: pixels of each instance, (H, W) bool each.
+            masks: mask of each instance, (H, W) bool each.
             surface: pixels of all surfaces, (H, W) bool.
             noise: of the frame.
-            up: direction against gravity, (3,), world; None: the normal of the plane that carries
-                most pixels of instances.
-            earlier: levels that earlier frames show; they carry where this one does not show them.
+            up: direction against gravity, (3,), world; None for the normal of the plane that
+                carries most instance pixels.
+            earlier: levels of earlier frames; used if they are not visible in this one.
         """
         shown = surface & (frame.depth > 0)
         levels = _found(frame, shown, noise, up)
@@ -138,15 +138,15 @@ class Supports:
         return cls(frame, tuple(masks), surface, tuple(levels), tuple(carriers))
 
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
-        """The level that carries most pixels of things that are looked for.
+        """Return the level that carries most pixels of candidate objects.
 
         Args:
-            among: pixels of the frame where things are looked for, (H, W) bool.
-            widest: diameter of the largest thing that is looked for, metres; None: any.
+            among: search area in the frame, (H, W) bool.
+            widest: diameter of the largest candidate object, metres; None for any.
 
         Returns:
-            The level; where none carries such a thing, the one that the camera is aimed at. None
-            where no level is seen.
+            The level; if none carries such an object, the level at which the camera is aimed. None
+            if no level is visible.
         """
         if not self.levels:
             return None
@@ -163,11 +163,11 @@ class Supports:
         return min(self.levels, key=self._off_the_axis)
 
     def under(self, mask: Mask, stands: bool = False) -> SurfaceLevel | None:
-        """The level that carries something; None where none that is seen does.
+        """Return the level that carries an object; None if there is no visible one.
 
         Args:
-            mask: its pixels, (H, W) bool.
-            stands: whether it is known to stand on something, so that it does not hang.
+            mask: of the object, (H, W) bool.
+            stands: whether the object is known not to hang in the air.
         """
         level = carrier_of(mask, self.frame, self.levels, stands)
         if level is not None or not self.masks:
@@ -177,10 +177,13 @@ class Supports:
         return self.carriers[row] if shared[row] else None
 
     def again(self, plane: Plane) -> SurfaceLevel | None:
-        """The level that a plane of an earlier frame is in this one; None where it is not seen.
+        """Return the level that corresponds to a plane of an earlier frame.
 
         Args:
-            plane: as the earlier frame shows it; the pose of either frame may err.
+            plane: in the earlier frame; both poses may have errors.
+
+        Returns:
+            The level; None if it is not visible.
         """
         found = None
         least = np.inf
@@ -197,7 +200,7 @@ class Supports:
         return found
 
     def _off_the_axis(self, level: SurfaceLevel) -> float:
-        """Pixels from the middle of the picture to the nearest one that shows a level."""
+        """Return the distance from the image centre to the nearest pixel of a level, pixels."""
         rows, columns = np.nonzero(level.pixels)
         if not len(rows):
             return np.inf
@@ -211,16 +214,16 @@ def carrier_of(
     levels: Sequence[SurfaceLevel],
     stands: bool = False,
 ) -> SurfaceLevel | None:
-    """The level that something stands on: it touches it, or is next above it and hides it.
+    """Return the level below an object: in contact with it, or the next one below and hidden by it.
 
     Args:
-        mask: its pixels, (H, W) bool.
-        frame: that shows it.
+        mask: of the object, (H, W) bool.
+        frame: of the mask.
         levels: of the frame.
-        stands: whether it is known to stand on something, so that it does not hang.
+        stands: whether the object is known not to hang in the air.
 
     Returns:
-        The level; None where its bottom is seen to touch none, or what is below is not seen.
+        The level; None if the visible bottom touches none, or the surface below is not visible.
     """
     if not levels or not (mask & (frame.depth > 0)).any():
         return None
@@ -251,13 +254,13 @@ def carrier_of(
 
 
 def _hangs(mask: Mask, frame: Frame, plane: Plane, away: float) -> bool:
-    """Whether the bottom of something is seen, and what is below it lies far behind.
+    """Return True if the bottom of an object is visible and the surface below is far behind it.
 
     Args:
-        mask: its pixels, (H, W) bool.
-        frame: that shows it.
-        plane: that it is above.
-        away: its distance, metres.
+        mask: of the object, (H, W) bool.
+        frame: of the mask.
+        plane: below the object.
+        away: distance of the object, metres.
     """
     part = within(mask, RING_WIDTH + 1)
     own = mask[part] & (frame.depth[part] > 0)
@@ -275,7 +278,7 @@ def _hangs(mask: Mask, frame: Frame, plane: Plane, away: float) -> bool:
 def _cut_by_picture(
     low: Mask, part: tuple[slice, slice], shape: tuple[int, int]
 ) -> bool:
-    """Whether pixels of a part of a picture touch the side of the picture."""
+    """Return True if pixels of a part of an image touch the image border."""
     rows, columns = np.nonzero(low)
     sides = ((rows, part[0].start, shape[0]), (columns, part[1].start, shape[1]))
     for index, start, size in sides:
@@ -290,13 +293,14 @@ def _found(
     noise: Noise,
     up: Float | None,
 ) -> list[SurfaceLevel]:
-    """The planes of the surfaces of a frame, one after the other by RANSAC.
+    """Find the planes of a frame's surfaces one by one with RANSAC.
 
-    What is left is sampled anew after each, so that a small table is found before a wide floor.
+    The remaining pixels are resampled after each plane, so that a small table is found beside a
+    large floor.
 
     Args:
         frame: of a depth camera.
-        surface: pixels of surfaces, (H, W) bool; all have a depth.
+        surface: pixels of surfaces, (H, W) bool; all with valid depth.
         noise: of the frame.
         up: direction against gravity, (3,), world; None for planes of any direction.
     """
@@ -328,7 +332,7 @@ def _found(
 
 
 def _beside(own: Samples, levels: Sequence[SurfaceLevel]) -> bool:
-    """Whether samples are the noise of a level that was found: they lie closely along it."""
+    """Return True if samples are noise of a known level, close to it everywhere."""
     for level in levels:
         near = np.abs(level.plane.height(own.points)) < TOLERANCES_ASIDE * own.tolerance
         if np.mean(near & level.holds(own.points)) > MOST_INSIDE:
@@ -337,14 +341,14 @@ def _beside(own: Samples, levels: Sequence[SurfaceLevel]) -> bool:
 
 
 def _sides(points: Float, plane: Plane) -> Float | None:
-    """The sides of the convex outline of points on a plane.
+    """Return the sides of the convex hull of points on a plane.
 
     Args:
         points: (N, 3), metres.
-        plane: that they lie on.
+        plane: of the points.
 
     Returns:
-        The sides, (K, 3), see ``SurfaceLevel``; None where the points lie on a line.
+        The sides, (K, 3), see ``SurfaceLevel``; None for collinear points.
     """
     try:
         return ConvexHull(points @ axes_along(plane).T).equations
@@ -359,12 +363,12 @@ def _on_others(
     noise: Noise,
     up: Float,
 ) -> list[SurfaceLevel | None]:
-    """Carriers, where instances that no surface carries may stand on other instances.
+    """Find carriers among the other instances for instances that no surface carries.
 
     Args:
         carriers: of each instance.
-        masks: pixels of each, (H, W) bool.
-        frame: that shows them.
+        masks: of each instance, (H, W) bool.
+        frame: of the masks.
         noise: of the frame.
         up: direction against gravity, (3,), world.
     """
@@ -381,14 +385,14 @@ def _on_others(
 
 
 def _points(mask: Mask, frame: Frame) -> Float:
-    """Some of the positions that a mask, (H, W) bool, shows, (N, 3), world, metres."""
+    """Sample points of a mask, (H, W) bool, as (N, 3), world, metres."""
     rows, columns = np.nonzero(mask & (frame.depth > 0))
     few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
     return frame.positions(rows[few], columns[few])
 
 
 def _load(level: SurfaceLevel, frame: Frame, masks: Sequence[Mask]) -> int:
-    """Pixels of the instances that one level would carry if there were no other."""
+    """Return the number of instance pixels that a level would carry on its own."""
     return sum(
         int(np.count_nonzero(mask))
         for mask in masks
@@ -401,7 +405,7 @@ def _by_load(
     frame: Frame,
     masks: Sequence[Mask],
 ) -> list[SurfaceLevel]:
-    """Levels, those that carry most pixels of instances first."""
+    """Sort levels by decreasing number of carried instance pixels."""
     carriers = [carrier_of(mask, frame, levels) for mask in masks]
     load = {
         id(level): sum(
@@ -419,7 +423,7 @@ def _parallel(
     frame: Frame,
     masks: Sequence[Mask],
 ) -> list[SurfaceLevel]:
-    """Those levels that are parallel to the one that carries most, where up is not known."""
+    """Return the levels parallel to the one with the largest load, if up is not known."""
     if not levels:
         return []
     first = max(
@@ -429,17 +433,17 @@ def _parallel(
 
 
 def _same(earlier: SurfaceLevel, level: SurfaceLevel, frame: Frame) -> bool:
-    """Whether a level of an earlier frame is one of this frame."""
+    """Return True if a level of an earlier frame is a level of this frame."""
     apart, reach = _apart(earlier.plane, level, frame)
     return apart < reach
 
 
 def _apart(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, float]:
-    """How far a plane of an earlier frame lies from a level, and by how much its pose may err.
+    """Return the distance between an earlier plane and a level, and its largest pose error.
 
     Args:
         plane: of the earlier frame.
-        level: that the frame shows.
+        level: of this frame.
         frame: of a depth camera.
 
     Returns:

@@ -7,29 +7,33 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import holes_of, within
 from nextview.types import Float32, Mask
 
-EDGE_ERROR = 6  # a segmenter's edge may be off by so many pixels
-# neighbouring pixels of one surface differ by at most this part of their depth, and THICK
+EDGE_ERROR = 6  # pixels, largest error of a mask's edge
+# largest relative depth step between neighbouring pixels of one surface, in addition to THICK
 NEIGHBOUR_STEP = 0.01
 THICK = 0.004  # metres
-NOISE_STEP = 2.5  # standard deviations by which a pixel may differ from the mean of its neighbours
-SQUARE_WIDTH = 5  # pixels across the square of these
+NOISE_STEP = (
+    2.5  # standard deviations, largest difference to the mean of the neighbours
+)
+SQUARE_WIDTH = 5  # pixels, side of the square of neighbours
 
 
 def trimmed(depth: Float32, mask: Mask, noise: Noise, high: Mask | None = None) -> Mask:
-    """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
+    """Return the pixels of a mask that are connected to its interior without a depth step.
 
-    Up to EDGE_ERROR pixels at the edge of a mask may show the background, or hang in the air before
-    it. The inside is what is farther from the edge; of a thing that is too thin for that, as much
-    farther as leaves a third of it. From there the mask grows back over pixels as near as their
-    neighbours: EDGE_ERROR pixels, and as far as they are ``high`` over the support plane, for the
-    legs of a chair are as thin as an edge. What is ``high`` behind a step, and wider than
-    EDGE_ERROR, is kept.
+    Up to EDGE_ERROR pixels at the edge of a mask may show the background, or flying pixels in front
+    of it. The interior starts at that distance from the edge; in an object that is too thin, at the
+    distance that leaves a third of its pixels. From there the mask grows back across small depth
+    steps: by EDGE_ERROR pixels, and without limit over ``high`` pixels, as chair legs are as thin
+    as an edge. Parts that are ``high`` behind a step and wider than EDGE_ERROR are kept.
 
     Args:
-        depth: metres, (H, W), 0 where nothing was measured.
+        depth: metres, (H, W), 0 without valid depth.
         mask: (H, W) bool.
-        noise: of the depth: pixels of one surface differ by it, too.
-        high: pixels that show no edge of what lies on the plane, (H, W) bool.
+        noise: of the depth, which adds to the steps within one surface.
+        high: pixels clearly above the support plane, (H, W) bool.
+
+    Returns:
+        The remaining pixels, (H, W) bool.
     """
     measured = mask & (depth > 0)
     part = within(measured)
@@ -53,7 +57,7 @@ def trimmed(depth: Float32, mask: Mask, noise: Noise, high: Mask | None = None) 
             > step
         )
         near = own & high[part] & ~far
-        # behind a step in depth, but wider than the edge of a mask: a handle beside its mug
+        # behind a depth step, but wider than the edge of a mask, such as the handle of a mug
         wide = binary_erosion(np.pad(near, 1), np.ones((3, 3), bool), EDGE_ERROR // 2)[
             1:-1,
             1:-1,

@@ -1,4 +1,4 @@
-"""Pixels of a frame in a box, in a sphere, above a plane, or in a mask without its edge."""
+"""Select pixels of a frame: in a box, in a sphere, above a plane, or in a trimmed mask."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Float32, Mask
 
-# height over a plane, as a part of the distance, above which a pixel at a mask's edge is not the
-# plane's
+# height above a plane, relative to the distance, from which a pixel at a mask's edge is not on it
 STANDS = 0.02
 PLANE_SHARE = 0.003  # of the distance, by which a plane is off beside the noise
 BESIDE = 20  # pixels around a mask in which the noise of the plane is measured
@@ -26,7 +25,7 @@ SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixe
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:
-    """Return the pixels whose positions lie in an upright box.
+    """Return the pixels with positions inside an upright box.
 
     Args:
         frame: the frame.
@@ -48,7 +47,7 @@ def inside_sphere(
     radius: float,
     part: Part = WHOLE,
 ) -> Mask:
-    """Return the pixels whose positions lie in a sphere.
+    """Return the pixels with positions inside a sphere.
 
     Args:
         frame: the frame.
@@ -67,7 +66,7 @@ def inside_sphere(
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) -> Mask:
-    """Return the pixels that are higher above a plane than the noise explains.
+    """Return the pixels that are above a plane by more than the noise.
 
     Args:
         frame: the frame.
@@ -83,7 +82,7 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     least = np.float32(PLANE_SHARE) * depth
     high = (height > least) & (depth > 0)
 
-    # Noise moves a point along its ray: it rises by so much as the ray does.
+    # Noise moves a point along its ray, so the height error depends on the slope of the ray.
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
     x = frame.rays[0][part[1]]
     y = frame.rays[1][part[0]]
@@ -109,12 +108,12 @@ def inside_mask(
     plane: Plane | None,
     noise: Noise,
 ) -> Mask:
-    """The pixels of a mask without the background at its edge and the support plane.
+    """Return the pixels of a mask without background at its edge and without the support plane.
 
     Args:
         frame: the frame.
         given: the mask, (H, W) bool.
-        plane: that the object stands on; None if it is not seen.
+        plane: support plane of the object; None if it is not visible.
         noise: of the frame.
     """
     if plane is None:
@@ -171,14 +170,14 @@ def touching(
     gap: float = TOUCHING_GAP,
     step: float = TOUCHING_STEP,
 ) -> bool:
-    """Whether two things meet in the picture and in depth.
+    """Return True if two objects touch in the image and in depth.
 
     Args:
-        frame: that shows them.
-        one: the pixels of one of them, (H, W) bool.
-        other: those of the other.
-        gap: metres between them in the picture, at most.
-        step: metres between their depths where they are nearest, at most.
+        frame: of both masks.
+        one: mask of one object, (H, W) bool.
+        other: mask of the other.
+        gap: largest gap between them in the image, metres.
+        step: largest depth difference at their closest pixels, metres.
     """
     part = within(one)
     away_from_camera = frame.depth[part][one[part]]

@@ -1,8 +1,9 @@
-"""The usual mistakes in what a depth camera gives, each a transformation that undoes it.
+"""Detect usual mistakes in depth and poses, each with the transformation that undoes it.
 
-A mistake is named where frames that disagree agree without it. All kinds are in one list, and one
-score decides: how many points of frames are contradicted by other frames (``agreement``). A new
-kind is one entry of ``usual_mistakes``, or of ``fitted_mistakes`` if it has a size.
+A mistake is reported if contradictory frames agree once it is undone. All kinds of mistakes are in
+one list and compared by one score, the share of points that other frames contradict
+(``agreement``). To add a kind, add an entry to ``usual_mistakes``, or to ``fitted_mistakes`` if it
+has a magnitude.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,24 +23,26 @@ from nextview.sensing.agreement import (
 from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.types import Float, Index, Mask
 
-# A mistake explains contradictions if so much of their share is left without it ...
+# A mistake explains contradictions if undoing it leaves at most this share of them, ...
 FEWER_CONTRADICTIONS = 0.5
-LEAST_EXPLAINED = 100  # ... if it explains so many ...
-LEAST_CONCERNED = 0.01  # ... and such a share of the points that it concerns ...
-LEAST_OVERLAP = 0.5  # ... of which this part can still be judged without it
-# Right poses of a real camera leave half of this share contradicted: of less no mistake is made.
+LEAST_EXPLAINED = 100  # ... resolves at least so many ...
+LEAST_CONCERNED = 0.01  # ... and at least this share of the affected points, ...
+LEAST_OVERLAP = 0.5  # ... and if at least this share of them can still be judged.
+# Correct poses of a real camera leave half of this share contradicted.
 LEAST_CONTRADICTED = 0.05
-# Frames look past each other if less than this part of what they see without a mistake is judged as
-# read, and so much of all that can be judged is judged without it.
+# A mistake explains a missing overlap if the frames as read have less than this share of the
+# judgements without the mistake, and these exceed this share of all possible judgements.
 NO_OVERLAP = 0.25
-# Share of the judgements that has to confirm without a mistake. The errors of a usual calibration
-# leave .88; of real frames whose poses are in any order, no mistake makes more than .2 confirm.
+# Least confirmed share once a mistake is undone. Usual calibration errors leave .88; for real
+# frames with shuffled poses, no mistake gives more than .2.
 WELL_EXPLAINED = 0.75
-# of two frames: share that confirms if most of what they show stands still
+# least confirmed share of two frames of a mostly static scene
 HALF_AGREES = 0.5
-# Cameras stand in one place within this part of the depth: less of a move does not show.
+# Cameras closer than this, relative to the depth, count as being in one place.
 ONE_PLACE = ROUGH.depth_tolerance
-SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
+SAME_POSE = (
+    1e-3  # tolerance of equal poses, for metres and elements of rotation matrices
+)
 
 UNIT_NAMES = {
     1.0: "metres",
@@ -49,36 +52,38 @@ UNIT_NAMES = {
     0.3048: "feet",
 }
 DEPTH_SCALES = (1000, 100, 10, 8, 5, 4, 2.5, 2, 0.5, 0.4, 0.25, 0.2, 0.1, 0.01, 0.001)
-"""By which the depth may be too large: the steps of cameras are 1, 0.5, 0.25, 0.2, 0.125 and 0.1
-mm.
+"""Factors by which the depth may be too large. The depth units of cameras are 1, 0.5, 0.25, 0.2,
+0.125 and 0.1 mm.
 """
-# that are tried together with another mistake
+# factors that are tried together with another mistake
 COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
-# times by which a depth scale is hardly ever wrong, and a unit of length often
+# a factor above this is rarely an error of the depth unit, and often one of the unit of length
 NEVER_A_DEPTH = 25
-# metres that a capture of an object may have as its median depth
+# metres, range of the median depth of a capture of an object
 PLAUSIBLE_DEPTH = (0.05, 15.0)
 
-MOST_FITTED = 20  # frames by which two mistakes, or one with a size, are searched for
-MOST_TRIALS = 120  # sizes that are tried
-# logarithms of the focal length that are tried first, from a half to twice
+MOST_FITTED = (
+    20  # frames used in the search for two mistakes, or for one with a magnitude
+)
+MOST_TRIALS = 120  # tried magnitudes
+# first tried logarithms of the focal length, from a half to twice
 FOCAL_STEPS = 0.05 * np.arange(-14, 15)
-LEAST_FOCAL_CHANGE = 0.05  # part of the focal length; less is a matter of calibration
-LEAST_OFFSET = 0.02  # metres; less is a matter of calibration
-FEWEST_STANDING = 10  # points of a frame whose middle tells where its object is
-# part of the largest singular value below which an offset has no effect in that direction
+LEAST_FOCAL_CHANGE = 0.05  # relative; smaller changes are calibration errors
+LEAST_OFFSET = 0.02  # metres; smaller offsets are calibration errors
+FEWEST_STANDING = 10  # least number of points whose mean locates the object
+# singular values below this share of the largest one mark unobservable directions
 NOT_OBSERVED = 1e-2
 
 
 @dataclass(frozen=True)
 class Stored:
-    """How frames and their poses are stored, so that a sentence can say what was expected.
+    """Storage conventions of frames and poses, so that messages can name the expected ones.
 
     Attributes:
-        to_world: whether the poses are camera-to-world; otherwise they are world-to-camera.
+        to_world: whether the poses are camera-to-world; otherwise world-to-camera.
         unit: of the translations, metres.
-        step: of the depth images, metres.
-        step_told_by: what tells that step.
+        step: unit of the depth images, metres.
+        step_told_by: source of that unit.
     """
 
     to_world: bool = True
@@ -89,12 +94,12 @@ class Stored:
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Frames and poses as they are taken to be: what a mistake transforms.
+    """Frames and poses as they were read, to which mistakes are applied.
 
     Attributes:
         views: N frames.
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
-        stored: how both were stored.
+        stored: storage conventions of both.
     """
 
     views: Sequence[SurfaceView]
@@ -103,14 +108,14 @@ class PosedViews:
 
     @property
     def median_depth(self) -> float:
-        """Metres; 0 without any point."""
+        """Median depth, metres; 0 without points."""
         depths = [
             np.median(view.points[:, 2]) for view in self.views if len(view.points)
         ]
         return float(np.median(depths)) if depths else 0.0
 
     def some(self, which: Index | Mask) -> "PosedViews":
-        """Some of the frames.
+        """Return a subset of the frames.
 
         Args:
             which: their indices, or (N,) bool.
@@ -119,21 +124,21 @@ class PosedViews:
         return replace(self, views=chosen, poses=self.poses[which])
 
     def with_poses(self, poses: Float) -> "PosedViews":
-        """The frames with other poses, (N, 4, 4)."""
+        """Return the frames with other poses, (N, 4, 4)."""
         return replace(self, poses=poses)
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """A kind of mistake, with the transformation of the input that undoes it.
+    """A kind of mistake, with the transformation that undoes it.
 
     Attributes:
         name: short.
-        kind: what it is a mistake in; two of one kind are not made at once.
-        sentence: what it looks like, the end of a sentence.
-        undone: makes the right input of the wrong one.
-        alone: whether it is not tried together with another mistake.
-        scale: by which the depth is too large, or the translations are too small.
+        kind: the affected quantity; two mistakes of one kind are not combined.
+        sentence: description, the end of a sentence.
+        undone: function that corrects the input.
+        alone: whether it is never combined with another mistake.
+        scale: factor by which the depth is too large, or the translations are too small.
     """
 
     name: str
@@ -144,19 +149,19 @@ class Mistake:
     scale: float = 1.0
 
     def right_pose(self, pose: Float) -> Float:
-        """The right pose if this mistake was made in one, camera-to-world, (4, 4)."""
+        """Return the corrected pose, camera-to-world, (4, 4)."""
         return self.undone(PosedViews((), pose[None])).poses[0]
 
 
 @dataclass(frozen=True)
 class FittedMistake:
-    """A kind of mistake that has a size.
+    """A kind of mistake with a magnitude.
 
     Attributes:
-        starts: where the search for the size begins, (K,) each; the best of them.
+        starts: start values of the search for the magnitude, (K,) each.
         step: of the search.
-        least: length of the size from which it is a mistake.
-        of_size: the mistake of some size, (K,).
+        least: least norm of the magnitude that is a mistake.
+        of_size: creates the mistake with a magnitude, (K,).
     """
 
     starts: Callable[[PosedViews], Sequence[Float]]
@@ -168,13 +173,13 @@ class FittedMistake:
 def find_mistake(posed: PosedViews) -> Mistake | None:
     """Return the mistake without which frames agree much better.
 
-    First each mistake is tried alone, then two at once.
+    Single mistakes are tried first, then pairs.
 
     Args:
-        posed: frames and poses as they are.
+        posed: frames and poses as read.
 
     Returns:
-        The mistake; None if the frames agree, or none explains why they do not.
+        The mistake; None if the frames agree, or no mistake explains the contradictions.
     """
     as_read = compare(posed.views, posed.poses)
     overlap = as_read.judged / max(_judgeable(posed.views), 1)
@@ -196,13 +201,13 @@ def likeliest(
     as_read: Agreement,
     part: Mask | None = None,
 ) -> Mistake | None:
-    """Return the mistake without which most points are confirmed, if it explains much.
+    """Return the mistake whose correction confirms most points, if it explains enough.
 
     Args:
-        posed: frames and poses as they are.
-        mistakes: that may have been made.
-        as_read: agreement of the frames as they are.
-        part: in which frames they may have been made, (N,) bool; in all by default.
+        posed: frames and poses as read.
+        mistakes: candidates.
+        as_read: agreement of the frames as read.
+        part: frames that may have the mistake, (N,) bool; all by default.
     """
     best = None
     most_confirmed = 0.0
@@ -229,18 +234,18 @@ def likeliest(
 def mistake_between(
     frame: Frame, last: Frame, scales: Sequence[float]
 ) -> Mistake | None:
-    """Return the mistake without which a frame agrees with the one before.
+    """Return the mistake without which a frame agrees with the previous one.
 
-    It may be in the depth of both frames, or in the pose of the latter. Frames that agree by half
-    have none: what stands in view may move.
+    It may be in the depth of both frames, or in the pose of the new one. Frames with at least half
+    agreement have no mistake, since objects in view may move.
 
     Args:
         frame: a frame with a pose.
-        last: the one before.
-        scales: by which the depth may be too large.
+        last: the previous frame.
+        scales: factors by which the depth may be too large.
 
     Returns:
-        The mistake; None if the frames agree, or none explains why they do not.
+        The mistake; None if the frames agree, or no mistake explains the contradictions.
     """
     views = [quick_view(one) for one in (last, frame)]
     poses = np.stack([last.camera_to_world, frame.camera_to_world])
@@ -262,10 +267,10 @@ def mistake_between(
 
 
 def explains(before: Agreement, after: Agreement) -> bool:
-    """Whether frames contradict each other much less without a mistake than with it.
+    """Return True if frames contradict each other much less once a mistake is undone.
 
     Args:
-        before: agreement as read, of the pairs of frames that the mistake concerns.
+        before: agreement as read, of the pairs of frames that the mistake affects.
         after: the same without the mistake.
     """
     explained = before.contradicted.sum() - after.contradicted.sum()
@@ -282,7 +287,7 @@ def _explains_all(
     posed: PosedViews,
     changed: Mask,
 ) -> bool:
-    """Whether a mistake explains why frames disagree, or why they look past each other."""
+    """Return True if a mistake explains contradictions, or a missing overlap, between frames."""
     if after.judged < LEAST_EXPLAINED or after.share < WELL_EXPLAINED:
         return False
     count = len(posed.views)
@@ -295,14 +300,14 @@ def _explains_all(
 
 
 def find_fitted(posed: PosedViews, kind: FittedMistake) -> Mistake | None:
-    """Return a mistake of the size without which frames agree best, if it explains much.
+    """Return the mistake with the magnitude without which frames agree best, if it explains enough.
 
     Args:
-        posed: frames and poses as they are.
+        posed: frames and poses as read.
         kind: of the mistake.
 
     Returns:
-        The mistake; None if the frames agree, or it does not explain why they do not.
+        The mistake; None if the frames agree, or it does not explain the contradictions.
     """
     as_read = compare(posed.views, posed.poses)
     if 1 - as_read.share < LEAST_CONTRADICTED:
@@ -330,12 +335,12 @@ def find_fitted(posed: PosedViews, kind: FittedMistake) -> Mistake | None:
 
 
 def _spread(count: int) -> Index:
-    """Frames of so many by which mistakes are searched for, evenly spread."""
+    """Return evenly spaced indices of the frames used in a search."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_FITTED)).astype(int))
 
 
 def relative_change(poses: Float, others: Float) -> Mask:
-    """Of which two cameras the pose relative to each other differs, (N, N).
+    """Return the pairs of cameras whose relative pose differs between two sets of poses, (N, N).
 
     Args:
         poses: camera-to-world, (N, 4, 4).
@@ -347,19 +352,19 @@ def relative_change(poses: Float, others: Float) -> Mask:
 
 
 def _judgeable(views: Sequence[SurfaceView]) -> float:
-    """How often points would be judged if all frames showed all of them, closely and roughly."""
+    """Return the number of judgements if all frames saw all points, with both tolerances."""
     return 2.0 * sum(len(view.points) for view in views) * (len(views) - 1)
 
 
 def _in_one_place(posed: PosedViews) -> bool:
-    """Return whether all cameras stand in one place, where rotations cannot be told."""
+    """Return True if all cameras are in one place, where rotations cannot be verified."""
     places = posed.poses[:, :3, 3]
     apart = np.linalg.norm(places - np.median(places, 0), axis=1)
     return bool(np.quantile(apart, 0.9) < ONE_PLACE * posed.median_depth)
 
 
 def _pairs(single: Sequence[Mistake]) -> Iterator[Mistake]:
-    """Two mistakes at once, of two kinds; the one that comes first in the list is undone first."""
+    """Combine mistakes of different kinds in pairs; the first one in the list is undone first."""
     single = [mistake for mistake in single if not mistake.alone]
     for i, first in enumerate(single):
         for second in single[i + 1 :]:
@@ -380,16 +385,16 @@ def _one_after_the_other(
     return lambda posed: second.undone(first.undone(posed))
 
 
-# The list
+# List of mistakes
 
 
 def usual_mistakes(posed: PosedViews) -> list[Mistake]:
-    """All kinds of mistakes without a size, as they are made where poses are stored in some way.
+    """Return all mistakes without a magnitude that are possible with the storage conventions.
 
-    Late poses are a matter of the order of frames, see ``captured.late_poses``.
+    Late poses depend on the order of the frames, see ``captured.late_poses``.
 
     Args:
-        posed: frames and poses as they are.
+        posed: frames and poses as read.
     """
     return [
         *mistakes_in_poses(posed.stored.to_world),
@@ -400,10 +405,10 @@ def usual_mistakes(posed: PosedViews) -> list[Mistake]:
 
 
 def fitted_mistakes(focal_length: float) -> dict[str, FittedMistake]:
-    """The kinds of mistakes that have a size, by name.
+    """Return the kinds of mistakes that have a magnitude, by name.
 
     Args:
-        focal_length: of the frames, pixels, for the sentence.
+        focal_length: of the frames, pixels, for the message.
     """
     return {
         "focal length": FittedMistake(
@@ -422,7 +427,7 @@ def fitted_mistakes(focal_length: float) -> dict[str, FittedMistake]:
 
 
 def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
-    """Those that a single pose can have: axes, inverse ones, and pictures that are turned.
+    """Return the mistakes of single poses: axes, inverse poses, and rotated images.
 
     Args:
         to_world: whether camera-to-world poses were expected.
@@ -510,7 +515,7 @@ def _mirrored_pictures() -> list[Mistake]:
 
 
 def _mistakes_in_quaternions() -> list[Mistake]:
-    """Of poses that are stored either way: the files may hold the inverse ones."""
+    """Return mistakes in the order of quaternions, for files of poses or of inverse poses."""
     return [
         Mistake(
             "quaternions",
@@ -527,13 +532,13 @@ def _mistakes_in_quaternions() -> list[Mistake]:
 
 
 def _all_scales(stored: Stored) -> list[float]:
-    """Ratios of the units of length and of the steps of depth images."""
+    """Return ratios of units of length and of depth units."""
     units = {round(unit / stored.unit, 6) for unit in UNIT_NAMES if unit != stored.unit}
     return sorted(units | set(DEPTH_SCALES))
 
 
 def _scales(posed: PosedViews, scales: Sequence[float]) -> list[Mistake]:
-    """Another unit of the translations, or another step of the depth: the same but for a scale."""
+    """Return mistakes in the unit of translations or of depth, which are equivalent up to scale."""
     return [
         Mistake(
             f"scale {scale:g}",
@@ -548,7 +553,7 @@ def _scales(posed: PosedViews, scales: Sequence[float]) -> list[Mistake]:
 
 
 def _scale_in_words(scale: float, posed: PosedViews) -> str:
-    """Translations have to be multiplied by a scale, or depths divided by it."""
+    """Describe the correction: multiply translations by a scale, or divide depths by it."""
     stored = posed.stored
     unit = stored.unit * scale
     other = min(UNIT_NAMES, key=lambda each: abs(np.log(each / unit)))
@@ -572,12 +577,12 @@ def _scale_in_words(scale: float, posed: PosedViews) -> str:
 
 
 def _is_plausible(depth: float) -> bool:
-    """Whether a median depth, metres, may be that of a frame that shows an object."""
+    """Return True if a median depth, metres, is plausible for a frame of an object."""
     return PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]
 
 
 def _wrong_focal_length(log_times: float, given: float) -> Mistake:
-    """A focal length, pixels, that has to be multiplied by the exponential of a number."""
+    """Return the mistake of a focal length, pixels, that must be multiplied by exp(log_times)."""
     times = float(np.exp(log_times))
     wrong = 1 / times - 1
     size = "long" if wrong > 0 else "short"
@@ -594,7 +599,7 @@ def _wrong_focal_length(log_times: float, given: float) -> Mistake:
 
 
 def _offset_camera(offset: Float) -> Mistake:
-    """Poses beside which the cameras stand, by an offset along their own axes, (3,), metres."""
+    """Return the mistake of poses with a constant offset in the camera frame, (3,), metres."""
     where = ", ".join(f"{value:+.2f}" for value in offset)
     sentence = (
         f"the camera stands some {100 * np.linalg.norm(offset):.0f} cm beside its poses, the same"
@@ -611,11 +616,11 @@ def _offset_camera(offset: Float) -> Mistake:
 
 
 def _offset_of_middles(posed: PosedViews) -> Float:
-    """Return the offset, (3,), metres, that brings the object's middles closest together.
+    """Estimate the offset, (3,), metres, that aligns the object's centre in all frames.
 
-    Least squares in the place w of the object and the offset d, with w - R d = R c + t for the
-    middle c that a camera of the pose (R, t) sees. Cameras see the near side of the object: that is
-    an error along their axes.
+    Least squares in the object position w and the offset d, with w - R d = R c + t for the centre c
+    seen by a camera with pose (R, t). Cameras see only the near side of the object, which causes an
+    error along their axes.
     """
     matrix = []
     middles = []
@@ -636,7 +641,7 @@ def _offset_of_middles(posed: PosedViews) -> Float:
     return solution[3:]
 
 
-# Transformations of poses, camera-to-world, (N, 4, 4)
+# Transformations of camera-to-world poses, (N, 4, 4)
 
 
 def _posed(change: Callable[[Float], Float]) -> Callable[[PosedViews], PosedViews]:
@@ -647,7 +652,7 @@ def _in_stored(
     change: Callable[[Float], Float],
     to_world: bool,
 ) -> Callable[[Float], Float]:
-    """A change of camera-to-world poses by one of the poses as they are stored."""
+    """Apply a change of the stored poses to camera-to-world poses."""
     if to_world:
         return change
     return lambda poses: _inverted(change(_inverted(poses)))
@@ -688,12 +693,12 @@ def _translation_inverted(poses: Float) -> Float:
 
 
 def _quaternion_rolled(steps: int) -> Callable[[Float], Float]:
-    """The rotations if the quaternions x, y, z, w that give them are in another order."""
+    """Return the rotations for another order of the quaternion components x, y, z, w."""
 
     def rolled(poses: Float) -> Float:
         poses = poses.copy()
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        # (x, y, z, w) as read are w, x, y, z in truth: they move to the left by one.
+        # e.g. (x, y, z, w) as read are w, x, y, z: roll to the left by one
         right = np.roll(quaternions, -steps, axis=1)
         poses[:, :3, :3] = Rotation.from_quat(right).as_matrix()
         return poses

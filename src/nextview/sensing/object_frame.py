@@ -1,4 +1,4 @@
-"""Where the object is in the world: the frame in which nextview thinks of it."""
+"""The object frame: centre, radius and axes of an object in the world."""
 
 from dataclasses import dataclass, field
 from itertools import chain, combinations
@@ -18,12 +18,12 @@ from nextview.types import Float
 class ObjectFrame:
     """The centre, the radius and the axes of an object.
 
-    Positions in the object frame are in object radii. UsageError is raised if the axes are no
+    Positions in the object frame are in object radii. A UsageError is raised if the axes are not a
     rotation, or the radius is not positive.
 
     Attributes:
         centre: (3,), world, metres.
-        radius: of the sphere about the centre that holds the object, metres.
+        radius: of the enclosing sphere around the centre, metres.
         axes: rows are the x, y and z (up) axes of the object in the world, (3, 3).
     """
 
@@ -48,7 +48,8 @@ class ObjectFrame:
 
         Args:
             pose: (..., 4, 4), object frame, object radii.
-            distance: of the cameras from the object's centre, metres; None to keep their distance.
+            distance: new distance of the cameras from the object's centre, metres; None for no
+                change.
 
         Returns:
             Poses, (..., 4, 4), world, metres, OpenCV axes.
@@ -64,9 +65,9 @@ class ObjectFrame:
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box in the world that fits the object tightly.
+    """An upright bounding box of the object in the world.
 
-    UsageError is raised if it has no volume, or the axes are no rotation.
+    A UsageError is raised if it has no volume, or the axes are not a rotation.
 
     Attributes:
         low: lower corner, (3,), metres, along the axes.
@@ -95,7 +96,7 @@ class Box:
 
     @property
     def object_frame(self) -> ObjectFrame:
-        """That of an object which fills the box to its corners."""
+        """Object frame of an object that fills the box."""
         middle = (self.low + self.high) / 2
         diagonal = float(np.linalg.norm(self.high - self.low))
         return ObjectFrame(middle @ self.axes, diagonal / 2, self.axes)
@@ -115,9 +116,9 @@ def _rotation(values: Any, what: str) -> Float:
 def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
     """Return the object frame of points on an object.
 
-    The centre is the middle of the smallest circle around all points seen from above, half way
-    between top and bottom. Of two walls of a box that meet at a right angle, a circle gives the
-    middle of the whole box.
+    The centre is the centre of the smallest circle around all points in the top view, halfway
+    between bottom and top. For two visible sides of a box at a right angle, this is the centre of
+    the whole box.
 
     Args:
         points: (N, 3), world, metres.
@@ -128,7 +129,7 @@ def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
         The object frame.
 
     Raises:
-        ObservationError: all points are in one place.
+        ObservationError: all points coincide.
     """
     upright = points @ axes.T
     low = upright.min(0)
@@ -149,10 +150,10 @@ def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
 
 
 def smallest_circle(points: Float) -> tuple[Float, float]:
-    """Centre (2,) and radius of the smallest circle that holds all points, (N, 2).
+    """Return centre, (2,), and radius of the smallest enclosing circle of points, (N, 2).
 
-    The farthest point joins those that hold the circle, at most three, until none is outside; each
-    time it grows.
+    The farthest point is added to the points that define the circle, at most three, until no point
+    is outside; the circle grows in each step.
     """
     corners = points[:1]
     centre = points[0]
@@ -169,7 +170,7 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
             np.array,
             chain(combinations(corners, 2), combinations(corners, 3)),
         ):
-            # equally far from all, or the middle of those in line:
+            # equidistant from all points, or the midpoint of collinear ones
             edges = chosen[1:] - chosen[0]
             middle = (
                 chosen[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]
@@ -179,5 +180,5 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
             )
         reach, corners, centre = min(fits, key=lambda fit: fit[0])
         if reach <= radius:
-            return centre, radius  # rounding: no better circle is to be had
+            return centre, radius  # no further progress within rounding errors
         radius = float(reach)

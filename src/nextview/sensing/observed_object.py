@@ -1,4 +1,4 @@
-"""An object as a camera comes to know it: frames in, observations out."""
+"""An object observed in a sequence of frames."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
-# share of an object's pixels by which another parting differs, at least
+# least share of an object's pixels by which another segmentation differs
 OTHER_SHARE = 0.03
-# change of the centre or the radius, in object radii, below which the object frame is left as it is
+# change of centre or radius, in object radii, below which the object frame is kept
 SAME_FRAME = 0.01
 NO_OUTLINE = (
     "an object that stands on no plane (support=False) is told from what holds it by a mask in each"
@@ -60,16 +60,16 @@ NO_PLANE = ViewWarning(
 
 @dataclass(frozen=True)
 class ObjectState:
-    """What is known of an object after some frames.
+    """State of an object after some frames.
 
     Attributes:
         frame: the object frame; None before the object is found.
-        sightings: what each frame shows of the object.
+        sightings: of the object, one per frame.
         observations: of the frames, in the latest object frame.
         warnings: about the latest frame.
-        revision: how often the object frame changed.
-        parting: what of the segmentation is the object.
-        partings: by which the latest frame shows it in other pixels.
+        revision: number of changes of the object frame.
+        parting: part of the segmentation that is the object.
+        partings: alternatives that give other pixels in the latest frame.
     """
 
     frame: ObjectFrame | None = None
@@ -82,33 +82,36 @@ class ObjectState:
 
 
 class ObservedObject:
-    """One object, seen in more and more frames. ``add`` takes a frame and gives an observation.
+    """One object observed in a sequence of frames. ``add`` turns a frame into an observation.
 
-    The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as
-    the instance of the segmentation that is nearest to a ``point``, or at which the first camera is
-    aimed. Its centre and radius are those of the box, or estimated from all frames that show enough
-    of it. When they get better the earlier frames are expressed anew: ``observations`` are always
-    all in the same, latest object frame, and ``revision`` counts how often it changed. Its x axis
-    points towards the first camera, unless a box or a known frame says otherwise.
+    The object is located in each frame by the frame's mask; otherwise by a ``box``; otherwise it is
+    the segmented instance nearest to a ``point``, or at which the first camera is aimed. Its centre
+    and radius are those of the box, or are estimated from all frames that show enough of it. When
+    the estimate improves, earlier frames are recomputed: all ``observations`` are in the latest
+    object frame, and ``revision`` counts its changes. The x axis points towards the first camera,
+    unless a box or a known frame defines it.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
 
     Args:
-        up: direction against gravity in the world, (3,); z by default. None: the normal of the
-            support plane of the first frame. Frames without a pose have no other way.
+        up: direction against gravity in the world, (3,); z by default. With None, and for frames
+            without a pose, the normal of the support plane in the first frame is used.
         point: near the object, world, metres, (3,).
-        box: upright, into which the object just fits.
-        support: whether the object stands on a plane in view. False for a gripper or a turntable:
-            then the object is given by the mask of each frame, by a box or by its known frame.
-        known: the object frame, if it need not be estimated; the object is what lies in its sphere.
-        denoise: smooth depth, fill holes and drop flying pixels. For sensors; renders need it not.
-        life_size: whether the object is as large as its kind is in life: then the radius is
-            evidence of the class.
-        segmentation: that tells the things in frames, see ``nextview.Scene``; None for the bundled
+        box: upright bounding box of the object.
+        support: whether the object stands on a visible plane. Set False for a gripper or a
+            turntable; the object must then be given by the mask of each frame, by a box or by its
+            known frame.
+        known: the object frame, if it need not be estimated; the object is everything in its
+            sphere.
+        denoise: smooth depth, fill holes and drop flying pixels. For real sensors; not needed for
+            renders.
+        life_size: whether the object has the usual size of its class, so that the radius is
+            evidence.
+        segmentation: segments the objects in frames, see ``nextview.Scene``; None for the bundled
             network.
-        parting: what of the segmentation is the object: an "instance"; or, as for a thing that
-            stands alone, one with all that is "touching" it; or a "piece" of one.
+        parting: part of the segmentation that is the object: an "instance"; or, for an object that
+            stands alone, an instance with everything "touching" it; or a "piece" of one.
     """
 
     def __init__(
@@ -140,7 +143,7 @@ class ObservedObject:
 
     @property
     def object_frame(self) -> ObjectFrame:
-        """Where the object is, as far as it is known; ObservationError before the first frame."""
+        """Latest object frame; an ObservationError is raised before the first frame."""
         if self.state.frame is None:
             raise ObservationError(
                 "no frame was added yet, so nothing is known of the object"
@@ -149,28 +152,28 @@ class ObservedObject:
 
     @property
     def sightings(self) -> tuple[Sighting, ...]:
-        """What each frame shows of the object, in order."""
+        """Sightings of the object in all frames, in order."""
         return self.state.sightings
 
     @property
     def observations(self) -> list[Observation]:
-        """One for each frame, in order, all in the latest object frame."""
+        """Observations of all frames, in order, in the latest object frame."""
         return list(self.state.observations)
 
     @property
     def warnings(self) -> list[ViewWarning]:
-        """What is likely to be wrong with the last frame; usually nothing."""
+        """Likely problems of the last frame; usually empty."""
         return list(self.state.warnings)
 
     @property
     def revision(self) -> int:
-        """How often earlier observations changed."""
+        """Number of times that earlier observations have changed."""
         return self.state.revision
 
     def add(self, frame: Frame) -> Observation:
-        """Take in a frame and return its observation from three object radii.
+        """Process a frame and return its observation from three object radii.
 
-        ObservationError where the object is not found in it; the frame is then not taken in.
+        An ObservationError is raised if the object is not found; the frame is then not used.
 
         Args:
             frame: of a depth camera.
@@ -182,12 +185,12 @@ class ObservedObject:
         self,
         p_value: Callable[[Sequence[Observation]], float],
     ) -> None:
-        """Decide what of the segmentation is the object, by what explains its views best.
+        """Choose the part of the segmentation that is the object by the best-explained views.
 
-        It may be an instance, an instance with all that touches it, or a piece of one.
+        Candidates are an instance, an instance with everything that touches it, or a piece of one.
 
         Args:
-            p_value: of some views of it as views of a known thing.
+            p_value: function from views to their p-value as views of a known thing.
         """
         found = [self.state]
         for parting in self.state.partings:
@@ -203,7 +206,7 @@ class ObservedObject:
             self.state = found[int(np.argmax(values))]
 
     def _after(self, frame: Frame) -> ObjectState:
-        """The state after a frame: all stages from the frame to its observation, in order."""
+        """Return the state after a frame, running all stages from frame to observation."""
         before = self.state
         known = self._known_frames
         known.refuse(frame)
@@ -252,26 +255,25 @@ class ObservedObject:
         return replace(after, warnings=tuple(warnings), partings=partings)
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
-        """Know the object by some sightings, whatever was known of it before.
+        """Replace the state of the object by some sightings.
 
-        Sightings that were known already keep their observations as long as the object frame stays
-        as it was.
+        Known sightings keep their observations as long as the object frame does not change.
 
         Args:
             sightings: at least one, see ``sighting_of``.
             up: direction against gravity, (3,), world.
 
         Raises:
-            ObservationError: what is seen of the object has no size.
+            ObservationError: the visible part of the object has no extent.
         """
         self.state = replace(self._known_by(sightings, up), warnings=())
         self.state = replace(self.state, warnings=self.warnings_of_view(-1))
 
     def warnings_of_view(self, number: int) -> tuple[ViewWarning, ...]:
-        """What is likely to be wrong with a view, by its frame and by the views before it.
+        """Return likely problems of a view, from its frame and its comparison with earlier views.
 
         Args:
-            number: of the view, from 0, or from -1 backwards.
+            number: of the view, from 0, or backwards from -1.
         """
         observations = self.state.observations
         warnings = list(self.state.sightings[number].warnings)
@@ -279,13 +281,13 @@ class ObservedObject:
         if not any(warning.holds for warning in warnings):
             last = range(len(observations))[number]
             found = plausibility.check_last_view(observations[: last + 1])
-            if found:  # errors of the poses alone are no contradiction
+            if found:  # pose errors alone are no contradiction
                 found = plausibility.check_last_view(self._without_displacements(last))
             warnings += found
         return tuple(warnings)
 
     def _without_displacements(self, last: int) -> list[Observation]:
-        """The observations up to one, as if no pose displaced the object."""
+        """Return the observations up to one, without the displacements caused by pose errors."""
         first, *others = self.state.sightings[: last + 1]
         mended = [first]
         for sighting in others:
@@ -298,7 +300,7 @@ class ObservedObject:
 
     @property
     def _known_frames(self) -> KnownFrames:
-        """What is known before another frame."""
+        """Known world against which a new frame is checked."""
         sightings = self.state.sightings
         known = self.known
         return KnownFrames(
@@ -310,13 +312,13 @@ class ObservedObject:
         )
 
     def _up(self, frame: Frame) -> Float | None:
-        """Direction against gravity, (3,), world; None where nothing tells it yet."""
+        """Return the direction against gravity, (3,), world; None if it is not known yet."""
         if self.state.frame is not None:
             return self.state.frame.axes[2]
         return None if frame.pose is None else self.up
 
     def _instances(self, frame: Frame, up: Float | None) -> Instances:
-        """The instances of a frame and its surfaces; a mask of the frame is the only one."""
+        """Return instances and surfaces of a frame; its mask, if any, is the only instance."""
         found = instances_of(self.segmentation, frame, up)
         if frame.mask is None:
             return found
@@ -332,10 +334,10 @@ class ObservedObject:
         instances: Instances | None,
         parting: Parting,
     ) -> Mask:
-        """Where the object is: in the mask, in its box or sphere, or an instance, (H, W) bool.
+        """Return the object's pixels: its mask, box, sphere or instance, (H, W) bool.
 
         Raises:
-            ObservationError: nothing is there.
+            ObservationError: there are none.
         """
         if frame.mask is not None:
             return frame.mask
@@ -358,10 +360,10 @@ class ObservedObject:
         supports: Supports | None,
         up: Float | None,
     ) -> Plane | None:
-        """The plane on which the object stands; None if it is not seen.
+        """Return the support plane of the object; None if it is not visible.
 
         Raises:
-            ObservationError: a first frame's pose is wrong, or its depth is a range.
+            ObservationError: the pose of a first frame is wrong, or its depth is a range.
         """
         if supports is None:
             return None
@@ -389,13 +391,13 @@ class ObservedObject:
         plane: Plane | None,
         noise: Noise,
     ) -> Mask:
-        """The object's pixels without those of its support, (H, W) bool.
+        """Return the object's pixels without those of its support, (H, W) bool.
 
         Raises:
-            ObservationError: too little is seen of it.
+            ObservationError: too little of it is visible.
         """
         if frame.mask is not None and self.known is not None:
-            return pixels  # its size does not hang on pixels at the edge
+            return pixels  # the size does not depend on pixels at the edge
         if frame.mask is not None or self.known is None:
             return inside_mask(frame, pixels, plane, noise)
         mask = pixels if plane is None else pixels & above_plane(frame, plane, noise)
@@ -406,7 +408,7 @@ class ObservedObject:
         return mask
 
     def _known_by(self, sightings: Sequence[Sighting], up: Float) -> ObjectState:
-        """The state by some sightings: estimate the object frame, and resample what changed."""
+        """Return the state for some sightings, with changed views resampled."""
         before = self.state
         object_frame = self._estimate_frame(sightings, up)
         kept = {}
@@ -430,7 +432,7 @@ class ObservedObject:
         )
 
     def _estimate_frame(self, sightings: Sequence[Sighting], up: Float) -> ObjectFrame:
-        """The object frame by some sightings; that of earlier frames where it stays the same."""
+        """Return the object frame of some sightings; the earlier one if the change is small."""
         if self.known is not None:
             return self.known
         before = self.state.frame
@@ -445,7 +447,7 @@ class ObservedObject:
         return object_frame_of(sightings, upright_axes(up, front))
 
     def _check(self, after: ObjectState, plane: Plane | None) -> list[ViewWarning]:
-        """Return likely faults of what a frame shows of the object."""
+        """Return likely problems of a frame of the object."""
         before = self.state
         assert after.frame is not None
         warnings = plausibility.check_observation(after.observations[-1])
@@ -470,5 +472,5 @@ def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
 
 
 def _differ(one: Mask, other: Mask) -> bool:
-    """Whether two sets of pixels, (H, W) bool, differ by more than noise."""
+    """Return True if two masks, (H, W) bool, differ by more than noise."""
     return bool(np.count_nonzero(one != other) > OTHER_SHARE * np.count_nonzero(one))

@@ -1,8 +1,8 @@
-"""Facets that belong to no surface of the object: flying pixels, and scraps of what is behind it.
+"""Remove outlier facets: flying pixels, and fragments of the background.
 
-One of them would set the object's radius. Two filters, as in the Point Cloud Library (Rusu and
-Cousins 2011): a point with few neighbours in space is an outlier, and so is a small group of points
-away from all others. Neighbours in space are looked for among the neighbours in the picture.
+A single outlier would determine the object's radius. The two filters are those of the Point Cloud
+Library (Rusu and Cousins 2011): points with few neighbours in space, and small isolated clusters.
+Neighbours in space are searched among the neighbours in the image.
 """
 
 from __future__ import annotations
@@ -13,37 +13,37 @@ from scipy import ndimage
 from nextview.sensing.facets import Facets, Noise, count_beside
 from nextview.types import Float, Index, Mask
 
-# pixels to each side among which the neighbours of a point are looked for
+# half the side of the window in which neighbours are searched, pixels
 NEIGHBOUR_WINDOW = 2
-# of 24: at the tip of a thing that is two pixels thin there are as many
+# of 24: as many as at the tip of an object that is two pixels wide
 FEWEST_NEIGHBOURS = 5
 STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
-NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
-# share of all points that a group away from the others has at least
+NOISE_GAP = 4.0  # largest depth difference of neighbours, in standard deviations
+# least share of all points in an isolated cluster that is kept
 SMALLEST_GROUP = 0.01
-GAP_PIXELS = 6  # pixels that two groups are apart
-# share of the nearest and the farthest points left out, by the noise as a part of the size
+GAP_PIXELS = 6  # pixels between isolated clusters
+# trimmed share of the nearest and the farthest points, per noise relative to the size
 TRIMMED_BY_NOISE = 0.1
 MOST_OUTLIERS = 0.01
 
 
 def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
-    """The facets that lie on a surface of some size.
+    """Return the facets that lie on a surface of some extent.
 
     Args:
-        facets: of an object, one for each square of ``coarse`` pixels.
+        facets: of an object, one per square of ``coarse`` pixels.
         noise: of the frame.
         coarse: pixels.
 
     Returns:
-        Those that are left; all of them where none would be.
+        The remaining facets; all of them if none would remain.
     """
     rows = facets.rows // coarse
     columns = facets.columns // coarse
     points = facets.points
     depth = points[:, 2]
 
-    # between neighbouring points of a surface that faces the camera
+    # spacing of neighbouring points on a surface that faces the camera
     spacing = float(facets.pitch.mean()) * depth
     error = NOISE_GAP * noise.at(depth) * depth**2 / coarse
     kept = np.flatnonzero(
@@ -64,11 +64,11 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
 
 
 def _within_its_depths(points: Float, error: Float) -> Mask:
-    """Which points, (N, 3), are not the nearest or the farthest few, (N,) bool.
+    """Trim the nearest and the farthest points, (N, 3), in depth; returns (N,) bool.
 
-    Where the noise is a large part of an object's size no neighbour tells a flying pixel, which
-    lies before or behind the object, from noise. So the more noise there is for its size, the more
-    of its outermost depths are left out.
+    If the noise is large relative to the object, neighbours cannot separate flying pixels, which
+    lie in front of or behind the object, from noise. The trimmed share therefore grows with the
+    relative noise.
     """
     if not len(points):
         return np.zeros(0, bool)
@@ -89,10 +89,10 @@ def _enough_neighbours(
     slope: Float,
     error: Float,
 ) -> Mask:
-    """Which pixels, (N,), have FEWEST_NEIGHBOURS around them that are as deep.
+    """Return which pixels, (N,), have FEWEST_NEIGHBOURS neighbours at a similar depth.
 
-    Depths may differ by a slope for each pixel between, and an error. Most pixels have so many
-    among the eight beside them; the wider window is looked at for the others only.
+    Depths may differ by a slope per pixel and an error. Most pixels pass with their eight direct
+    neighbours; the larger window is tested only for the others.
     """
     picture = np.full(
         (
@@ -129,7 +129,7 @@ def _enough_neighbours(
 
 
 def _groups(rows: Index, columns: Index, layers: Index) -> Index:
-    """Return the group of each point, (N,): touching cells of the view are one group."""
+    """Return the cluster of each point, (N,): touching cells of the view form one cluster."""
     at = (rows - rows.min(), columns - columns.min(), layers)
     size = [int(index.max()) + 1 for index in at]
     cells = np.zeros(size, bool)

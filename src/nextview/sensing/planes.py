@@ -1,4 +1,4 @@
-"""Planes in a frame, found by RANSAC and refined by least squares."""
+"""Find planes in a frame by RANSAC and refine them by least squares."""
 
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -11,39 +11,41 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Floats, Index, Mask
 
-# planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
+# hypotheses per search: with one point in ten on the plane, 0.8 of all searches find it
 TRIALS = 200
-# cosine of the lean of a support plane, at most: errors of a calibration
+# cosine of the largest tilt of a support plane, due to calibration errors
 TILT = np.cos(np.radians(12.0))
-# the same, at which a plane counts nothing when planes are compared
+# cosine of the tilt at which the weight of a plane is zero
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
-# share of what is seen that lies on a support plane, at least; more if gravity is not known
+# least share of the samples on a support plane; more if gravity is not known
 LEAST_SUPPORT = 0.04
 LEAST_ALONE = 0.15
-# times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
+# least gain of samples on a plane if depth is read as range: small, as narrow lenses bend it little
 RANGE = 1.05
-BLOCKS_SAMPLED = 1500  # blocks of pixels in which planes are searched
-LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
-STEEP_LAG = 2  # samples between two that tell how steep a surface is
-# error of a camera's pose, at most: by it a plane known from earlier frames is moved in this one
+BLOCKS_SAMPLED = (
+    1500  # approximate number of blocks of pixels in which planes are searched
+)
+LARGE_SIDE = 8  # pixels, side of a block from which only every second pixel is used
+STEEP_LAG = 2  # distance of two samples whose slope is measured
+# largest pose error, which displaces a known plane in a new frame
 POSE_SHIFT = 0.02  # metres
 POSE_TURN = np.radians(2.0)
-# tolerances from a plane up to which few samples lie beside it, if it is a surface that is seen
+# distance from a visible plane, in tolerances, up to which few samples are off the plane
 TOLERANCES_ASIDE = 3.0
-STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
-# times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
+STEEP_RISE = 0.7  # rise of a steep surface, relative to the distance
+# largest gain of precision by averaging a block, limited by errors of the lens
 MOST_ALONE = 4.0
 
 
 @dataclass(frozen=True)
 class Samples:
-    """A grid of points of a frame, with their tolerance from a plane.
+    """A grid of points of a frame, with their tolerances.
 
     Attributes:
         points: (N, 3), world, metres.
-        tolerance: distance from a plane within which each point may belong to it, metres, (N,).
-        rows: of the blocks in the picture, (N,).
-        columns: of the blocks in the picture, (N,).
+        tolerance: largest distance of each point from a plane that it belongs to, metres, (N,).
+        rows: of the blocks in the image, (N,).
+        columns: of the blocks in the image, (N,).
         camera: position of the camera, (3,), world, metres.
     """
 
@@ -54,7 +56,7 @@ class Samples:
     camera: Float
 
     def some(self, which: Mask) -> "Samples":
-        """Those of a choice, (N,) bool."""
+        """Return a subset, (N,) bool, of the samples."""
         return Samples(
             self.points[which],
             self.tolerance[which],
@@ -65,15 +67,14 @@ class Samples:
 
 
 def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
-    """Return the means over blocks of pixels.
+    """Average a frame over blocks of pixels.
 
-    The mean inverse depth of pixels of a plane is that at the mean of their places in the picture,
-    with less noise than that of one. A block is left out if fewer than half of its pixels are
-    given.
+    For pixels of a plane, the mean inverse depth is exact at their mean image position, with less
+    noise than a single pixel. Blocks with fewer than half of their pixels given are left out.
 
     Args:
         frame: the frame.
-        pixels: pixels to use, (H, W) bool; all have a depth.
+        pixels: pixels to use, (H, W) bool; all with valid depth.
         noise: of the frame.
 
     Returns:
@@ -83,7 +84,7 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
     if (
         side >= LARGE_SIDE
-    ):  # every second pixel is enough: those side by side err together anyway
+    ):  # every second pixel is enough, as errors of neighbours are correlated
         step = 2
         side //= step
     few = (slice(None, None, step), slice(None, None, step))
@@ -105,7 +106,7 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
         :3,
     ].T + pose[:3, 3]
     erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
-    # root of how many err for themselves
+    # square root of the number of independent errors
     alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
     return Samples(
         points,
@@ -124,7 +125,7 @@ def _block_sums(values: Floats, side: int) -> Float:
 
 
 def _sums_along(values: Floats, side: int) -> Floats:
-    """Sums of each ``side`` rows that follow each other: faster than a reduction over an axis."""
+    """Return sums over ``side`` consecutive rows each, faster than a reduction over an axis."""
     sums = values[::side].copy()
     for first in range(1, side):
         sums += values[first::side]
@@ -136,10 +137,10 @@ class Plane:
     """A plane: ``normal @ p + offset`` is the height of a position p, metres.
 
     Attributes:
-        normal: of unit length, (3,).
+        normal: unit vector, (3,).
         offset: metres.
-        lean_error: by how much it may lean, as far as the thickness and the extent of what is seen
-            of it tell, radians, one standard deviation; 0 where that is not known.
+        lean_error: standard deviation of the tilt, from thickness and extent of the visible part,
+            radians; 0 if not known.
     """
 
     normal: Float
@@ -147,15 +148,15 @@ class Plane:
     lean_error: float = 0.0
 
     def height(self, points: Float) -> Float:
-        """Of points (..., 3) above the plane, metres."""
+        """Return the height of points, (..., 3), above the plane, metres."""
         return points @ self.normal + self.offset
 
     def holds(self, samples: Samples) -> Mask:
-        """Which samples are on it, (N,) bool."""
+        """Return which samples are on the plane, (N,) bool."""
         return np.abs(self.height(samples.points)) < samples.tolerance
 
     def extent(self, samples: Samples) -> Float:
-        """Return the samples on the plane, (M, 3), connected with most of them."""
+        """Return the samples, (M, 3), in the largest connected part of the plane."""
         on = self.holds(samples)
         if not on.any():
             return samples.points[on]
@@ -166,7 +167,7 @@ class Plane:
 
 
 def axes_along(plane: Plane) -> Float:
-    """Two directions along a plane, perpendicular to each other, (2, 3)."""
+    """Return two orthonormal directions along a plane, (2, 3)."""
     first = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(plane.normal, first)])
@@ -180,7 +181,7 @@ def steep(samples: Samples, up: Float) -> Mask:
         up: direction against gravity, (3,).
 
     Returns:
-        Whether each is on such a surface, by its neighbours above and below in the picture, (N,)
+        Whether each is on such a surface, by its neighbours above and below in the image, (N,)
         bool.
     """
     upright = np.zeros(len(samples.points), bool)
@@ -203,16 +204,16 @@ def find_plane(
     up: Float | None = None,
     above: Float | None = None,
 ) -> Plane | None:
-    """Find the plane with most samples by RANSAC (Fischler and Bolles 1981).
+    """Find the plane with the most samples by RANSAC (Fischler and Bolles 1981).
 
     Args:
         samples: the samples.
         rng: source of all random numbers.
-        up: direction to which the plane is perpendicular, (3,); None for any plane.
-        above: point that lies above the plane, as the camera does, (3,); None for none.
+        up: normal of the plane, up to a small tilt, (3,); None for any plane.
+        above: point above the plane, such as the camera position, (3,); None for none.
 
     Returns:
-        The plane; None if too few samples lie on any.
+        The plane; None if no plane has enough samples.
     """
     points = samples.points
     if len(points) < 10:
@@ -220,7 +221,7 @@ def find_plane(
     a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
     normals = np.cross(b - a, c - a)
     if up is not None:
-        # one point is enough where the direction is known; the triples find what leans a little
+        # one point is enough if the normal is known; triples find slightly tilted planes
         normals[::2] = up
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 0] / length[length > 0, None]
@@ -242,12 +243,12 @@ def find_plane(
     offsets = offsets[fits]
     if len(normals) == 0:
         return None
-    # From the camera on, so that half as many digits are enough.
+    # Relative to the camera, so that single precision is enough.
     away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
     away += (offsets + normals @ samples.camera).astype(np.float32)
     count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
     if up is not None:
-        # What leans much is hardly a support, but a plane through things that stand on one.
+        # A strongly tilted plane is more likely to pass through objects than to support them.
         count = count * (1 - (1 - normals @ up) / (1 - STEEPEST_SUPPORT))
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
@@ -262,7 +263,7 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
     Args:
         plane: the plane.
         samples: the samples.
-        loose: tolerances within which samples count.
+        loose: multiple of the tolerance within which samples are used.
 
     Returns:
         The refined plane; the plane itself if fewer than ten samples are near.
@@ -278,27 +279,27 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
         spread = points[on] - centre
         squares, directions = np.linalg.eigh((weight * spread).T @ spread)
         normal = directions[:, 0] * (np.sign(directions[:, 0] @ plane.normal) or 1.0)
-        # Neighbours err together: it may lean by half as much as a sample is off at its edge.
+        # As errors of neighbours are correlated, half the deviation at the edge is assumed.
         error = float(np.sqrt(max(squares[0], 0.0) / max(squares[1], 1e-12))) / 2
         plane = Plane(normal, float(-normal @ centre), error)
     return plane
 
 
 def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
-    """The plane of an earlier frame as this frame shows it, though the pose of one of them errs.
+    """Find the plane of an earlier frame in this frame, in spite of pose errors.
 
-    Least squares from the plane of the earlier frame is enough where the error is below the
-    noise. By a larger error only a strip of the surface lies in reach, and the fit is a plane that
-    cuts it. Samples then lie beside the fit as well as on it, and the surface is searched for as
-    far around as the pose may err.
+    If the pose error is below the noise, least squares from the earlier plane is enough. With a
+    larger error only a strip of the surface is in reach, and the fitted plane cuts the surface,
+    with samples on both sides. In that case the plane is searched for within the range of pose
+    errors.
 
     Args:
         plane: of an earlier frame.
         samples: of this frame.
-        other: which samples may be of the object, (N,) bool: they are not searched for the plane.
+        other: samples that may belong to the object, (N,) bool, which are ignored.
 
     Returns:
-        The plane in this frame; that of least squares where no other holds more samples.
+        The plane in this frame; the least-squares fit if no other plane has more samples.
     """
     fit = refine_plane(plane, samples, loose=2)
     if is_seen(fit, samples):
@@ -314,7 +315,7 @@ def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
 
 
 def is_seen(plane: Plane, samples: Samples) -> bool:
-    """Whether more samples lie on a plane than closely beside it, as those of a surface do.
+    """Return True if more samples are on a plane than next to it, as for a real surface.
 
     Args:
         plane: the plane.
@@ -334,7 +335,7 @@ def lies_better_as_range(
     up: Float | None,
     above: Float | None = None,
 ) -> bool:
-    """Return whether the frame fits a plane better if its depth is taken along each ray.
+    """Return True if a frame fits a plane better with its depth read as range along each ray.
 
     Args:
         frame: the frame.
@@ -342,10 +343,7 @@ def lies_better_as_range(
         samples: of the frame.
         rng: source of all random numbers.
         up: direction against gravity, (3,); None if it is not known.
-        above: point that lies above the plane, (3,); None for none.
-
-    Returns:
-        True if more of the frame lies on a plane then.
+        above: point above the plane, (3,); None for none.
     """
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
@@ -359,14 +357,13 @@ def lies_better_as_range(
     if other is None or other.holds(nearer).mean() <= RANGE * usual:
         return False
 
-    # Two planes of one room may be found: each is refined for both readings of the depth, so that
-    # like is compared.
+    # The two readings may find different planes of a room, so each plane is compared for both.
     share = held = 0.0
     for found, its_samples in ((plane, samples), (other, nearer)):
         if found is None:
             continue
         on = found.holds(its_samples)
-        if not on.any():  # it is known by finer samples
+        if not on.any():  # the plane was found with finer samples
             continue
         share = max(share, _share_held(samples, on, found.normal))
         held = max(held, _share_held(nearer, on, found.normal))
@@ -374,7 +371,7 @@ def lies_better_as_range(
 
 
 def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
-    """Share of the samples on the plane that fits some of them, (N,) bool, best."""
+    """Return the share of all samples on the plane fitted to some of them, (N,) bool."""
     middle = np.median(samples.points[on] @ normal)
     plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
     return float(refine_plane(plane, samples).holds(samples).mean())

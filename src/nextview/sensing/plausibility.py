@@ -1,4 +1,4 @@
-"""Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
+"""Reject implausible frames, and name the likely mistake behind an observation."""
 
 from collections.abc import Sequence
 
@@ -14,45 +14,43 @@ from nextview.sensing.mistakes import mistake_between, mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
-PIXELS_SAMPLED = 500  # pixels that are looked at
-FEWEST_DEPTHS = 20  # pixels with a depth below which nothing is seen
-# how far from the origin a surface may be, object radii: centre and radius are estimates
+PIXELS_SAMPLED = 500  # sampled pixels
+FEWEST_DEPTHS = 20  # least number of pixels with valid depth
+# object radii, largest plausible distance of a surface from the origin
 OUTERMOST = 1.15
-INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
-# views contradict if one misses this share of the surface that the other saw
+INNERMOST = 0.4  # object radii, least plausible distance of the outermost points
+# views contradict each other if one misses this share of the surface seen in the other
 CONTRADICTION = 0.2
-COMPARED_VIEWS = 3  # views before the last one with which it is compared
-# how far a principal point is from the middle of an uncropped picture, at most, half sides of it
+COMPARED_VIEWS = 3  # earlier views with which the last one is compared
+# largest offset of the principal point from the centre of an uncropped image, in half sides
 OFF_CENTRE = 0.25
-# metres: few depth cameras measure farther, and nothing fills a picture from there
+# metres, median depth beyond the range of most depth cameras
 FAR_DEPTH = 10.0
-# how far from a thing, object radii, the point that asks for it may be, seen from above
+# object radii, largest horizontal distance of the selecting point from the object
 FARTHEST_POINT_ASIDE = 3.0
-# so many times as far as a frame shows anything an object cannot be: of a near one only the front
-# shows
+# largest distance of an object as a multiple of the farthest depth in the frame
 TOO_FAR = 2.5
 STILL = 1e-3
 CHANGED = 0.04
 CHANGED_SHARE = 0.03
-"""Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by
-which a pixel has changed, and the share of pixels that have to."""
+"""Tolerance of equal poses, for metres and rotation matrices; relative change of a changed pixel's
+depth; and share of changed pixels in a changed image."""
 TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
-"""As the depth is if 16 bits in steps of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are taken for
-millimetres.
+"""Factors by which depth is too large if 16-bit units of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are read
+as millimetres.
 """
 NOTHING_NEARER = 1.2
 MUCH_FARTHER = 1.7
-"""Times the distance of a target: nothing is nearer, and what is seen in its place is so far, if
-depth is too large.
+"""Multiples of the target distance. If depth is too large, nothing is nearer than the first, and
+the surface at the target's pixels is at least as far as the second.
 """
-# metres from the origin of the world, within which robots work; where positions in millimetres
-# begin
+# metres from the world origin: workspace of robots; larger positions may be in millimetres
 FAR_ORIGIN = 30.0
-# from the world's origin within which a robot's camera is
+# largest distance of a robot's camera from the world origin, millimetres
 FARTHEST_MILLIMETRES = 20_000.0
-SAME_HEIGHT = 0.1  # part of a height up to which another one is the same
-SAME_STEPS = 0.03  # the same, of heights that tell the steps of the depth
-# factor from which a radius is nearer to ten times than to once
+SAME_HEIGHT = 0.1  # relative tolerance of equal heights
+SAME_STEPS = 0.03  # the same for heights that identify the depth unit
+# factor above which a ratio of radii is closer to ten than to one
 ORDER_OF_SIZE = np.sqrt(10)
 
 
@@ -62,16 +60,16 @@ def refuse_far(
     target: Float | None,
     radius: float,
 ) -> None:
-    """Refuse a camera that is much farther away than anything that it sees.
+    """Reject a camera that is much farther away than anything it measures.
 
     Args:
         frame: the frame.
-        last: the frame before; None for a first one.
-        target: where the object is expected, world, (3,); None if it is not known.
+        last: the previous frame; None for a first one.
+        target: expected position of the object, world, (3,); None if not known.
         radius: of the object, metres.
 
     Raises:
-        ObservationError: the camera is too far from where it was, or from its target.
+        ObservationError: the camera is too far from its last position, or from its target.
     """
     camera = frame.camera_to_world[:3, 3]
     farthest = float(frame.depth.max())
@@ -102,11 +100,11 @@ def refuse_far(
 
 
 def refuse_millimetres(pose: Float, height: float, up: Float) -> None:
-    """Refuse a first pose in millimetres: a thousandth of its height is that over the support.
+    """Reject a first pose in millimetres: its height is a thousand times that above the support.
 
     Args:
         pose: camera-to-world, (4, 4).
-        height: of the camera above the support plane as the depth shows it, metres.
+        height: of the camera above the support plane according to the depth, metres.
         up: against gravity, world, (3,).
     """
     place = pose[:3, 3]
@@ -121,14 +119,14 @@ def refuse_millimetres(pose: Float, height: float, up: Float) -> None:
 
 
 def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
-    """Whether 16-bit depth of other steps than millimetres would fit the pose; usually not.
+    """Warn if 16-bit depth in another unit than millimetres would fit the pose.
 
-    Depth that is several times too large puts the support so far below the camera. With the right
-    steps it is level with the world's origin, as a robot's base or table often is.
+    If depth is several times too large, the support plane is too far below the camera. With the
+    right unit it is level with the world origin, as a robot's base or table often is.
 
     Args:
-        frame: the first one, with a pose.
-        height: of the camera above the support plane as the depth shows it, metres.
+        frame: the first frame, with a pose.
+        height: of the camera above the support plane according to the depth, metres.
         up: against gravity, world, (3,).
     """
     stands = float(frame.camera_to_world[:3, 3] @ up)
@@ -153,20 +151,20 @@ def refuse_mistake(
     target: Float | None,
     radius: float,
 ) -> None:
-    """Refuse depth that is several times too large, and a pose without whose mistake frames agree.
+    """Reject depth that is several times too large, and poses with an identifiable mistake.
 
-    16-bit depth in steps of less than a millimetre is too large. Either everything visible lies
-    behind the target, at a multiple of its distance; or the frame and the last one contradict each
-    other, and would not if the depth of both were smaller.
+    16-bit depth in units smaller than a millimetre is read as too large. This is detected if
+    everything visible is behind the target, at a multiple of its distance; or if the frame and the
+    previous one contradict each other, but agree with smaller depth.
 
     Args:
         frame: the frame.
-        last: the frame before; None for a first one.
-        target: where the object is expected, world, (3,); None if it is not known.
+        last: the previous frame; None for a first one.
+        target: expected position of the object, world, (3,); None if not known.
         radius: of the object, metres.
 
     Raises:
-        ObservationError: the depth is too large, with the likely factor; or the mistake.
+        ObservationError: the depth is too large, with the likely factor; or another mistake.
     """
     times = 0.0
     if target is not None and frame.mask is None:
@@ -198,7 +196,7 @@ def refuse_mistake(
 
 
 def _times_behind(frame: Frame, target: Float, radius: float) -> float:
-    """How many times too large the depth is if all that is seen lies behind a target; else 0."""
+    """Return the factor by which depth is too large if everything is behind a target; else 0."""
     pose = frame.camera_to_world
     in_camera = pose[:3, :3].T @ (target - pose[:3, 3])
     z = in_camera[2]
@@ -224,7 +222,7 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
-    """What is likely to be wrong with a frame though it can be right; usually nothing."""
+    """Return likely problems of a frame that is not rejected; usually empty."""
     found = []
     k = frame.intrinsics
     height, width = frame.shape
@@ -260,7 +258,7 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
 
 
 def check_point(aside: Float, radius: float) -> list[ViewWarning]:
-    """Warn if the object is far from the point that asked for it.
+    """Warn if the object is far from the point that selected it.
 
     Args:
         aside: offset from the point, metres, (2,).
@@ -285,11 +283,11 @@ def check_point(aside: Float, radius: float) -> list[ViewWarning]:
 
 
 def check_size(radius: float, before: float) -> list[ViewWarning]:
-    """Whether a frame makes the object one of another order of size; usually not.
+    """Warn if a frame changes the size of the object by an order of magnitude.
 
     Args:
         radius: of the object with this frame, metres.
-        before: of the object as earlier frames show it, metres.
+        before: of the object in earlier frames, metres.
     """
     if radius <= ORDER_OF_SIZE * before:
         return []
@@ -303,10 +301,10 @@ def check_size(radius: float, before: float) -> list[ViewWarning]:
 
 
 def check_place(displaced: Displacement | None) -> list[ViewWarning]:
-    """Whether a frame shows the object in another place than earlier ones; usually not.
+    """Warn if the object is displaced relative to earlier frames.
 
     Args:
-        displaced: by how much it does; None where that is not known.
+        displaced: the displacement; None if not known.
     """
     if displaced is None or not displaced.noticed:
         return []
@@ -322,7 +320,7 @@ def check_place(displaced: Displacement | None) -> list[ViewWarning]:
 
 
 def check_lean(lean: Lean) -> list[ViewWarning]:
-    """Whether the support plane leans by more than errors of the camera explain; usually not."""
+    """Warn if the support plane is tilted by more than camera errors explain."""
     if not lean.noticed:
         return []
     return [
@@ -336,11 +334,11 @@ def check_lean(lean: Lean) -> list[ViewWarning]:
 
 
 def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
-    """Warn if the picture changed since the last frame, but the pose did not.
+    """Warn if the image has changed since the previous frame, but the pose has not.
 
     Args:
         frame: the frame.
-        last: the frame before.
+        last: the previous frame.
 
     Returns:
         The warning, if any.
@@ -369,10 +367,10 @@ def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
 
 
 def check_observation(observation: Observation) -> list[ViewWarning]:
-    """What is likely to be wrong with an observation; usually nothing.
+    """Return likely problems of an observation; usually empty.
 
-    The object fills most of the unit sphere about the origin and nothing of it is outside. Where
-    that is not so, the usual mistake without which it would be so is named.
+    The object should fill most of the unit sphere around the origin and not exceed it. Otherwise
+    the usual mistake that explains the difference is named.
     """
     seen = np.flatnonzero(observation.depth)
     pose = np.asarray(observation.pose, np.float64)
@@ -387,7 +385,7 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
 
 
 def _surface(observation: Observation, seen: Index) -> Float:
-    """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
+    """Sample the surface at pixels, given by index, (N, 3), camera frame."""
     rows, columns = np.divmod(
         seen[:: max(1, len(seen) // PIXELS_SAMPLED)],
         observation.depth.shape[1],
@@ -409,7 +407,7 @@ def _plausible(points: Float, pose: Float) -> bool:
 
 
 def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
-    """Name and message of the mistake without which the points would lie in the unit sphere."""
+    """Return name and message of the mistake without which the points are in the unit sphere."""
     reach = _reach(points, pose)
     distance = float(np.linalg.norm(pose[:3, 3]))
     if reach < INNERMOST:
@@ -452,10 +450,10 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
 
 
 def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
-    """Warn if one of two views of an object looks through a surface that the other saw.
+    """Warn if one of two views of an object sees through a surface observed in the other.
 
     Args:
-        first: the one view.
+        first: one view.
         second: the other view.
 
     Returns:
@@ -474,7 +472,7 @@ def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
 
 
 def check_last_view(observations: Sequence[Observation]) -> list[ViewWarning]:
-    """Warn if the last of some views of an object contradicts one of those just before it.
+    """Warn if the last view of an object contradicts one of the views just before it.
 
     Args:
         observations: of the object, in order, at least one.
@@ -491,10 +489,10 @@ def check_last_view(observations: Sequence[Observation]) -> list[ViewWarning]:
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
-    """Return the share of the first view's surface that the second view looks through.
+    """Return the share of the first view's surface that the second view sees through.
 
-    Where all that the second camera saw is known, it has to have measured something behind: a hole
-    is no contradiction.
+    If the second view contains the whole scene, it must have measured something behind the surface:
+    a hole in the depth is no contradiction.
     """
     seen = np.flatnonzero(first.depth)
     if len(seen) == 0 or not second.depth.any():
@@ -517,7 +515,7 @@ def _seen_through(first: Observation, second: Observation) -> float:
     height, width = depth.shape
     at = PinholeCamera.of(k, depth.shape).project(points)
     column, row = np.floor(at).astype(np.int64).T
-    # what the object frame may be off
+    # pixels, allowance for errors of the object frame
     margin = max(2, width // 50) if scene is None else 2
     inside = (
         (column >= margin)

@@ -1,4 +1,4 @@
-"""What a frame shows of the object as the networks take it: seen from three object radii, level."""
+"""Resample the object in a frame to the input of the networks: level, from three object radii."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.sighting import Sighting
 from nextview.types import Float, Float32, Index
 
-# depth of what can be shown, object radii; all of the object is between 2 and 4
+# depth range of rendered facets, object radii; the object is between 2 and 4
 NEAREST_FACET = 0.5
 FARTHEST_FACET = 100.0
-# half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
+# largest half width of a rendered sensor pixel, as a share of the image, to limit the run time
 WIDEST_FACET = 1 / 16
-# object radii of depth within which facets are of one surface; the nearest to a pixel is shown
+# depth range of facets of one surface, object radii; of these the one nearest to a pixel is shown
 SURFACE_LAYER = 0.03
-# object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
+# size of a pixel of the scene, object radii: half a voxel of ``expected_visibility``
 FINEST_PITCH = 1 / 32
 
 
@@ -28,11 +28,11 @@ def observation_of(
     object_frame: ObjectFrame,
     life_size: bool = True,
 ) -> Observation:
-    """Resample what a frame shows of the object.
+    """Resample a sighting of the object.
 
     Args:
         sighting: of the object in the frame.
-        object_frame: of the object, as far as it is known.
+        object_frame: latest object frame.
         life_size: whether the radius is evidence of the class.
 
     Returns:
@@ -59,7 +59,7 @@ def virtual_pose(pose: Float) -> Float:
     right = np.array([-outward[1], outward[0], 0.0])
     if (
         np.hypot(right[0], right[1]) < 1e-6
-    ):  # straight above: keep the camera's own right
+    ):  # from directly above, keep the camera's own x axis
         right = pose[:3, 0] - (pose[:3, 0] @ outward) * outward
     right /= np.linalg.norm(right)
     virtual = np.eye(4)
@@ -77,11 +77,11 @@ def look_again(
     """Render facets from the virtual pose.
 
     Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the
-    depth where its own ray meets the plane of the facet, so that planes stay planes.
+    depth where its own ray meets the plane of the facet, so that planes remain planes.
 
     Args:
         facets: the facets.
-        pose: of the camera that saw them, (4, 4), object frame, object radii.
+        pose: of the original camera, (4, 4), object frame, object radii.
         radius: of the object, metres.
         size: side of the image, pixels.
 
@@ -100,9 +100,8 @@ def look_again(
     z = points[:, 2]
     front = np.flatnonzero((z > NEAREST_FACET) & (z < FARTHEST_FACET))
     x, y = focal * points[front, :2].T / z[front] + size / 2
-    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more
-    # where it is turned. A sensor that stands within the object has wider ones; they fill gaps no
-    # farther than WIDEST_FACET.
+    # A facet is as wide as a sensor pixel, in pixels of this image, and slightly wider if it is
+    # inclined. Half widths are limited to WIDEST_FACET, for sensors inside the object.
     half = (
         np.clip(
             0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front],
@@ -111,7 +110,7 @@ def look_again(
         )
         + 0.05
     )
-    # The first column and row whose centres it covers:
+    # First column and row whose centres the facet covers
     left, top = (
         np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y)
     )
@@ -142,7 +141,7 @@ def look_again(
     with np.errstate(divide="ignore"):
         meets = offset[chosen] / towards
     depth = np.zeros(size * size, np.float32)
-    # A plane seen edge-on runs away within a pixel: stay near the facet.
+    # The depth of a plane seen edge-on diverges within a pixel, so it is limited.
     depth[shown] = np.where(np.abs(meets - z[chosen]) < SURFACE_LAYER, meets, z[chosen])
     return depth.reshape(size, size), facet.reshape(size, size)
 
@@ -152,7 +151,7 @@ def _resampled(
     facets: Facets,
     facet: Index,
 ) -> NDArray[np.uint8] | None:
-    """The picture of a frame, (H, W) or (H, W, 3), at the facets that a camera sees, (S, S)."""
+    """Sample the image of a frame, (H, W) or (H, W, 3), at the visible facets, (S, S)."""
     if picture is None:
         return None
     shown = np.zeros((*facet.shape, *picture.shape[2:]), np.uint8)
@@ -162,7 +161,7 @@ def _resampled(
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
-    """Return all that a frame shows, in the object frame and object radii."""
+    """Return the whole frame in the object frame and object radii."""
     k = sighting.frame.intrinsics.copy()
     step = max(
         1,

@@ -1,4 +1,4 @@
-"""What one frame shows of an object, and the object frame that all frames show together."""
+"""Sightings of an object in single frames, and the object frame estimated from all of them."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from nextview.sensing.planes import Plane
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
-FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
-# of the most pixels that a frame shows of an object: others say too little of its size
+FEWEST_OBJECT_PIXELS = 60  # least number of pixels of an object in a frame
+# frames with a smaller share of the largest number of pixels are not used to estimate the size
 LEAST_VIEW_PART = 0.1
-MOST_HULL_POINTS = 3000  # of which the convex hull is taken, about
+MOST_HULL_POINTS = 3000  # approximate number of points for the convex hull
 TOO_LITTLE = "too little is seen of the object"
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one frame, with the noise of it all, shows of the object.
+    """The object in one frame, with the noise of the frame.
 
     Attributes:
-        frame: its pose is shifted so that the object stands where earlier frames show it.
+        frame: its pose is shifted so that the object coincides with earlier frames.
         noise: of the frame.
         facets: the object's surface, camera frame.
-        mask: its pixels, (H, W) bool.
-        hull: corners of its convex hull, world, (K, 3), metres.
-        plane: the support plane, if it is seen.
-        shift: by which the pose was shifted, (3,), metres.
-        warnings: about the frame, whatever it shows of the object.
+        mask: of the object, (H, W) bool.
+        hull: vertices of its convex hull, world, (K, 3), metres.
+        plane: the support plane, if it is visible.
+        shift: applied to the pose, (3,), metres.
+        warnings: about the frame, independent of the object.
     """
 
     frame: Frame
@@ -51,11 +51,11 @@ class Sighting:
 
     @property
     def frame_as_given(self) -> Frame:
-        """The frame with the pose that it was handed in with."""
+        """Frame with its original pose."""
         return self.frame.shifted(-self.shift) if self.shift.any() else self.frame
 
     def shifted(self, shift: Float) -> Sighting:
-        """The same from a place that is shifted in the world, (3,), metres."""
+        """Return the sighting with its pose shifted in the world, (3,), metres."""
         plane = self.plane
         return replace(
             self,
@@ -79,12 +79,12 @@ def sighting_of(
     Args:
         frame: the frame.
         mask: the object's pixels, (H, W) bool.
-        plane: that the object stands on; None if it is not seen.
+        plane: support plane of the object; None if it is not visible.
         noise: of the frame's depth.
         denoise: smooth depth, fill holes and drop flying pixels.
 
     Raises:
-        ObservationError: too little is seen of the object.
+        ObservationError: too little of the object is visible.
     """
     if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
         raise ObservationError(TOO_LITTLE)
@@ -109,7 +109,7 @@ def sighting_of(
     pose = frame.camera_to_world
     few = slice(None, None, max(1, len(facets.planes) // MOST_HULL_POINTS))
     points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
-    with suppress(QhullError):  # all in one plane: they do as they are
+    with suppress(QhullError):  # coplanar points are used as they are
         points = points[ConvexHull(points).vertices]
     return Sighting(frame, noise, facets, mask, points, plane)
 
@@ -122,14 +122,14 @@ def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         axes: rows x, y and z (up) of the object frame, (3, 3).
 
     Raises:
-        ObservationError: what is seen of the object has no size.
+        ObservationError: the visible part of the object has no extent.
     """
     shown = np.array([np.count_nonzero(sighting.mask) for sighting in sightings])
     enough = shown >= LEAST_VIEW_PART * shown.max()
     pairs = zip(sightings, enough, strict=True)
     points = np.concatenate([sighting.hull for sighting, counts in pairs if counts])
 
-    # The height of the planes along up, where the object is: they may lean a little.
+    # Height of the planes below the object, as they may be slightly tilted.
     here = points.mean(0)
     heights = [
         axes[2] @ here - plane.height(here) / (plane.normal @ axes[2])

@@ -1,7 +1,7 @@
-"""Refuse a first frame whose pose or depth its surfaces contradict.
+"""Reject a first frame whose pose or depth is contradicted by its surfaces.
 
-By a wrong pose the largest plane in view leans, and depth that is measured along the rays shows no
-plane where there is one.
+With a wrong pose, the largest visible plane is tilted. If depth is measured along the rays, planes
+are curved.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from nextview.sensing.mistakes import mistakes_in_poses
 from nextview.sensing.planes import TILT, Plane, Samples, find_plane, steep
 from nextview.types import Float
 
-# radians by which a plane may be less level by one mistake than by another that explains it as well
+# radians, difference of tilt within which two mistakes explain a plane equally well
 AS_LEVEL = np.radians(3.0)
-# share of the samples on a plane from which no other plane holds twice as many
+# share of the samples on a plane such that no other plane can have twice as many
 LARGE_SHARE = 1 / 3
-# mistakes that turn a plane as an inverse pose does, or not at all
+# mistakes that rotate a plane like an inverse pose, or not at all
 PLACE_ALONE = ("inverse rotation", "inverse translation")
 
 
@@ -30,12 +30,12 @@ def refuse_mistakes(
     plane: Plane | None,
     up: Float | None,
 ) -> None:
-    """Refuse a frame whose pose is wrong, or whose depth is a range, by its surfaces.
+    """Reject a frame with a wrong pose, or with range instead of depth, by its surfaces.
 
     Args:
         frame: the frame.
         samples: of the surfaces in it.
-        plane: of these, the one that things stand on; None if none is level.
+        plane: the support plane; None if no surface is level.
         up: direction against gravity, (3,), world; None if it is not known.
 
     Raises:
@@ -55,7 +55,7 @@ def _refuse_range(
     rng: Generator,
     up: Float | None,
 ) -> None:
-    """Refuse a frame that fits a plane better if its depth is taken along each ray."""
+    """Reject a frame that fits a plane better with its depth read as range along each ray."""
     if planes.lies_better_as_range(frame, plane, level, rng, up):
         raise ObservationError(
             "the depth is measured along the rays, a range: give it along the optical axis"
@@ -63,7 +63,7 @@ def _refuse_range(
 
 
 def _share(plane: Plane | None, samples: Samples) -> float:
-    """Share of the samples that lie on a plane."""
+    """Return the share of the samples on a plane."""
     return 0.0 if plane is None else float(plane.holds(samples).mean())
 
 
@@ -74,7 +74,7 @@ def _refuse_wrong_pose(
     up: Float,
     rng: Generator,
 ) -> None:
-    """Refuse a frame whose largest plane holds more than a share, and would be level otherwise."""
+    """Reject a frame if a large plane would be level with another reading of the pose."""
     largest = find_plane(samples, rng)
     if largest is None:
         return
@@ -88,9 +88,9 @@ def _refuse_wrong_pose(
 def _mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
     """Return the mistake in a pose without which the largest plane would be level.
 
-    Floors and tables are level and walls upright. A plane that leans in between indicates a wrong
-    pose; so does one that is level but lies over the camera. A wall indicates nothing: seen from
-    the side it would pass for a floor.
+    Floors and tables are level and walls are vertical. A plane at an angle in between indicates a
+    wrong pose, and so does a level plane above the camera. A vertical plane indicates nothing: with
+    a rotated pose it could be a floor.
 
     Args:
         plane: the largest plane in view.
@@ -98,7 +98,8 @@ def _mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
         up: direction against gravity, (3,).
 
     Returns:
-        The mistake, in words, or all that explain the plane as well; None if there is none.
+        The mistake, in words, or all mistakes that explain the plane equally well; None if there is
+        none.
     """
     if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
         return None
@@ -112,6 +113,6 @@ def _mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
     most = max(rises.values())
     if most <= TILT:
         return None
-    # One frame may be explained by several: which of them it is, a level plane does not tell.
+    # A level plane does not distinguish between mistakes that explain it equally well.
     least = np.cos(np.arccos(min(most, 1.0)) + AS_LEVEL)
     return "; or ".join(name for name, rise in rises.items() if rise >= least) + "?"

@@ -1,4 +1,4 @@
-"""All things that stand on the surfaces of one frame, each with its pixels."""
+"""Segmented objects on the support surfaces of one frame."""
 
 from __future__ import annotations
 
@@ -33,35 +33,37 @@ NO_SUPPORT = (
     "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse?"
     " OpenGL axes?) and which way is up"
 )
-# metres above the plane that a thing reaches, at least: else it is a stain
+# metres, least height of an object above the plane, to exclude stains
 LOWEST_TOP = 0.008
-# the same as a part of its distance, where the depth is less exact
+# the same relative to the distance, for noisy depth
 LOWEST_SHARE = 0.012
-# share of a thing's pixels that are below its top, flying pixels left out
+# quantile of an object's pixel heights that defines its top, to exclude flying pixels
 TOP_SHARE = 0.9
-# square metres that are seen of a thing, at least: of a die a little more
+# square metres, least visible area of an object, slightly less than that of a die
 SMALLEST_AREA = 1.5e-4
-THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of edges are thinner
-# metres from the plane within which what is seen is likely to be the plane's
+THINNEST = (
+    0.006  # metres, least width of an object at its thickest part, to exclude edges
+)
+# metres, height above the plane within which pixels are likely to belong to it
 NEAR_TABLE = 0.015
 
 
 @dataclass(frozen=True, eq=False)
 class TableTop:
-    """What one frame shows on its surfaces.
+    """Support surfaces of one frame, and the objects on them.
 
     Attributes:
         frame: the frame.
         noise: of its depth.
-        plane: the level that carries most things, or that carried most in an earlier frame.
+        plane: the level that carries most objects, in this frame or in an earlier one.
         up: direction against gravity, (3,), world.
-        above: pixels of things above what carries them, (H, W) bool.
-        background: pixels that clearly show neither a thing nor a surface, (H, W) bool.
-        height: of each pixel over the plane that carries what it shows, (H, W) float32, metres.
-        supports: the surfaces, and what stands on each.
-        pieces: that a segmentation may cut things into, (H, W) int, 0 for none; None where it
-            tells none.
-        shows_ground: whether the plane is in the picture.
+        above: pixels of objects above their support, (H, W) bool.
+        background: pixels that are clearly neither an object nor a surface, (H, W) bool.
+        height: of each pixel above its supporting plane, (H, W) float32, metres.
+        supports: the surfaces, and the instances on each.
+        pieces: of the segmentation, into which instances may be split, (H, W) int, 0 for none; None
+            if there are none.
+        shows_ground: whether the plane is visible.
         warnings: about the frame.
     """
 
@@ -87,18 +89,18 @@ class TableTop:
         region: Box | None = None,
         widest: float | None = None,
     ) -> TableTop:
-        """Find the surfaces of a frame, and what stands on them.
+        """Find the support surfaces of a frame, and the objects on them.
 
         Args:
-            frame: of a depth camera; a mask, if it has one, says where is looked.
-            instances: the things in it.
-            up: direction against gravity, (3,), world; None: the normal of the plane.
-            earlier: what an earlier frame shows, whose plane and levels are found again.
-            region: what is outside of this upright box is left out.
-            widest: diameter of the largest thing that is looked for, metres; None: any.
+            frame: of a depth camera; its mask, if any, limits the search.
+            instances: segmented objects of the frame.
+            up: direction against gravity, (3,), world; None for the normal of the plane.
+            earlier: surfaces of an earlier frame, whose plane and levels are found again.
+            region: upright box that limits the search.
+            widest: diameter of the largest candidate object, metres; None for any.
 
         Raises:
-            ObservationError: no surface is seen.
+            ObservationError: no surface is visible.
         """
         noise = noise_of(frame)
         inside = frame.depth > 0 if frame.mask is None else frame.mask
@@ -143,7 +145,7 @@ class TableTop:
 
     @property
     def carried_by_none(self) -> tuple[Mask, ...]:
-        """Pixels of each thing that no surface carries, (H, W) bool each."""
+        """Masks of the objects without a supporting surface, (H, W) bool each."""
         pairs = zip(self.supports.masks, self.supports.carriers, strict=True)
         return tuple(
             mask
@@ -161,30 +163,30 @@ class TableTop:
         return found
 
     def under(self, mask: Mask) -> Plane:
-        """The plane that a thing stands on.
+        """Return the plane that supports an object.
 
         Args:
-            mask: its pixels, (H, W) bool.
+            mask: of the object, (H, W) bool.
         """
         level = self.supports.under(mask)
         return self.plane if level is None else level.plane
 
     def sighting(self, mask: Mask) -> Sighting:
-        """What the frame shows of a thing.
+        """Return the sighting of an object in the frame.
 
         Args:
-            mask: its pixels, (H, W) bool.
+            mask: of the object, (H, W) bool.
 
         Raises:
-            ObservationError: too little is seen of it.
+            ObservationError: too little of it is visible.
         """
         seen = sighting_of(self.frame, mask, self.under(mask), self.noise)
         return replace(seen, warnings=self.warnings)
 
     def segments(self) -> list[Mask]:
-        """The pixels of each thing that a surface carries, (H, W) bool, the largest first.
+        """Return the masks of all supported objects, (H, W) bool, the largest first.
 
-        Those of the background at its edges and of what carries it are left out.
+        Background at their edges and pixels of their support are removed.
         """
         found = []
         for mask, carrier in zip(
@@ -198,13 +200,13 @@ class TableTop:
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
 
     def pieces_of(self, pixels: Mask) -> list[Mask]:
-        """The pieces into which the segmentation may cut some pixels, the largest first.
+        """Return the pieces into which a mask may be split, the largest first.
 
         Args:
-            pixels: of things, (H, W) bool.
+            pixels: of objects, (H, W) bool.
 
         Returns:
-            The pixels of each piece, (H, W) bool.
+            The mask of each piece, (H, W) bool.
         """
         if self.pieces is None:
             return []
@@ -215,7 +217,7 @@ class TableTop:
         return [inside == number for number in numbers[np.argsort(-sizes[numbers])]]
 
     def is_thing(self, mask: Mask) -> bool:
-        """Whether some pixels, (H, W) bool, are enough, and high enough, to be a thing."""
+        """Return True if a mask, (H, W) bool, is large and high enough to be an object."""
         part = within(mask)
         own = mask[part] & (self.frame.depth[part] > 0)
         count = np.count_nonzero(own)
@@ -239,14 +241,14 @@ class TableTop:
         masks: Sequence[Mask | None],
         gap: float = TOUCHING_GAP,
     ) -> list[tuple[int, int]]:
-        """Which pairs of things are so near in the picture that they may touch.
+        """Return the pairs of objects that are close enough in the image to touch.
 
         Args:
-            masks: the pixels of each, (H, W) bool; None where the frame does not show it.
-            gap: metres between two things that touch, at most.
+            masks: of the objects, (H, W) bool; None if not visible in the frame.
+            gap: largest gap between touching objects, metres.
 
         Returns:
-            Their places in ``masks``, the smaller one first.
+            Their positions in ``masks``, the smaller one first.
         """
         shown = [row for row, mask in enumerate(masks) if mask is not None]
         parts = np.array(
@@ -271,7 +273,7 @@ class TableTop:
         gap: float = TOUCHING_GAP,
         step: float = TOUCHING_STEP,
     ) -> bool:
-        """Whether two things meet in the picture and in depth, see ``masks.touching``."""
+        """Return True if two objects touch in the image and in depth, see ``masks.touching``."""
         return touching(self.frame, one, other, gap, step)
 
 
@@ -280,7 +282,7 @@ def _heights(
     plane: Plane,
     noise: Noise,
 ) -> tuple[Float32, Mask]:
-    """Height of each pixel over what carries it, metres, and the pixels of things above that."""
+    """Return the height of each pixel above its support, metres, and the pixels of objects."""
     frame = supports.frame
     height = frame.along(plane.normal, plane.offset)
     for level in supports.levels:

@@ -1,22 +1,22 @@
-"""What is likely to be wrong with a view, in words."""
+"""Warnings about likely problems of a view."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class ViewWarning:
-    """Something that is likely to be wrong, in a sentence.
+    """A likely problem of a view or a frame, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
-    "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin",
-    "support", "point", "size", "stale pose", "displaced" and "lean". Those of scenes are on the
-    page on tables.
+    "contradiction" and "repeated"; for frames "intrinsics", "unit", "far origin", "support",
+    "point", "size", "stale pose", "displaced" and "lean". The warnings of scenes are listed on the
+    page about tables.
 
     Attributes:
         name: one of these.
-        message: a sentence for whoever set up the camera.
-        holds: whether no answer is confident by a view with it. It is not so where the mistake is
-            allowed for, or does not matter for the answer.
+        message: a sentence for the person who set up the camera.
+        holds: whether the warning blocks a confident answer. It is False if the problem is
+            corrected, or irrelevant for the answer.
     """
 
     name: str

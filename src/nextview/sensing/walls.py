@@ -1,8 +1,8 @@
-"""Walls and ceiling of a room: planes that end the scene and are no part of any object.
+"""Walls and ceiling of a room: planes that bound the scene and belong to no object.
 
-A wall is found among what rises above the support plane. Seen from above an upright plane is a
-line, so the search is a RANSAC for lines (Fischler and Bolles 1981). An object has upright sides,
-too: a wall is wider than an object, goes on to the edge of the picture, and has next to nothing
+Walls are found among the samples above the support plane. In the top view a vertical plane is a
+line, so the search is a RANSAC for lines (Fischler and Bolles 1981). Objects have vertical sides
+too, but a wall is wider than an object, extends to the border of the image, and has almost nothing
 behind it.
 """
 
@@ -16,26 +16,26 @@ from numpy.random import Generator
 from nextview.sensing.planes import Plane, Samples, steep
 from nextview.types import Float, Index, Mask
 
-LINE_TRIALS = 150  # lines that are tried for each wall
-MOST_LINES = 6  # upright planes that are looked at, the largest first
-FEWEST_SAMPLES = 0.02  # share of all samples that lie on a wall, at least
-# metres: an upright plane that reaches a side of the picture and is as wide is a wall
+LINE_TRIALS = 150  # tried lines per wall
+MOST_LINES = 6  # tested vertical planes, the largest first
+FEWEST_SAMPLES = 0.02  # least share of all samples on a wall
+# metres, least width of a wall that reaches one side of the image
 WIDE_WALL = 1.5
-WIDEST_OBJECT = 3.0  # metres: no object is so wide
-# share of the columns of the picture over which a narrower wall extends, from side to side
+WIDEST_OBJECT = 3.0  # metres, largest width of an object
+# least share of the image columns covered by a narrower wall that reaches both sides
 WIDE_SHARE = 0.8
-SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the picture
-# samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
+SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the image
+# largest number of samples behind a wall relative to those on it: flying pixels and open doors
 MOST_SAMPLES_BEHIND = 0.1
-OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
+OVER_CAMERA = 0.3  # metres, least height of a ceiling above the camera
 CEILINGS_TRIED = 50  # heights
-# cosine of the angle up to which two planes are parallel
+# cosine of the largest angle between parallel planes
 PARALLEL_WALLS = np.cos(np.radians(25.0))
-# how far behind a wall noise may put the camera, as a part of the distance of what it sees
+# largest distance of the camera behind a wall due to noise, relative to the distance of the samples
 CAMERA_BEHIND = 0.1
-# from the next wall to a sample of a wall that meets it, as a part of its distance, at most
+# largest distance from a wall to a sample of an adjacent wall, relative to the sample's distance
 CORNER_GAP = 0.05
-# metres that the place of an object lies before a wall, at least
+# metres, least distance of an object in front of a wall
 NEAREST_TO_PLACE = 0.02
 
 
@@ -51,12 +51,12 @@ def find_walls(
     Args:
         samples: of the whole frame.
         plane: the support plane.
-        rng: draws the lines that are tried.
-        place: where the object is known to be, (3,), world, metres: it lies before every wall.
-        narrowest: width of a wall that reaches one side of the picture, metres.
+        rng: for drawing the tried lines.
+        place: known position of the object, (3,), world, metres, which is in front of every wall.
+        narrowest: least width of a wall that reaches one side of the image, metres.
 
     Returns:
-        The ceiling, if it is seen, and the walls, the one with most samples first. Empty where
+        The ceiling, if it is visible, and the walls, the one with most samples first. Empty if
         there are none.
     """
     up = plane.normal
@@ -93,7 +93,7 @@ def find_walls(
 
 
 def _ceiling(samples: Samples, plane: Plane, place: Float | None) -> Plane | None:
-    """The level plane over the camera that reaches the top of the picture and ends the scene."""
+    """Find the level plane above the camera that reaches the top of the image."""
     height = plane.height(samples.points)
     over = height - plane.height(samples.camera)
     level = np.flatnonzero((over > OVER_CAMERA) & ~steep(samples, plane.normal))
@@ -126,9 +126,9 @@ def _largest_upright_plane(
     up: Float,
     rng: Generator,
 ) -> Plane | None:
-    """The upright plane through most of the chosen samples.
+    """Find the vertical plane with most of the chosen samples.
 
-    Its normal points to the side where most is seen.
+    Its normal points to the side with more samples.
     """
     points = samples.points[chosen]
     tolerance = samples.tolerance[chosen]
@@ -144,7 +144,7 @@ def _largest_upright_plane(
     on = np.abs(points @ normals.T + offsets) < tolerance[:, None]
     best = int(on.sum(0).argmax())
     plane = _refined(points, tolerance, normals[best], on[:, best], up)
-    # a camera that looks along a wall may stand on either side by noise
+    # noise may put a camera that looks along a wall on either side
     distance = plane.height(samples.points)
     off = np.abs(distance) > samples.tolerance
     facing = 1.0 if np.sign(distance[off]).sum() >= 0 else -1.0
@@ -158,7 +158,7 @@ def _refined(
     on: Mask,
     up: Float,
 ) -> Plane:
-    """The upright plane of least squares through some points, weighted by how exact each is."""
+    """Fit a vertical plane to some points by weighted least squares."""
     weight = 1 / tolerance[on] ** 2
     centre = weight @ points[on] / weight.sum()
     spread = points[on] - centre
@@ -179,7 +179,7 @@ def _is_wall(
     place: Float | None,
     narrowest: float,
 ) -> bool:
-    """Whether an upright plane is as wide as a wall and reaches the edge of the picture."""
+    """Return True if a vertical plane is as wide as a wall and reaches the border of the image."""
     if place is not None and upright.height(place) < NEAREST_TO_PLACE:
         return False
     away = float(np.median(np.linalg.norm(samples.points[on] - samples.camera, axis=1)))
@@ -203,7 +203,7 @@ def _is_wall(
     ]
     corners = sum(abs(wall.normal @ up) < PARALLEL_WALLS for wall in met)
     to_the_top = (
-        len(met) > corners  # as high as the ceiling
+        len(met) > corners  # reaches the ceiling
         or samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
     )
     in_corner = to_the_top and corners > 0
@@ -219,9 +219,9 @@ def _hides_much(
     walls: Sequence[Plane],
     many: int,
 ) -> bool:
-    """Whether more is seen behind an upright plane than flying pixels explain.
+    """Return True if there are more samples behind a vertical plane than flying pixels explain.
 
-    Walls that cross it are left out.
+    Walls that cross it are ignored.
     """
     behind = upright.height(samples.points) < -2 * samples.tolerance
     for wall in walls:

@@ -1,1 +1,1 @@
-"""Episodes, sessions and the front door."""
+"""Recognise single objects: systems, sessions and episodes."""

@@ -1,6 +1,6 @@
-"""The loop: observe, believe, stop or choose, move.
+"""The recognition loop: observe, update the belief, stop or choose the next view, move.
 
-One for a robot and for a hundred thousand replays.
+The same code runs one robot and thousands of replays at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,28 +25,29 @@ from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.types import Float, Floats, Index, Mask
 
-# views within this angle of where a camera stood count as visited: it saw what they show
+# candidate views within this angle of a camera position count as visited
 VISITED_ANGLE = np.radians(6.0)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One view in the episodes that were still running, A of them.
+    """One view in each of the A running episodes.
 
     Attributes:
-        episodes: which ones, (A,).
-        views: the view taken, or the one nearest to where the camera stood, (A,).
+        episodes: their indices, (A,).
+        views: the view taken, or the view nearest to the camera position, (A,).
         evidence: of the view in each episode.
-        belief: fused after it, (A, classes).
-        enough: whether belief is enough to stop, (A,).
-        stopped: whether the episode ended here, (A,).
-        next_views: where it goes next, (A,); -1 where it ended.
-        total: sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``.
-        seen: views so far in which anything was seen, each by its weight, (A,), see
+        belief: fused belief after the view, (A, classes).
+        enough: whether the belief suffices to stop, (A,).
+        stopped: whether the episode ended with this view, (A,).
+        next_views: next view of each episode, (A,); -1 if it ended.
+        total: sum of the log-evidence up to this view, (A, D), see ``belief.log_evidence_of``.
+        seen: weighted number of views so far in which the object was visible, (A,), see
             ``Calibration.weights``.
-        state: what the policy was shown of the episodes that go on; None where all ended.
-        joint: what all views so far say together, of each of the A episodes, None before anything
-            is seen; () where views are judged one by one.
+        state: state that was passed to the policy for the episodes that continue; None if all
+            ended.
+        joint: joint belief from all views so far, one for each of the A episodes, None before the
+            object is visible; () if views are judged separately.
     """
 
     episodes: Index
@@ -64,14 +65,14 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How B episodes ended, (B,) each.
+    """Outcomes of B episodes, (B,) each.
 
     Attributes:
-        answer: most believed class.
-        confidence: its belief.
+        answer: class with the highest belief.
+        confidence: belief in that class.
         n_views: number of views taken.
-        confident: whether the threshold was reached; else no view was left.
-        travel: over the moves between these views, grid cells.
+        confident: whether the threshold was reached; otherwise no view was left.
+        travel: distance travelled between the views, grid cells.
         arc: the same in radians.
         views: in order, (B, max views), -1 after the end.
     """
@@ -87,14 +88,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Taken:
-    """A step that is not taken in yet, and what goes with it in its A episodes.
+    """A step that has not been committed yet, with the state that belongs to it.
 
     Attributes:
         step: the step.
-        counts: whether anything is seen in the view, (A,).
-        visited: views that count as visited after it, (A, V).
+        counts: whether the object is visible in the view, (A,).
+        visited: views that count as visited after the step, (A, V).
         azimuth: of the cameras, radians, (A,).
-        places: where they stood so far, (A, step, 3); None where these are the views themselves.
+        places: camera positions so far, (A, step, 3); None if they are those of the views.
     """
 
     step: Step
@@ -104,9 +105,9 @@ class Taken:
     places: Float | None
 
 
-# expected share of the object that shows from each view, (B, V)
+# expected visible share of the object from each view, (B, V)
 Visible = Callable[[EpisodeState], Float]
-# with where robots can go, and what it costs
+# adds reachable views and travel costs to a state
 Constrain = Callable[[EpisodeState], EpisodeState]
 # see ``protocol.JudgesTogether.together``
 Together = Callable[[Sequence[Observation], Float, int], JointBelief]
@@ -115,32 +116,32 @@ LookAhead = Callable[[Sequence[Observation], JointBelief], Any]
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
-    """Every view can be reached, and travel costs what it is."""
+    """Return the state unchanged: all views can be reached at their usual cost."""
     return state
 
 
 class Episodes:
-    """B episodes side by side.
+    """B episodes that run side by side.
 
-    Give ``update`` what was seen from ``current``, until ``running`` is empty.
+    Pass the evidence of the views ``current`` to ``update`` until ``running`` is empty.
     """
 
     def __init__(
         self,
         sphere: Viewpoints,
-        policy: Policy,  # chooses where to go
+        policy: Policy,  # chooses the next views
         starts: Index,  # first view of each episode, (B,)
-        # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
+        # stopping rule; an episode also ends after all views of the sphere
         stopping: Stopping,
-        rng: np.random.Generator,  # for policies that draw
-        # how far to trust the sum of the logits; fully by default
+        rng: np.random.Generator,  # for random policies
+        # calibration of the summed logits; none by default
         calibration: Calibration = PLAIN_SUM,
-        # for policies that need it; by default from the scenes in the observations, see
-        # ``SeenScene``
+        # expected visibility, for policies that need it; by default from the scenes in the
+        # observations, see ``SeenScene``
         visibility: Visible | None = None,
-        # judges all views of an episode; by default their evidence is added up
+        # judges all views of an episode jointly; by default their evidence is summed
         together: Together | None = None,
-        # what it foresees of other views, for policies that need it
+        # predicts further views, for policies that need it
         outlook: LookAhead | None = None,
     ) -> None:
         self.sphere = sphere
@@ -169,22 +170,24 @@ class Episodes:
         directions: Float | None = None,
         constrain: Constrain = unconstrained,
     ) -> Step:
-        """Take in one view of every running episode, and stop it or choose its next view.
+        """Process one view of every running episode, and stop it or choose its next view.
 
-        Where nothing is seen, the view counts as taken, but changes no belief and ends no episode
-        with confidence. If this raises, nothing is taken in, and the same view can be passed again.
-        Where the cameras stood elsewhere, the nearest views count as taken, those within
-        VISITED_ANGLE as visited too, and azimuths and travel are measured from the places. An
+        A view without visible object counts as taken, but changes no belief and ends no episode
+        with confidence. If an error is raised, nothing changes, and the same view can be passed
+        again.
+
+        If directions are given, the views nearest to the cameras count as taken, and views within
+        VISITED_ANGLE as visited; azimuths and travel are computed from the camera positions. An
         episode without a free view ends.
 
         Args:
             evidence: of the views of the A running episodes.
             directions: unit vectors towards the actual cameras, (A, 3), in all updates or in none;
-                None if they stood at ``current``.
+                None if the cameras were at ``current``.
             constrain: marks the views that can be reached; called before the policy.
 
         Returns:
-            What was taken in.
+            The step.
         """
         taken = self.next_step(evidence, directions, constrain)
         self.keep(taken)
@@ -197,18 +200,17 @@ class Episodes:
         constrain: Constrain = unconstrained,
         hold: Callable[[Step], bool] = lambda step: False,
     ) -> Taken:
-        """Return what ``update`` would take in, without changing anything; ``keep`` takes it in.
+        """Compute the step of ``update`` without changing anything; ``keep`` commits it.
 
         Args:
             evidence: of the views of the A running episodes.
-            directions: unit vectors towards the actual cameras, (A, 3); None if they stood at
+            directions: unit vectors towards the actual cameras, (A, 3); None if the cameras were at
                 ``current``.
             constrain: marks the views that can be reached.
-            hold: called where the belief is high enough to stop; no episode stops if it returns
-                True.
+            hold: called if the belief suffices to stop; no episode stops if it returns True.
 
         Returns:
-            What would be taken in.
+            The step, not committed yet.
         """
         taken = self._taken(evidence, directions)
         step = taken.step
@@ -236,27 +238,28 @@ class Episodes:
         directions: Float | None = None,
         joint: tuple[JointBelief | None, ...] | None = None,
     ) -> None:
-        """Take in a view of episodes that are known to go on, without stopping or choosing.
+        """Process a view of episodes that are known to continue, without stopping or choosing.
 
         Args:
             evidence: of the views of the A running episodes.
-            directions: unit vectors towards the actual cameras, (A, 3); None if they stood at
+            directions: unit vectors towards the actual cameras, (A, 3); None if the cameras were at
                 ``current``.
-            joint: what all views said together after it, if it is known; they are not judged again.
+            joint: joint belief after the view, if it is known already; it is then not computed
+                again.
         """
         self.keep(self._taken(evidence, directions, joint))
 
     def keep(self, taken: Taken) -> None:
-        """Take in what ``next_step`` made."""
+        """Commit a step of ``next_step``."""
         self._last = taken
         self.steps.append(taken.step)
         self._go(taken.step)
 
     def next_choice(self, constrain: Constrain = unconstrained) -> Step:
-        """Ask the policy again, for changes that ``constrain`` marks; see ``update``.
+        """Ask the policy again after a change of the reachable views; see ``update``.
 
-        Nothing is changed; ``keep_choice`` takes in the last step with other ``next_views``. Where
-        no view is free any more the episode ends.
+        Nothing is changed; ``keep_choice`` commits the returned step, which is the last one with
+        other ``next_views``. An episode without a free view ends.
         """
         if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
             raise SessionError(
@@ -273,12 +276,12 @@ class Episodes:
         return replace(step, next_views=next_views, stopped=next_views < 0, state=state)
 
     def keep_choice(self, step: Step) -> None:
-        """Go where ``next_choice`` says."""
+        """Commit a step of ``next_choice``."""
         self.steps[-1] = step
         self._go(step)
 
     def _reached(self, step: Step) -> Mask:
-        """Whether the stopping rule ends the episodes of a step, (A,)."""
+        """Return which episodes of a step the stopping rule ends, (A,)."""
         if type(self.stopping).reached_along is Stopping.reached_along:
             return self.stopping.reached(step.belief, np.maximum(step.seen, 1))
 
@@ -300,7 +303,7 @@ class Episodes:
         self.running = step.episodes[~step.stopped]
 
     def _state(self, taken: Taken, going: Mask) -> EpisodeState:
-        """What the policy may see of the episodes that go on."""
+        """Return the state that the policy receives for the episodes that continue."""
         step = taken.step
         needs = self.policy.needs
         azimuth_bins = None
@@ -347,14 +350,14 @@ class Episodes:
         )
 
     def outlooks(self, step: Step, some: Mask) -> list[Any]:
-        """Return what can be foreseen after a step in some of its episodes.
+        """Return the predictions of further views after a step.
 
         Args:
             step: the step.
-            some: which of its episodes, (A,) bool.
+            some: mask of its episodes, (A,) bool.
 
         Returns:
-            An outlook for each of these, None where nothing can be foreseen.
+            A prediction for each selected episode, None if there is none.
         """
         rows = np.flatnonzero(some)
         if self.outlook is None or not any(step.joint):
@@ -372,7 +375,7 @@ class Episodes:
         directions: Float | None,
         joint: tuple[JointBelief | None, ...] | None = None,
     ) -> Taken:
-        """The next step, as if no episode ended and none moved on. Nothing is changed yet."""
+        """Return the next step as if every episode continued. Nothing is changed."""
         now = self.running
         if len(evidence.logits) != len(now):
             raise UsageError(
@@ -419,7 +422,7 @@ class Episodes:
         )
         total = before + seen[:, None] * said
         counted = counted + seen
-        # Before anything is seen the total is zero, whatever it is divided by.
+        # Before the object is visible the total is zero, so the divisor does not matter.
         belief = self.calibration.belief(
             total,
             np.maximum(counted, 1),
@@ -438,10 +441,10 @@ class Episodes:
         seen: Mask,
         known: tuple[JointBelief | None, ...],
     ) -> Step:
-        """The step with what all views so far say together, and the belief that follows.
+        """Add the joint belief from all views so far to a step.
 
-        ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is
-        known already. Before anything is seen the belief stays as it is.
+        ``seen`` tells in which episodes the object is visible in this view, (A,); ``known`` holds
+        joint beliefs that are known already. The belief is unchanged until the object is visible.
         """
         assert self.together is not None
         before: dict[int, JointBelief | None] = {}
@@ -470,7 +473,7 @@ class Episodes:
         return replace(step, belief=belief, joint=tuple(joint))
 
     def _visibility(self, last: Step, state: EpisodeState) -> Float:
-        """What is expected to show from each view in the episodes of a state."""
+        """Return the expected visible share from each view for the episodes of a state."""
         if self.visibility is not None:
             return self.visibility(state)
         if any(step.evidence.observations is None for step in (*self.steps, last)):
@@ -494,7 +497,7 @@ class Episodes:
         return np.stack(found)
 
     def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
-        """What the frames of an episode say together; what all but the new ones say is kept."""
+        """Combine the frames of an episode; the combination of the earlier frames is cached."""
         known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
         if any(old is not new for old, new in zip(known, scenes, strict=False)):
             known = []
@@ -510,9 +513,9 @@ class Episodes:
         episodes: Index,
         counted: bool = False,
     ) -> list[list[Observation]]:
-        """Return all views of some episodes, the last step included.
+        """Return all views of some episodes, including the last step.
 
-        ``counted`` leaves out those that are no evidence.
+        With ``counted``, views that are no evidence are left out.
         """
         kept = bool(self.steps) and self.steps[-1] is last
         steps = self.steps if kept else [*self.steps, last]
@@ -543,7 +546,7 @@ class Episodes:
         state: EpisodeState,
         constrain: Constrain,
     ) -> tuple[EpisodeState, Index]:
-        """What the policy is shown, and where it goes, -1 where no view is free."""
+        """Return the state for the policy, and the chosen views, -1 if no view is free."""
         state = constrain(replace(state, reachable=None, travel=self._travel(state)))
         chosen = np.full(len(state.current), -1)
         free = state.free.any(1)
@@ -554,7 +557,10 @@ class Episodes:
         return state, chosen
 
     def _travel(self, state: EpisodeState) -> Float | None:
-        """Cells to each view from the places, (B, V); None where these are views."""
+        """Return the distance from the camera positions to each view, cells, (B, V).
+
+        Returns None if the positions are those of views.
+        """
         if state.places is None:
             return None
         here = state.places[:, -1]
@@ -565,9 +571,9 @@ class Episodes:
         return np.where(there[:, None], self.sphere.travel[state.current], cells)
 
     def _choose(self, state: EpisodeState) -> Index:
-        """What the policy chooses, checked.
+        """Return the choice of the policy, checked.
 
-        If a view is out of reach it is asked again, as if it had been there.
+        If it chooses an unreachable view, it is asked again with that view marked as visited.
         """
         name = self._name
         free = state.free
@@ -593,7 +599,7 @@ class Episodes:
         return chosen
 
     def _ask(self, state: EpisodeState) -> Index:
-        """What the policy answers: views of the sphere, whichever."""
+        """Return the unchecked choice of the policy."""
         name = self._name
         with plugin_errors(
             lambda said: PolicyError(
@@ -627,7 +633,7 @@ class Episodes:
         ).__name__
 
     def _first_to_fail(self, state: EpisodeState) -> int | None:
-        """The first episode for which the policy raises even if asked for it alone."""
+        """Return the first episode for which the policy raises an error on its own."""
         for episode in state.episodes:
             alone = state.select(state.episodes == episode)
             try:
@@ -638,7 +644,7 @@ class Episodes:
 
     @property
     def outcome(self) -> Outcome:
-        """How the episodes ended."""
+        """Return the outcomes of the episodes."""
         if len(self.running):
             raise SessionError("the episodes are still running")
         b = len(self.current)
@@ -665,7 +671,7 @@ class Episodes:
 
 
 def _without_unseen(evidence: Evidence) -> tuple[Evidence, Mask]:
-    """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
+    """Return the evidence with zeros where no object is visible, and the visibility, (B,) bool."""
     seen = evidence.seen
     if seen is None or seen.all():
         return evidence, np.ones(len(evidence.logits), bool)
@@ -693,14 +699,14 @@ def run_episodes(
     constrain: Constrain = unconstrained,
     visibility: Visible | None = None,
 ) -> Episodes:
-    """Run episodes to their end.
+    """Run episodes until all have ended.
 
     Args:
-        observe: returns the evidence of some episodes, (A,), each at one view, (A,).
+        observe: returns the evidence of some episodes, (A,), each from one view, (A,).
         sphere: the candidate views.
         policy: chooses the next views.
         starts: first view of each episode, (E,) int64.
-        stopping: ends the episodes.
+        stopping: the stopping rule.
         rng: source of all random numbers.
         calibration: turns sums of evidence into belief.
         constrain: marks the views that can be reached.

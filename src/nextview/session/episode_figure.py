@@ -1,4 +1,4 @@
-"""The figure of an episode: views, beliefs, values of the candidates, and the path."""
+"""Draw an episode: views, beliefs, values of the candidate views, and the camera path."""
 
 import itertools
 from collections.abc import Sequence
@@ -40,19 +40,19 @@ from nextview.session.style import (
 from nextview.session.view import View
 from nextview.types import Float, Floats, Index, Mask
 
-# inches: of a column, between two, and of the large picture at most
+# inches: width of a column, gap between columns, and largest size of the large panel
 COLUMN_WIDTH = 2.2
 COLUMN_GAP = 0.3
 LARGE_PICTURE = 6.0
 CLASSES_SHOWN = 4  # classes
 FIGURE_FORMATS = (".png", ".pdf", ".svg")
-# of the silhouette: parts and holes below this share of it are specks of the scan
+# parts and holes below this share of the silhouette are artefacts of the scan
 SPECK_SHARE = 0.002
-# of the dome: its lines, its candidate views
+# colours of the view dome: its lines and its candidate views
 RING = "#cdbfa6"
 RIM = "#a8977a"
 VALUES = LinearSegmentedColormap.from_list("value", ["#f1e9da", "#9cc3dc", BLUE])
-# how far from the object its candidate views are drawn, and the eye is, object radii
+# distances of the drawn candidate views and of the virtual camera, object radii
 DOME = 1.35
 FIGURE_DISTANCE = 10.0
 NUMBER: dict[str, Any] = {
@@ -64,14 +64,14 @@ NUMBER: dict[str, Any] = {
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure to a PNG, PDF or SVG file, complete or not at all.
+    """Write a figure to a PNG, PDF or SVG file. The file is written completely or not at all.
 
     Args:
         figure: the figure.
-        path: of the file, which is replaced.
+        path: of the file; an existing file is replaced.
 
     Raises:
-        UsageError: it is another format.
+        UsageError: the format is not supported.
         ResultsError: the path is a link or a folder, or cannot be written.
     """
     if path.suffix.lower() not in FIGURE_FORMATS:
@@ -98,9 +98,10 @@ def draw_episode(
     posed: Triangles | None = None,
     displaced: Float | None = None,
 ) -> Figure:
-    """Draw a column for each view, and beside them the object and the path.
+    """Draw a column for each view, and beside them the object and the camera path.
 
-    Each column shows the image, the belief, and the policy's values of the candidate views.
+    Each column shows the image, the belief, and the values that the policy assigns to the candidate
+    views.
 
     Args:
         views: of the episode, in order.
@@ -216,7 +217,7 @@ def draw_episode(
 
 
 def _best_side(path: Float) -> float:
-    """Return the azimuth, radians, from which the path is seen best."""
+    """Return the azimuth, radians, from which the camera path is best visible."""
     found = []
     for azimuth in np.radians(np.arange(20, 380, 45)):
         pose = look_at_origin(np.radians(25), azimuth, FIGURE_DISTANCE)
@@ -230,7 +231,7 @@ def _best_side(path: Float) -> float:
 
 
 def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
-    """The object as this view shows it: by its picture if a camera took one, else by its depth."""
+    """Draw the object as seen in a view: the camera image if there is one, else shaded depth."""
     seen = view.observation
     elevation, azimuth = view.angles
     times = (
@@ -275,7 +276,7 @@ def _draw_outline(
     caster: RayCaster,
     displacement: Float,
 ) -> None:
-    """The outline of a surface, displaced, as a view sees it, over the image of that view."""
+    """Draw the outline of a displaced surface over the image of a view."""
     seen = view.observation
     height, width = axis.get_images()[0].get_size()
     shape = (int(height), int(width))
@@ -286,7 +287,7 @@ def _draw_outline(
     ).rays.reshape(-1, 3)
 
     along = rays @ seen.pose[:3, :3].T.astype(np.float32)
-    # Seen from a camera that is displaced the other way, the surface itself is where it should be.
+    # Displacing the camera by the opposite vector is equivalent to displacing the surface.
     depth, _ = caster.cast(seen.pose[:3, 3] - displacement, along)
     shows = without_specks(np.isfinite(depth).reshape(shape))
     if shows.any() and not shows.all():
@@ -295,13 +296,13 @@ def _draw_outline(
 
 
 def without_specks(silhouette: Mask) -> Mask:
-    """A silhouette, (H, W), without its tiny parts, and with its tiny holes filled."""
+    """Remove tiny parts from a silhouette, (H, W), and fill its tiny holes."""
     least = SPECK_SHARE * silhouette.sum()
     cleaned = silhouette.copy()
     for shows in (True, False):
         parts, _ = label(cleaned == shows)
         tiny = np.bincount(parts.ravel()) < least
-        tiny[0] = False  # the pixels of the other kind
+        tiny[0] = False  # label 0 is the complement
         cleaned[tiny[parts]] = not shows
     return cleaned
 
@@ -313,7 +314,7 @@ def _draw_belief(
     classes: Sequence[str],
     shown: Index,
 ) -> None:
-    """Bars of the classes shown, with a mark where belief is enough."""
+    """Draw a bar for each listed class, with a mark at the stopping threshold."""
     best = int(view.belief.argmax())
     at = 0.015 + 0.97 * threshold
 
@@ -344,7 +345,7 @@ def _draw_belief(
             )
         if np.isfinite(threshold):
             axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
-    if np.isfinite(threshold):  # a rule of your own need not stop at a belief
+    if np.isfinite(threshold):  # custom stopping rules may have no threshold
         enough = f"enough: {100 * threshold:.0f} %"
         axis.text(
             min(at + 0.02, 1),
@@ -363,7 +364,7 @@ def _draw_values(
     sphere: Viewpoints,
     seen_from: float,
 ) -> None:
-    """Draw the dome of candidate views from above, coloured by their values."""
+    """Draw the dome of candidate views from above, coloured by value."""
     view = views[-1]
     turned = sphere.azimuth - seen_from - np.pi / 2
     out = 90 - np.degrees(sphere.elevation)
@@ -451,7 +452,7 @@ def _draw_cells(
 ) -> float:
     """Draw a coloured cell around each view of a grid.
 
-    It returns how far out the cells reach, degrees from the zenith.
+    Returns the angle from the zenith that the cells reach, degrees.
     """
     out = 90 - np.degrees(sphere.elevation)
     rings = np.sort(90 - np.asarray(sphere.elevations, float))
@@ -477,7 +478,7 @@ def _draw_cells(
 
 
 def _draw_scale(axis: Axes) -> None:
-    """What the colours of values mean: from low to high."""
+    """Draw the colour scale of the values, from low to high."""
     axis.imshow(
         VALUES(np.linspace(0, 1, 64))[None],
         aspect="auto",
@@ -512,7 +513,7 @@ def _draw_path(
     light: SoftLight,
     seen_from: float,
 ) -> None:
-    """Draw the visible part of the object, the candidate views, and the path."""
+    """Draw the visible part of the object, the candidate views, and the camera path."""
     figure = axis.figure
     assert isinstance(figure, Figure)
     wide = axis.get_position().width * figure.get_figwidth()

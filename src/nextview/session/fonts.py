@@ -1,4 +1,4 @@
-"""Find fonts of this machine that contain the characters of a figure's texts."""
+"""Find installed fonts that contain the characters of a figure's texts."""
 
 import logging
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from matplotlib.ft2font import FT2Font
 from matplotlib.text import Text
 
 log = logging.getLogger(__name__)
-NO_SCRIPT = ("Last Resort", "STIX", "cm")  # fonts of boxes, and of formulas
+NO_SCRIPT = ("Last Resort", "STIX", "cm")  # placeholder fonts and formula fonts
 INSTALL = (
     "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for "
     "Chinese, Japanese and Korean, has them"
@@ -17,10 +17,10 @@ INSTALL = (
 
 
 def fit_fonts(texts: Iterable[Text]) -> None:
-    """Give each text the fonts that its characters need beside its own.
+    """Add the fonts that the characters of each text need.
 
-    A character that no installed font has is written as its code, as in a terminal, and one line of
-    the log says which font to install.
+    A character without an installed font is written as its code, and a line in the log says which
+    font to install.
     """
     lacking: set[str] = set()
     for text in texts:
@@ -40,24 +40,27 @@ def fit_fonts(texts: Iterable[Text]) -> None:
 
 
 def _missing(written: str, path: str) -> set[str]:
-    """The characters that a font lacks, but for ends of lines."""
+    """Return the characters that a font lacks, except line breaks."""
     has = _characters(path)
     return {c for c in written if ord(c) not in has and c != "\n"}
 
 
 @cache
 def _characters(path: str) -> frozenset[int]:
-    """The codes of all characters in a font file; none if it cannot be read."""
+    """Return the codes of all characters in a font file; none if it cannot be read."""
     try:
         return frozenset(FT2Font(path).get_charmap())
-    except (OSError, RuntimeError) as error:  # what FreeType says of a damaged file
+    except (OSError, RuntimeError) as error:  # FreeType raises these for damaged files
         log.debug("%s: not a usable font (%s)", path, error)
         return frozenset()
 
 
 @cache
 def _fonts_for(missing: frozenset[str]) -> tuple[tuple[str, ...], frozenset[str]]:
-    """Families that have these characters, as few as possible, and the characters that none has."""
+    """Choose as few font families as possible for these characters.
+
+    Also returns the characters that no font has.
+    """
     families: list[str] = []
     without = set(missing)
     fonts = [
@@ -65,7 +68,7 @@ def _fonts_for(missing: frozenset[str]) -> tuple[tuple[str, ...], frozenset[str]
     ]
     fonts.sort(key=_plainness)
     while without:
-        # the plainest of equal ones
+        # of equally good fonts, the plainest
         best = max(fonts, key=lambda font: len(_held(font, without)), default=None)
         held = set() if best is None else _held(best, without)
         if best is None or not held:
@@ -81,7 +84,7 @@ def _held(font: FontEntry, characters: Iterable[str]) -> set[str]:
 
 
 def _plainness(font: FontEntry) -> tuple[bool, bool, str]:
-    """Upright fonts of normal weight come first; then by name, so that every run takes the same."""
+    """Sort key: upright fonts of normal weight first, then by name for reproducibility."""
     weighs = font.weight not in (400, "normal", "regular", "book")
     return font.style != "normal", weighs, font.name
 

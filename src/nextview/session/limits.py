@@ -1,4 +1,4 @@
-"""Candidate views to which no camera is sent, by what the frames show of the place."""
+"""Exclude candidate views that are unsafe according to the frames."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,17 +16,16 @@ if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
 LOWEST_VIEW = 0.08
-"""Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do
-not touch it.
-"""
+"""Metres above the support plane: clearance for a wrist camera, its mount and the gripper."""
 GRAZING = 0.1
-"""Height over the support plane in parts of the distance to the object, 6 degrees: from lower
-the plane is a line.
+"""Least height above the support plane as a share of the distance to the object, about 6 degrees.
+
+From a lower viewpoint the plane degenerates to a line.
 """
 HIGHEST = 2.0
-"""Metres above the support plane that no camera of a robot reaches."""
+"""Metres above the support plane: beyond the reach of most robots."""
 MOST_METRES = 10.0
-"""Heights and clearances beyond are of another unit: no candidate view would be left."""
+"""Larger heights and clearances are likely to be in another unit."""
 VIEW_CLEARANCE = 0.1  # metres between the camera and what the frames show
 TOO_LOW = "too low"
 TOO_HIGH = "too high"
@@ -37,21 +36,21 @@ BEHIND_WALL = "behind a wall"
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a camera may be sent. What is not given has a default that fits most robots.
+    """Limits on the camera positions, with defaults that suit most robots.
 
-    The heights count from the support plane, where one is known. What the frames show as occupied
-    is left out where the object stands on a support plane; in a gripper or on a turntable
-    (``ObservedObject(support=False)``) the room moves against the object, so only a clearance that
-    is given counts.
+    Heights are measured from the support plane, if it is known. Surfaces in the frames exclude
+    views if the object rests on a support plane. In a gripper or on a turntable
+    (``ObservedObject(support=False)``) the surroundings move relative to the object, and only an
+    explicit clearance is applied.
 
     Attributes:
-        min_height: of the camera above the support plane, metres, at least. By default 0.08, and a
-            tenth of the camera's distance from the object.
-        max_height: of the camera above the support plane, metres, at most; infinity for none. By
-            default 2, or as high as the camera has stood.
-        clearance: metres between the camera and any surface that the frames show, but for the
-            object and the support plane; views behind walls and behind other things are left out
-            too. 0 leaves none of these out. By default 0.1.
+        min_height: least height of the camera above the support plane, metres. By default 0.08, and
+            a tenth of the camera's distance from the object.
+        max_height: largest height of the camera above the support plane, metres; infinity for no
+            limit. By default 2, or the greatest height of the camera so far.
+        clearance: least distance between the camera and any surface in the frames, except the
+            object and the support plane, metres. Views behind walls and other objects are excluded
+            too. 0 disables these tests. By default 0.1.
     """
 
     min_height: float | None = None
@@ -78,7 +77,7 @@ class Limits:
 
     @classmethod
     def none(cls) -> "Limits":
-        """A camera may be sent everywhere."""
+        """Return limits that allow every camera position."""
         return cls(min_height=-1e6, max_height=np.inf, clearance=0.0)
 
     def reasons(
@@ -87,16 +86,16 @@ class Limits:
         object: "ObservedObject",
         surroundings: Sequence[Surroundings],
     ) -> NDArray[np.str_]:
-        """Why each candidate is left out.
+        """Return the reason why each candidate is excluded.
 
         Args:
             poses: of the candidates, camera-to-world, metres, (V, 4, 4).
-            object: what is looked at.
-            surroundings: what each frame of it shows.
+            object: the object.
+            surroundings: of the object in each frame.
 
         Returns:
             (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``BEHIND_SOMETHING``, ``BEHIND_WALL``,
-            or "" where none applies.
+            or "" for allowed candidates.
         """
         places = poses[:, :3, 3]
         found = np.full(len(poses), "", f"<U{len(TOO_NEAR)}")
@@ -134,7 +133,7 @@ class Limits:
         object: "ObservedObject",
         surroundings: Sequence[Surroundings],
     ) -> list[tuple[str, Mask]]:
-        """Return reasons by what the frames show, with their places; the last one counts most."""
+        """Return reasons and excluded positions from the frames; later entries take precedence."""
         clearance = self.clearance
         if clearance is None:
             clearance = VIEW_CLEARANCE if object.support else 0.0
@@ -163,6 +162,6 @@ class Limits:
 
 
 def in_words(reasons: Sequence[str]) -> str:
-    """How many candidates are left out for which reason: ``12 too low, 3 behind a wall``."""
+    """Summarise the excluded candidates: ``12 too low, 3 behind a wall``."""
     counts = Counter(reason for reason in reasons if reason)
     return ", ".join(f"{count} {reason}" for reason, count in counts.most_common())

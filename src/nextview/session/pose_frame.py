@@ -1,4 +1,4 @@
-"""In which frame the poses of a result are given."""
+"""The coordinate frame of the poses of a result."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ IN_WORDS: dict[PoseFrameName, str] = {
 
 @dataclass(frozen=True, eq=False)
 class PoseFrame:
-    """The frame in which poses are given.
+    """The coordinate frame of poses.
 
     Attributes:
-        name: "world": the robot's, in which the poses of the frames' cameras are given. "camera":
-            that of the camera, OpenCV axes, of a single frame without a pose. "object": the object
-            frame, for cameras that give observations, as simulated ones do.
-        from_object: from the object frame, in metres, into this one, (4, 4) float64.
+        name: "world": the frame of the camera poses, usually that of the robot. "camera": the
+            camera frame, OpenCV axes, of a single frame without a pose. "object": the object frame,
+            for cameras that return observations, such as simulated ones.
+        from_object: transform from the object frame, in metres, to this frame, (4, 4) float64.
     """
 
     name: PoseFrameName = "object"
@@ -39,10 +39,10 @@ class PoseFrame:
 
     @classmethod
     def of(cls, thing: ObservedObject | None) -> PoseFrame:
-        """The frame of what is seen of an object.
+        """Return the frame of an observed object.
 
         Args:
-            thing: the object as it was seen in frames; None where observations were handed in.
+            thing: the object observed in frames; None if observations were passed in.
         """
         if thing is None or not thing.sightings:
             return cls()
@@ -50,8 +50,7 @@ class PoseFrame:
         frame = thing.object_frame
         from_object = np.eye(4)
         from_object[:3, :3] = frame.axes.T
-        # Each frame shows the object in another place, if their poses err: it is where they show
-        # it in the mean.
+        # With pose errors each frame shows the object displaced; the mean displacement is used.
         shifts = [sighting.shift for sighting in thing.sightings]
         from_object[:3, 3] = frame.centre - np.mean(shifts, axis=0)
         posed = thing.sightings[-1].frame.pose is not None

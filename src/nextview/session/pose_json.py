@@ -1,4 +1,4 @@
-"""Where an object is, as JSON has it."""
+"""The pose of an object as JSON."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from nextview.session.result import Recognition
 
 
 def pose_as_json(result: Recognition) -> dict[str, Any]:
-    """What ``Recognition`` says of where the object is, by the same names.
+    """Return the pose attributes of a ``Recognition`` under the same names.
 
     Args:
         result: of a session, or of one object of a scene.

@@ -1,4 +1,4 @@
-"""Candidate camera poses, ranked by what their views are expected to tell."""
+"""Rank camera poses by the expected information of their views."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -17,14 +17,14 @@ from nextview.types import Float, Index
 
 @dataclass(frozen=True, eq=False)
 class RankedView:
-    """A candidate view, and what it is expected to tell.
+    """A candidate view with its expected information.
 
     Attributes:
-        index: of the pose in the list that was ranked; of the candidate in ``Session.sphere``.
-        pose: camera-to-world, (4, 4), as it was given.
-        information: expected information, natural units (nats).
-        settles: the same as a share of what is not known yet, 0 to 1.
-        words: which things it would tell apart.
+        index: of the pose in the ranked list, or of the candidate in ``Session.sphere``.
+        pose: camera-to-world, (4, 4), as it was passed in.
+        information: expected information, nats.
+        settles: the same as a share of the remaining uncertainty, 0 to 1.
+        words: description of the things that the view would distinguish.
     """
 
     index: int
@@ -38,16 +38,16 @@ class RankedView:
 
 
 def camera_poses(given: ArrayLike) -> Float:
-    """Check camera poses that a user hands in.
+    """Check camera poses passed in by a user.
 
     Args:
         given: camera-to-world, (V, 4, 4).
 
     Returns:
-        The same, float64.
+        The same as float64.
 
     Raises:
-        UsageError: they are of another shape, or no rigid motions.
+        UsageError: the shape is wrong, or a matrix is not a rigid transformation.
     """
     try:
         poses = np.asarray(given, np.float64)
@@ -85,18 +85,18 @@ def rank_views(
     """Rank candidate poses.
 
     Args:
-        outlook: what can be foreseen.
+        outlook: prediction of further views.
         inside: the poses in the object frame, object radii, (V, 4, 4).
         radius: of the object, metres.
-        given: the poses as they are shown, (V, 4, 4).
-        index: what they are called, (V,).
-        goal: what is to be told.
+        given: the poses to report, (V, 4, 4).
+        index: the indices to report, (V,).
+        goal: what the views shall determine.
 
     Returns:
-        The best first.
+        The views, the best first.
 
     Raises:
-        UsageError: there is no such goal.
+        UsageError: the goal is not known.
     """
     if goal not in get_args(Goal):
         raise UsageError(

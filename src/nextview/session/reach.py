@@ -1,4 +1,4 @@
-"""What a robot can do: where it can bring the camera, and what that costs."""
+"""Reachability and travel cost of a robot's camera."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,23 +14,23 @@ from nextview.policies.base import EpisodeState, travel_from
 from nextview.types import Float, Index, Mask
 
 Reachable = Mask | Callable[[Float], bool]
-"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of
-``Session.poses``. What a masked array hides cannot be reached."""
+"""Candidate views that the camera can reach: (V,) bool, or a function of a pose of
+``Session.poses``. Masked entries of a masked array cannot be reached."""
 TravelCost = Float | Callable[[Float, Float], float]
-"""What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a
-function of two poses in the frame of ``Session.poses``, the first that where the camera stands.
-Infinity, or masked out, where there is no way."""
-# gives the candidate poses, (V, 4, 4); called only where a function has to be asked
+"""Cost of moving from one view to another, in any unit: (V, V), from row to column; or a function
+of two poses in the frame of ``Session.poses``, the first being the current camera pose. Infinite
+or masked costs mean that there is no path."""
+# returns the candidate poses, (V, 4, 4); called only if a function needs them
 Poses = Callable[[], Float]
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Where the camera can go, and what that costs.
+    """Views that the camera can reach, and the cost of moving there.
 
     Attributes:
         failed: viewpoints that the camera failed to reach, (V,).
-        reachable: tells which poses can be reached; None if all can.
+        reachable: reachable views or a function of a pose; None if all can be reached.
         cost: cost of each move; None for the distance on the view sphere.
     """
 
@@ -73,7 +73,7 @@ class Reach:
             poses: returns the poses of all views.
 
         Returns:
-            The state with these.
+            The constrained state.
         """
         views = np.flatnonzero(state.free[0])
         views = views[self.can_reach(views, poses)]
@@ -102,7 +102,7 @@ class Reach:
 
 
 def _cost(answer: Any) -> float:
-    """What a function says that a way costs; infinity is a cost, too."""
+    """Check a cost returned by a user's function; infinity is allowed."""
     try:
         cost = float(answer)
     except (TypeError, ValueError):
@@ -115,9 +115,9 @@ def _cost(answer: Any) -> float:
 
 
 def _truth(answer: Any) -> bool:
-    """What a function says of a pose.
+    """Check the answer of a user's function for a pose.
 
-    None is no answer: a function that forgets to return gives it.
+    None is rejected: it is returned by a function without a return statement.
     """
     if not isinstance(answer, bool | np.bool_ | int):
         raise UsageError(
@@ -130,7 +130,7 @@ def as_reachable(
     given: ArrayLike | Callable[[Float], bool] | None,
     views: int,
 ) -> Reachable | None:
-    """Check what a user passes as reachable.
+    """Check the reachability passed in by a user.
 
     Args:
         given: mask of the views, (V,) bool, a callable on poses, or None.
@@ -145,7 +145,7 @@ def as_reachable(
     if given is None or callable(given):
         return given
     mask = np.asarray(given)
-    if np.ma.isMaskedArray(given):  # what is masked out is not known to be reachable
+    if np.ma.isMaskedArray(given):  # masked views are not known to be reachable
         mask = np.ma.filled(given, False)
     if mask.shape != (views,) or mask.dtype != bool:
         wanted = f"reachable is a mask, ({views},) bool, or a callable on poses"
@@ -157,7 +157,7 @@ def as_travel_cost(
     given: ArrayLike | Callable[[Float, Float], float] | None,
     views: int,
 ) -> TravelCost | None:
-    """Check what a user passes as travel cost.
+    """Check the travel cost passed in by a user.
 
     Args:
         given: cost from view to view, (V, V), a callable on two poses, or None.
@@ -172,7 +172,7 @@ def as_travel_cost(
     if given is None or callable(given):
         return given
     costs = np.asarray(given)
-    # for a way that is masked out no cost is known
+    # masked moves have no known cost
     if np.ma.isMaskedArray(given) and costs.dtype.kind in "fiu":
         costs = np.ma.filled(np.ma.asarray(given, np.float64), np.inf)
     if (

@@ -1,4 +1,4 @@
-"""A picture handed in twice, as a camera that hangs does: it is one piece of evidence, not two."""
+"""Detect repeated images, as from a camera that hangs: they are one piece of evidence, not two."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,19 +21,16 @@ ADVICE = (
     "and counts once: does the camera hang?"
 )
 REPEATED = ViewWarning("repeated", ADVICE)
-# difference of the third rows of two poses that differ by a turn about the vertical alone
+# tolerance for the third rows of two poses that differ only by a rotation about the vertical
 SAME_THIRD_ROW = 1e-4
 
 
 def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
-    """Return whether an observation shows the picture of an earlier one.
+    """Return True if an observation repeats the image of an earlier one.
 
     Args:
         seen: the observation.
-        earlier: the earlier ones.
-
-    Returns:
-        True if it does.
+        earlier: the earlier observations.
     """
     return any(
         np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen)
@@ -48,8 +45,8 @@ def after_repeated(
 ) -> "ObjectState | None":
     """Return the state of an object after a frame that repeats an earlier one.
 
-    No two pictures of a depth camera are the same to the last bit. The true camera pose of such a
-    frame is not known, so the earlier sighting stands for it.
+    No two images of a depth camera are bitwise identical, so such a frame was not captured at its
+    stated pose. The earlier sighting is used in its place.
 
     Args:
         state: before the frame.
@@ -73,10 +70,10 @@ def after_repeated(
 
 
 def _is_one_picture(first: Observation, second: Observation) -> bool:
-    """Whether two observations of one depth show no two sides of a symmetric object.
+    """Return True if two observations with the same depth are the same image.
 
-    A render of one is the same to the bit after a turn about the vertical. Nothing else is, from
-    another direction.
+    Two renders of a symmetric object may also be identical, but only after a rotation about the
+    vertical.
     """
     if not first.seen:
         return False

@@ -1,4 +1,4 @@
-"""How an episode ended: the answer, how sure it is, and its picture."""
+"""The result of an episode: answer, confidence, pose and figure."""
 
 import logging
 from dataclasses import dataclass, field
@@ -29,35 +29,36 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# an object as novel as so many times the share that may be called unknown gets no confident answer
+# no answer is confident if the p-value is below this multiple of the significance level
 SUSPICIOUS = 5.0
 
 
 @dataclass(frozen=True)
 class Recognition:
-    """The end of an episode, or how it stands; before the first view nothing is seen.
+    """The result of an episode, or its current state.
 
-    It is confident where the threshold was reached in a view without warnings that hold it (see
-    ``ViewWarning.holds``), by an object that is not suspiciously novel (see ``SUSPICIOUS``) and may
-    be of the class by its size, fewer than half of the views contradict others, and there is no
+    An answer is confident if the threshold was reached in a view without blocking warnings (see
+    ``ViewWarning.holds``), the object is not suspiciously novel (see ``SUSPICIOUS``), its size is
+    possible for the class, fewer than half of the views contradict others, and there is no
     ``doubt``.
 
     Attributes:
         views: in order.
         classes: their names.
-        confident: else the views ran out.
-        sphere: the candidates.
-        stopping: the rule that ended it.
-        stranded: whether it ended because no view that was left could be reached; then it is not
-            confident.
-        why_stranded: what became of the views that were left, as "30 too low, 9 failed"; "" if not
+        confident: whether the answer is confident.
+        sphere: the candidate views.
+        stopping: the stopping rule.
+        stranded: whether the episode ended because no remaining view could be reached; then it is
+            not confident.
+        why_stranded: reasons for the remaining views, such as "30 too low, 9 failed"; "" if not
             stranded.
-        score: gives the novelty of views; None if the recogniser has none.
-        unknown_rate: share of objects of known classes that may be called unknown; 0: none.
-        impossible: classes whose objects have not such a size.
-        poses_in: the frame in which poses are given.
+        score: computes the novelty of views; None if the recogniser has no novelty score.
+        unknown_rate: significance level of the test for unknown objects; 0 disables it.
+        impossible: classes that never have the size of this object.
+        poses_in: the coordinate frame of the poses.
 
     Example:
+
         >>> result = nextview.recognise(sample_mesh("chair"), start=3)
         >>> result.answer, result.confident
         ('chair', True)
@@ -77,12 +78,12 @@ class Recognition:
 
     @property
     def seen(self) -> bool:
-        """Whether the object was seen from any of the views."""
+        """True if the object was visible in any view."""
         return any(view.observation.seen for view in self.views)
 
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
-        """Likely faults of the views, each kind once, as the last view reports it."""
+        """Likely problems of the views, each kind once, as reported by the last view."""
         found = {
             warning.name: warning for view in self.views for warning in view.warnings
         }
@@ -90,11 +91,11 @@ class Recognition:
 
     @property
     def novelty(self) -> float | None:
-        """p-value: share of known objects that are at least as novel; None without a score.
+        """p-value: share of known objects that are at least as novel; None without a novelty score.
 
-        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see
-        ``values_of``. Of things that are known by their geometry it says how badly the likeliest
-        one explains the depth.
+        It is valid for objects seen under the same conditions as the known ones; occlusion is taken
+        into account, see ``values_of``. For things with known geometry it measures how badly the
+        likeliest one explains the depth.
         """
         if self._explained is not None:
             return self._explained
@@ -105,26 +106,26 @@ class Recognition:
 
     @property
     def unknown(self) -> bool:
-        """Whether the object is of no known class, by its novelty or its size."""
+        """True if the object belongs to no known class, by its novelty or its size."""
         if not self.unknown_rate or not self.seen:
             return False
         if self.novelty is not None and self.novelty < self.unknown_rate:
             return True
-        # A thing that explains the depth has the right size, even where half of it is hidden.
+        # A thing that explains the depth has the right size, even if half of it is hidden.
         return self._explained is None and self.most_like in self.impossible
 
     @property
     def none_of_them(self) -> str:
-        """The answer for an unknown object.
+        """Answer for an unknown object.
 
-        It reads ``none of the 10 known classes (most like a toilet)``.
+        For example ``none of the 10 known classes (most like a toilet)``.
         """
         a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
         return f"none of the {len(self.classes)} known classes (most like {a} {self.most_like})"
 
     @property
     def why_unknown(self) -> str:
-        """What an object is called unknown for, in words."""
+        """Reason why the object is called unknown, in words."""
         if self._explained is not None and self._joint_poses:
             return (
                 f"{100 * self._explained:.2g} % of taught things are explained as badly by their"
@@ -136,22 +137,22 @@ class Recognition:
 
     @property
     def most_like(self) -> str | None:
-        """The class believed most, also of an unknown object; None if nothing was seen."""
+        """Class with the highest belief, even for an unknown object; None if never visible."""
         return self.classes[int(self.views[-1].belief.argmax())] if self.seen else None
 
     @property
     def answer(self) -> str | None:
-        """The class believed most; None if nothing was seen, or the object is unknown."""
+        """Class with the highest belief; None if nothing was visible or the object is unknown."""
         return None if self.unknown else self.most_like
 
     @property
     def confidence(self) -> float:
-        """The belief in the answer; 0 if there is none."""
+        """Belief in the answer; 0 if there is none."""
         return 0.0 if self.answer is None else float(self.views[-1].belief.max())
 
     @property
     def beliefs(self) -> dict[str, float]:
-        """The belief in each class by its name, over all views; empty if nothing was seen."""
+        """Belief in each class by name, over all views; empty if nothing was visible."""
         return (
             dict(zip(self.classes, self.views[-1].belief.tolist(), strict=True))
             if self.seen
@@ -167,15 +168,15 @@ class Recognition:
     def pose(self) -> Float | None:
         """Transform from the frame of the scan file to ``pose_frame``, (4, 4), metres.
 
-        A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no
-        answer, or its geometry is not known: see ``why_no_pose``.
+        A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None if there is no answer
+        or its geometry is not known: see ``why_no_pose``.
         """
         found = self._candidates_of_answer
         return found[0].pose if found else None
 
     @property
     def pose_of(self) -> str | None:
-        """Name of the thing whose scan ``pose`` is of; one of the answer's class."""
+        """Name of the thing to whose scan ``pose`` belongs; a thing of the answer's class."""
         found = self._candidates_of_answer
         return found[0].thing if found else None
 
@@ -187,21 +188,20 @@ class Recognition:
 
     @property
     def pose_frame(self) -> PoseFrameName:
-        """The frame in which poses are given.
+        """Name of the coordinate frame of the poses.
 
-        "world" is the robot's: that in which the frames' camera poses are. "camera" is that of the
-        camera (OpenCV axes), of a single frame without a pose. "object" is the object frame in
-        metres, where a camera gives observations, as simulated ones do.
+        "world" is the frame of the camera poses, usually that of the robot. "camera" is the camera
+        frame (OpenCV axes) of a single frame without a pose. "object" is the object frame in
+        metres, for cameras that return observations, such as simulated ones.
         """
         return self.poses_in.name
 
     @property
     def pose_candidates(self) -> tuple[PoseCandidate, ...]:
-        """The plausible poses, most likely first, in ``pose_frame``; probabilities sum to 1.
+        """Plausible poses, most likely first, in ``pose_frame``; their probabilities sum to 1.
 
-        There are several where a thing looks alike from several sides, or two things look alike:
-        each says of which thing it is. None are known where ``pose`` is None because the geometry
-        is not known.
+        There are several if a thing looks alike from several sides, or if two things look alike;
+        each candidate names its thing. There are none if the geometry is not known.
         """
         return tuple(
             candidate.moved(self.poses_in.from_object)
@@ -212,8 +212,8 @@ class Recognition:
     def pose_uncertainty(self) -> PoseUncertainty | None:
         """Standard deviations of ``pose``, degrees and millimetres; None without a pose.
 
-        It comes from how well the depth determines the pose, from how likely the other candidates
-        of the same thing are, and in the world from how far off cameras usually are.
+        They combine the precision of the registration, the probabilities of the other candidates of
+        the same thing, and, in the world frame, the usual error of camera poses.
         """
         found = self._candidates_of_answer
         joint = self._joint
@@ -233,10 +233,10 @@ class Recognition:
 
     @property
     def posed_surface(self) -> Triangles | None:
-        """The scan of the named thing in its pose; None without a pose or a surface.
+        """Scan of the named thing in its pose; None without a pose or a surface.
 
-        Vertices, (V, 3) float64, in the object frame and object radii as observations are, and
-        faces, (F, 3).
+        Vertices, (V, 3) float64, in the object frame and object radii like observations; and faces,
+        (F, 3).
         """
         radius = self.radius
         if not self._candidates_of_answer or radius is None:
@@ -251,8 +251,7 @@ class Recognition:
     def _displacements(self) -> Float:
         """Displacement of ``posed_surface`` in each view, (views, 3), object radii.
 
-        It comes from the errors of the camera positions, in the object frame; 0 where it is not
-        known.
+        It comes from errors of the camera positions, in the object frame; 0 if it is not known.
         """
         displaced = np.zeros((len(self.views), 3))
         radius = self.radius
@@ -274,35 +273,35 @@ class Recognition:
 
     @property
     def _likeliest_in_object_frame(self) -> PoseCandidate:
-        """The likeliest pose of a thing of the class that is the answer, in the object frame."""
+        """Likeliest pose among the things of the answer's class, in the object frame."""
         label = self._candidates_of_answer[0].label
         return next(each for each in self._joint_poses if each.label == label)
 
     @property
     def why_no_pose(self) -> str:
-        """Why there is no pose though all views were judged together; "" if there is one."""
+        """Reason why jointly judged views determine no pose; "" if there is a pose."""
         joint = self._joint
         return joint.why_no_pose if joint is not None and self.pose is None else ""
 
     @property
     def doubt(self) -> str:
-        """Why the answer is not confident however high the belief in it, in words; "" if it may be.
+        """Reason why the answer is not confident whatever its belief; "" if there is none.
 
-        A taught thing is confident as "this thing in this pose": its scan stands on the ground or
-        above, hides what is behind it, fits without being stretched, has its orientation known, and
-        is seen in enough pixels.
+        A taught thing is confident as "this thing in this pose": its scan is not below the ground,
+        it occludes the background, it fits without being scaled, its orientation is determined, and
+        it covers enough pixels.
         """
         joint = self._joint
         return "" if joint is None or self.answer is None else joint.doubt
 
     @property
     def _joint(self) -> JointBelief | None:
-        """What all views say together; None if views are judged one by one."""
+        """Joint belief from all views; None if views are judged separately."""
         return self.views[-1].joint if self.views else None
 
     @property
     def _joint_poses(self) -> tuple[PoseCandidate, ...]:
-        """The poses that the object may have, in the object frame."""
+        """Candidate poses of the object, in the object frame."""
         joint = self._joint
         return () if joint is None else joint.poses
 
@@ -314,7 +313,7 @@ class Recognition:
 
     @property
     def _candidates_of_answer(self) -> list[PoseCandidate]:
-        """Poses of things of the answer's class, most likely first; none if unknown."""
+        """Poses of things of the answer's class, most likely first; empty if unknown."""
         if self.answer is None:
             return []
         label = self.classes.index(self.answer)
@@ -324,14 +323,14 @@ class Recognition:
 
     @property
     def travel(self) -> float:
-        """Of the whole episode, grid cells."""
+        """Distance travelled in the whole episode, grid cells."""
         return self.views[-1].travel if self.views else 0.0
 
     @property
     def effort_in_words(self) -> str:
-        """How many views there were and how far the camera moved between them, as angles.
+        """Describe the number of views and the camera travel between them as an angle.
 
-        It reads ``2 views, moved by 63° around it``.
+        For example ``2 views, moved by 63° around it``.
         """
         views = number_of(len(self.views), "view")
         if len(self.views) < 2:
@@ -339,7 +338,7 @@ class Recognition:
         return f"{views}, moved by {np.degrees(self.views[-1].arc):.0f}° around it"
 
     def __repr__(self) -> str:
-        """One line: ``chair (belief 0.998, 2 views, moved by 63° around it, confident)``."""
+        """Return one line: ``chair (belief 0.998, 2 views, moved by 63° around it, confident)``."""
         views = self.effort_in_words
 
         if not self.seen:
@@ -364,29 +363,29 @@ class Recognition:
 
     @property
     def _place_in_words(self) -> str:
-        """Place and uncertainty in words; "" without a pose.
+        """Describe position and uncertainty; "" without a pose.
 
-        It reads ``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``.
+        For example ``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``.
         """
         if self.place is None:
             return ""
         return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
 
     def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
-        """Draw the episode: images, values of the views, beliefs, and the path on the sphere.
+        """Draw the episode: images, values of the views, beliefs, and the camera path.
 
-        The outline of the posed scan of the named thing is drawn over the images, corrected for the
-        errors of the camera positions.
+        The outline of the named thing's scan is drawn over the images in its pose, corrected for
+        the errors of the camera positions.
 
         Args:
-            path: file to write, PNG, PDF or SVG, which is replaced; None for no file.
+            path: output file, PNG, PDF or SVG; an existing file is replaced; None for no file.
             title: text before the heading.
 
         Returns:
             The figure.
 
         Raises:
-            UsageError: it is another format.
+            UsageError: the format is not supported.
             ResultsError: the path is a link or a folder, or cannot be written.
         """
         from nextview.session.episode_figure import draw_episode, save_figure

@@ -17,12 +17,12 @@ def episode_as_json(
     frames: Sequence[str] = (),
     indent: int | None = 1,
 ) -> str:
-    """Return all that the table shows, with complete beliefs and maps, as a JSON object.
+    """Return the contents of the table, with complete beliefs and maps, as a JSON object.
 
     Args:
         result: of the episode.
         name: of the object.
-        frames: names of the captured frames that were taken; empty for other cameras.
+        frames: names of the captured frames that were used; empty for other cameras.
         indent: of the text, in spaces; None for one line.
 
     Returns:
@@ -57,7 +57,7 @@ def episode_as_json(
 
 
 def _view_as_json(result: Recognition, view: View) -> dict[str, Any]:
-    """One view: what was seen, what is believed, and where to look next."""
+    """Return one view: camera position, belief, and next view."""
     azimuth = None
     if view.azimuth_bins is not None and view.observation.seen:
         bins = view.azimuth_bins[view.belief.argmax()]
@@ -86,7 +86,7 @@ def _view_as_json(result: Recognition, view: View) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """As JSON has it: six digits, and null for what is no number."""
+    """Convert a value for JSON: floats with six decimals, and null for NaN and infinity."""
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray | np.generic):

@@ -1,4 +1,4 @@
-"""Live use: hand in what the camera sees, get told what it is or where to look next."""
+"""Recognise one object live: pass in frames and get the belief and the next view."""
 
 from __future__ import annotations
 
@@ -70,63 +70,62 @@ if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
 FARTHEST_TARGET = 60.0
-"""Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
-be a thousand times.
+"""Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres
+would be a thousand times as large.
 """
-# times as large as in any single frame: from there an object of several frames is none
+# an object so many times as large in all frames as in any single frame is inconsistent
 MUCH_LARGER = 1.5
 
 
 @runtime_checkable
 class FrameCamera(Protocol):
-    """A camera in the world that delivers frames, with the object that it is to look at.
+    """A camera in the world that delivers frames of one object.
 
-    Where it has an attribute ``knows_reach`` that is true, it decides alone where it can stand, and
-    is asked for candidates too that ``Session.limits`` would leave out: views that were captured
-    before, for instance.
+    If it has a true attribute ``knows_reach``, it alone decides which poses it can reach, and is
+    also asked for candidates that ``Session.limits`` would exclude, such as views captured earlier.
     """
 
     @property
     def object(self) -> ObservedObject:
-        """The object that it is to look at."""
+        """Object to recognise."""
         ...
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose in the object frame, object radii, or from near it.
+        """Capture a frame from a pose in the object frame, object radii, or from near it.
 
         It raises ``NoViewLeftError`` if that is not possible.
         """
         ...
 
     def refused(self, error: ObservationError) -> None:
-        """The object is not found in the last frame.
+        """Report that the object was not found in the last frame.
 
-        Returns if there may be another one; else raises the error.
+        Returns if there may be another frame; otherwise raises the error.
         """
         ...
 
 
 @lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
-    """The libraries below NumPy.
+    """Return a controller of the thread pools below NumPy.
 
-    Their threads wait for more work in a loop, and take the cores from the networks.
+    Their idle threads spin and take the cores from the networks.
     """
     return ThreadpoolController().select(user_api="blas")
 
 
 class Session:
-    """One object under way; the caller moves the camera.
+    """Recognition of one object, view by view; the caller moves the camera.
 
-    Threads that share one wait for each other. A camera that goes where it is told, in the object
-    frame and object radii:
+    A session can be shared between threads; calls wait for each other. With a camera that reaches
+    every requested pose, in the object frame and object radii:
 
     >>> session = nextview.load().session()                                     # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
     ...     view = session.update(my_camera.observe(session.pose))
     >>> session.result                                                          # doctest: +SKIP
 
-    A depth camera on a robot, in the world and metres, beginning wherever it stands:
+    With a depth camera on a robot, in the world frame and metres, from any first pose:
 
     >>> session = nextview.load().session(distance=0.6)                         # doctest: +SKIP
     >>> session.update(look())                                                  # doctest: +SKIP
@@ -138,23 +137,21 @@ class Session:
 
     Args:
         models: recogniser and map networks.
-        policy: chooses the next view; it may know other viewpoints, see ``policies.off_grid``.
-        sphere: the viewpoints.
-        start: where to look first; a camera that stands elsewhere is as welcome.
-        stopping: when to stop; by default the rule that goes with the recogniser, see
-            ``Stopping.of``.
-        rng: for policies that draw; seed 0 by default.
-        object: which object to find in frames; by default the one at which the first camera is
-            aimed.
+        policy: chooses the next view; it may use other viewpoints, see ``policies.off_grid``.
+        sphere: the candidate viewpoints.
+        start: suggested first view; the camera may start elsewhere.
+        stopping: stopping rule; by default that of the recogniser, see ``Stopping.of``.
+        rng: for random policies; seed 0 by default.
+        object: the object to find in frames; by default the one at which the first camera is aimed.
         distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii
             by default.
-        unknown: share of objects of known classes that may be called unknown; 0: none.
-        segmentation: that tells the things in frames, see ``Scene``; None for the bundled network.
-            An object has its own.
+        unknown: significance level of the test for unknown objects; 0 disables it.
+        segmentation: segments the objects in frames, see ``Scene``; None for the bundled network. A
+            given object has its own segmentation.
 
     Raises:
-        UsageError: an object and a segmentation are given.
-        SessionError: the models lack what the policy needs.
+        UsageError: both an object and a segmentation are given.
+        SessionError: the models lack an output that the policy needs.
     """
 
     def __init__(
@@ -198,9 +195,7 @@ class Session:
         self.views: list[View] = []
         self._goal: Goal = "thing"
         self.observers: list[Callable[[Session], None]] = []
-        """Called, in order, after each view that was taken in, and when another next view was
-        chosen.
-        """
+        """Functions that are called in order after each view, and when the next view changes."""
 
         self._before = 0 if object is None else len(object.sightings)
         self._chooser = anywhere(policy, sphere)
@@ -212,7 +207,10 @@ class Session:
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the lock: a session can be copied and pickled, its networks are opened again."""
+        """Leave out the lock, so that a session can be copied and pickled.
+
+        Networks are opened again.
+        """
         return {name: value for name, value in vars(self).items() if name != "_lock"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -233,16 +231,16 @@ class Session:
             outlook=recogniser.outlook if isinstance(recogniser, LooksAhead) else None,
         )
 
-    # Where to look
+    # The next view
 
     @property
     def done(self) -> bool:
-        """Whether the episode has ended."""
+        """True if the episode has ended."""
         return len(self._episodes.running) == 0
 
     @property
     def view(self) -> int:
-        """Where to look now."""
+        """Index of the next view."""
         return int(self._episodes.current[0])
 
     @property
@@ -252,11 +250,11 @@ class Session:
 
     @property
     def poses(self) -> Float:
-        """Candidate poses in your world: camera-to-world, (V, 4, 4), OpenCV axes, metres.
+        """Candidate poses in the world: camera-to-world, (V, 4, 4), OpenCV axes, metres.
 
-        At ``distance`` from the object, looking at its centre, the horizon level. They move when a
-        frame shows better where the object is. Without frames they are those of ``sphere``, in
-        object radii.
+        They are level, at ``distance`` from the object, and aimed at its centre. They are updated
+        when a frame improves the estimate of the object's position. Without frames they are those
+        of ``sphere``, in object radii.
         """
         return self._poses_around(self.object)
 
@@ -272,7 +270,7 @@ class Session:
 
     @property
     def target(self) -> Float | None:
-        """Where to look now, one of ``poses``, (4, 4); None where the episode has ended."""
+        """Next camera pose, one of ``poses``, (4, 4); None if the episode has ended."""
         return None if self.done else self.poses[self.view]
 
     def ranked(
@@ -280,24 +278,22 @@ class Session:
         poses: ArrayLike | None = None,
         goal: Goal = "thing",
     ) -> tuple[RankedView, ...]:
-        """Candidate views, those first that are expected to tell most of which taught thing it is.
+        """Rank candidate views by their expected information about the identity of the object.
 
-        Of the views that are worth nearly the same the nearer ones come first. What stands in the
-        way by the frames so far is allowed for; whether the camera can be brought there is yours to
-        know.
+        Among views of similar value, nearer ones come first. Occluders seen in the frames so far
+        are taken into account; reachability is left to the caller.
 
         Args:
-            poses: of the camera, as your robot can take them, camera-to-world, (V, 4, 4), OpenCV
-                axes, in the world and metres; without frames in the object frame and object radii.
-                By default those of ``poses`` that are left: not visited, within ``limits`` and
-                ``reachable``.
-            goal: "thing" ranks by what is told of which thing it is, "pose" by what is told of its
-                pose too.
+            poses: candidate camera poses of your robot, camera-to-world, (V, 4, 4), OpenCV axes, in
+                the world frame and metres; without frames, in the object frame and object radii. By
+                default the remaining ``poses``: not visited, within ``limits`` and ``reachable``.
+            goal: "thing" ranks by information about the identity, "pose" by information about
+                identity and pose.
 
         Raises:
-            SessionError: nothing can be foreseen: no view was taken, or the geometry of what is
-                seen is not known.
-            UsageError: these are no poses.
+            SessionError: nothing can be predicted, as there is no view yet or the geometry of the
+                object is not known.
+            UsageError: the poses are invalid.
         """
         with self._lock:
             return self._ranked(poses, goal)
@@ -326,14 +322,14 @@ class Session:
             else self.object.object_frame.pose_in_object(given)
         )
         radius = self.views[-1].observation.radius
-        assert radius is not None  # else nothing was foreseen
+        assert radius is not None  # an outlook implies a radius
         return rank_views(outlook, inside, radius, given, left, goal)
 
     @property
     def outlook(self) -> Outlook | None:
-        """What can be foreseen of other views: the leading hypotheses of known geometry.
+        """Prediction of further views from the leading hypotheses with known geometry.
 
-        None before the first view, and where no taught thing of known geometry explains the views.
+        None before the first view, and if no taught thing with known geometry explains the views.
         """
         with self._lock:
             if not self.views:
@@ -344,7 +340,7 @@ class Session:
             return found if isinstance(found, Outlook) else None
 
     def _left(self) -> Mask:
-        """Which candidates may still be chosen, (V,) bool."""
+        """Return which candidates may still be chosen, (V,) bool."""
         state = self._episodes.steps[-1].state
         if state is not None:
             return state.free[0]
@@ -356,7 +352,7 @@ class Session:
     def distance(self) -> float | None:
         """Camera distance from the object's centre, metres; None for ``sphere.distance`` radii.
 
-        What is set here counts from the next pose on.
+        A change takes effect with the next pose.
         """
         return self._distance
 
@@ -373,16 +369,16 @@ class Session:
                     self._distance = before
                     raise
 
-    # What the robot can do
+    # Constraints of the robot
 
     @property
     def goal(self) -> Goal:
-        """What is to be found out: which "thing" it is, or its "pose" too.
+        """Goal of the session: "thing" for the identity, "pose" for identity and pose.
 
-        For the pose, views are valued by what they tell of thing and pose, and the session goes on
-        until the likeliest pose is as sure as the thing has to be: turns of a symmetry make no
-        difference. Where no pose can be known it ends as for the thing. Set it before the first
-        view. ``UsageError``: the policy looks for no pose.
+        With "pose", views are valued by their information about identity and pose, and the session
+        continues until the belief in the likeliest pose, up to symmetry, reaches the threshold too.
+        If the object has no known pose, the session ends as with "thing". Set the goal before the
+        first view. A policy that does not support it raises ``UsageError``.
         """
         return self._goal
 
@@ -410,7 +406,7 @@ class Session:
             self._episodes = self._begin(self.view)
 
     def _pose_in_doubt(self, step: Step) -> bool:
-        """Whether the pose is wanted, and not as sure yet as the thing has to be."""
+        """Return True if the goal is the pose and its belief is below the threshold."""
         joint = step.joint[0] if len(step.joint) else None
         if self._goal == "thing" or joint is None or not joint.poses:
             return False
@@ -419,11 +415,11 @@ class Session:
 
     @property
     def reachable(self) -> Reachable | None:
-        """Which views the camera can be brought to, see ``session.reach.Reachable``; None for all.
+        """Views that the camera can reach, see ``session.reach.Reachable``; None for all.
 
-        No policy chooses another one. What is set here counts from now on: if the view that was
-        chosen is not reachable, another one is. A callable is asked anew for each choice, of
-        unvisited views, after the first view.
+        Policies choose only among these. A change takes effect immediately: if the current target
+        is not reachable, another view is chosen. A callable is called again for each choice after
+        the first view, with the unvisited views.
         """
         return self._reach.reachable
 
@@ -438,9 +434,9 @@ class Session:
     def travel_cost(self) -> TravelCost | None:
         """Cost from view to view, see ``session.reach.TravelCost``; None for grid cells.
 
-        Policies that weigh travel weigh this instead from the next choice on: seconds of your
-        planner for instance. Its unit does not matter: its mean over the free views counts as much
-        as their mean travel in cells.
+        It replaces the travel distance from the next choice on, for instance by the duration from
+        your motion planner. The unit is arbitrary: costs are scaled so that their mean over the
+        free views equals the mean travel in cells.
         """
         return self._reach.cost
 
@@ -457,10 +453,10 @@ class Session:
 
     @property
     def limits(self) -> Limits:
-        """Limits by which candidates are left out, see ``session.limits.Limits``.
+        """Limits on the camera positions, see ``session.limits.Limits``.
 
-        What is set here counts from now on, as for ``reachable``. Sessions without frames know no
-        place to keep off.
+        A change takes effect immediately, as for ``reachable``. Limits have no effect in sessions
+        without frames.
         """
         return self._limits
 
@@ -481,7 +477,7 @@ class Session:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Why each candidate is left out by ``limits`` or has failed, (V,); else ""."""
+        """Reason why each candidate is excluded or has failed, (V,); "" if allowed."""
         with self._lock:
             reasons = self._reasons(self.object)
             return tuple(
@@ -490,7 +486,7 @@ class Session:
             )
 
     def _reasons(self, object: ObservedObject | None) -> NDArray[np.str_]:
-        """See ``Limits.reasons``; all "" before the first frame, and without frames."""
+        """Return ``Limits.reasons``; all "" without frames and before the first one."""
         if object is None or not object.sightings:
             return np.full(len(self.sphere), "", "<U1")
         known = {id(shown.frame): shown for shown in self._surroundings}
@@ -508,9 +504,8 @@ class Session:
     def failed(self, view: int | None = None) -> None:
         """Report that the camera could not reach a view, by default the requested one.
 
-        It is offered no more.
-
-        Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
+        The view is not offered again. If no reachable view is left, the session ends and is not
+        confident: ``Recognition.stranded``.
         """
         with self._lock:
             if self.done:
@@ -540,7 +535,7 @@ class Session:
             )
 
     def _set_reach(self, reach: Reach) -> None:
-        """Choose another view if the one that was chosen can no longer be reached."""
+        """Update the reachability, and choose another view if the target is no longer reachable."""
         if self.done or (self.views and self._can_go(self.view, reach)):
             self._reach = reach
         elif self.views:
@@ -557,7 +552,7 @@ class Session:
             self.views[-1] = view
             for observer in self.observers:
                 observer(self)
-        else:  # with frames it begins where the camera is
+        else:  # with frames the episode starts at the current camera pose
             episodes = (
                 self._begin_nearest(reach) if self.object is None else self._episodes
             )
@@ -565,15 +560,15 @@ class Session:
             self._episodes = episodes
 
     def _can_go(self, view: int, reach: Reach) -> bool:
-        """Whether the camera may be sent to a view, and can be brought there."""
+        """Return True if a view is allowed and reachable."""
         if self._reasons(self.object)[view]:
             return False
         return bool(reach.can_reach(np.array([view]), lambda: self.poses)[0])
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
-        """Before the first view: begin at the nearest view that can be reached.
+        """Start a session without views at the nearest reachable view.
 
-        A callable is not asked yet.
+        A callable is not called yet.
         """
         there = ~reach.failed & (
             reach.reachable if isinstance(reach.reachable, np.ndarray) else True
@@ -591,9 +586,9 @@ class Session:
         object: ObservedObject | None,
         here: Float | None = None,
     ) -> EpisodeState:
-        """Return the state with the reachable views and the travel cost.
+        """Add the reachable views and the travel cost to a state.
 
-        They are counted from the camera of the last view by default.
+        Costs are measured from the camera of the last view by default.
         """
         if here is None:
             here = (
@@ -607,24 +602,23 @@ class Session:
             state, self.sphere, here, lambda: self._poses_around(object)
         )
 
-    # What is seen
+    # Views
 
     def update(self, seen: Observation | Frame) -> View:
-        """Take in what was seen, from ``pose``, ``target`` or anywhere else.
+        """Process a view, taken from ``pose``, ``target`` or anywhere else.
 
-        Where this raises, nothing is taken in: the session is as it was, and goes on with the next
-        view.
+        If an error is raised, the session is unchanged and continues with the next view.
 
         Args:
-            seen: an observation in the object frame; or a frame of a depth camera in the world. If
-                a frame shows better where the object is, the earlier ones are expressed anew, and
-                ``views`` with them: all but what was chosen after them, and what they were warned
-                of.
+            seen: an observation in the object frame, or a frame of a depth camera in the world
+                frame. If a frame improves the estimate of the object's position, the earlier
+                ``views`` are recomputed in the new object frame, except for their choices and
+                warnings.
 
         Raises:
-            SessionError: the episode has ended, or a session mixes frames and observations.
-            ObservationError: the object is not found in the frame, the frames do not fit together,
-                or the image does not suit the networks.
+            SessionError: the episode has ended, or the session mixes frames and observations.
+            ObservationError: the object is not found in the frame, the frames are inconsistent, or
+                the image does not suit the networks.
             UsageError: the session's ``distance`` is inside the object, or more than 60 object
                 radii.
             PolicyError: the policy failed.
@@ -689,12 +683,12 @@ class Session:
             raise
 
     def _part(self, object: ObservedObject) -> None:
-        """Look for another parting of what is suspiciously novel."""
+        """Try other segmentations of an object that is suspiciously novel."""
         if self._p_value(object.observations) < SUSPICIOUS * self.unknown:
             object.part_otherwise(self._p_value)
 
     def _p_value(self, observations: Sequence[Observation]) -> float:
-        """The p-value of some views as views of a known thing; 1 where nothing tells it."""
+        """Return the p-value of some views as views of a known thing; 1 without a novelty score."""
         seen = [one for one in observations if one.seen]
         if not seen:
             return 1.0
@@ -710,10 +704,10 @@ class Session:
         return recogniser.novelty.of_views(values_of(found.novelty))
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
-        """Refuse frames that only together make the object reach as far as the camera's distance.
+        """Reject frames whose object is as large as the camera distance only in combination.
 
-        A wrong distance or depth scale shows in a single frame. Where each frame alone shows a much
-        smaller object, the frames do not fit together.
+        A wrong distance or depth scale is visible in a single frame. If the object is much smaller
+        in each frame than in all together, the frames are inconsistent.
         """
         together = object.object_frame.radius
         if (
@@ -739,7 +733,7 @@ class Session:
         )
 
     def _check_distance(self, object: ObservedObject) -> None:
-        """Refuse targets inside the object or far from it, as soon as its radius is known."""
+        """Reject targets inside the object or far away, as soon as its radius is known."""
         radius = object.object_frame.radius
         if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
             return
@@ -766,7 +760,7 @@ class Session:
         here: Float,
         object: ObservedObject | None,
     ) -> View:
-        """Take in the last of some observations, and whichever of the others has changed."""
+        """Process the last of some observations, and any earlier ones that have changed."""
         last = len(observations) - 1
         changed = [
             k
@@ -821,7 +815,7 @@ class Session:
         which: Sequence[int],
         warnings: Sequence[ViewWarning],
     ) -> dict[int, Evidence]:
-        """The evidence of some of the observations; a repeated picture counts as unseen.
+        """Return the evidence of some observations; a repeated image counts as not visible.
 
         ``warnings`` are those of the last observation.
         """
@@ -836,10 +830,10 @@ class Session:
         evidence: dict[int, Evidence],
         directions: Sequence[Float],
     ) -> Episodes:
-        """The episode so far once more, with new evidence of some of its views."""
+        """Replay the episode with new evidence for some of its views."""
         episodes = self._begin(self.view)
         for k, step in enumerate(self._episodes.steps):
-            # What all views said together then is not asked again: it takes time.
+            # The joint beliefs of earlier steps are reused, as they are slow to compute.
             episodes.take(
                 evidence.get(k, step.evidence),
                 directions[k][None],
@@ -848,12 +842,12 @@ class Session:
         return episodes
 
     def _degrees_off(self, direction: Float) -> float:
-        """Between the view that was asked for and where the camera stood."""
+        """Return the angle between the requested view and the actual camera position."""
         off = angle_between(self.sphere.directions[self.view], direction)
         return float(np.degrees(off))
 
     def _snapped(self, towards: Float) -> Float:
-        """A direction, (3,), or that of the candidate view at which it is."""
+        """Return a direction, (3,), snapped to a candidate view that it coincides with."""
         view, there = self.sphere.nearest(towards)
         return self.sphere.directions[view] if there else towards
 
@@ -864,7 +858,7 @@ class Session:
         direction: Float,
         travel: tuple[float, float],
     ) -> View:
-        """What a step says of its view, but for what was chosen after it."""
+        """Return the view of a step, without its choice of the next view."""
         calibration = self._episodes.calibration
         nearest, there = self.sphere.nearest(direction)
         azimuth = (
@@ -906,7 +900,7 @@ class Session:
             return None
         if (
             score is not None and score.joint
-        ):  # how badly all views are explained by what is known
+        ):  # by geometry: how badly known things explain all views
             calibration = self.models.recogniser.calibration
             classes = len(self.models.classes)
             seen = np.maximum(step.seen, 1)
@@ -922,7 +916,7 @@ class Session:
         steps: Sequence[Step],
         observations: Sequence[Observation],
     ) -> bool:
-        """Return whether an object is too novel for a confident answer."""
+        """Return True if an object is too novel for a confident answer."""
         if not self.unknown:
             return False
         joint = steps[-1].joint[0] if steps[-1].joint else None
@@ -946,7 +940,7 @@ class Session:
         views: Sequence[int],
         directions: Sequence[Float],
     ) -> list[tuple[float, float]]:
-        """Cells and radians on the way to each view, from the places where the camera stood."""
+        """Return the travel to each view from the camera positions, in cells and radians."""
         sphere = self.sphere
         found = [(0.0, 0.0)]
         at = [
@@ -992,7 +986,7 @@ class Session:
         return values[0]
 
     def run(self, camera: Camera | FrameCamera) -> Recognition:
-        """Continue to the end with a camera, or until it has no view left."""
+        """Run the session with a camera until it ends or the camera has no view left."""
         while not self.done:
             try:
                 seen = camera.observe(self.pose)
@@ -1012,7 +1006,7 @@ class Session:
 
     @property
     def result(self) -> Recognition:
-        """How it ended; or what is believed so far, not confident, while it goes on."""
+        """Result of the session; while it is running, the current belief, not confident."""
         with self._lock:
             enough = self.done and bool(self._episodes.outcome.confident[0])
             all_taken = len(self.views) >= min(
@@ -1037,7 +1031,7 @@ class Session:
             return replace(result, confident=enough and not result.unknown)
 
     def _why_stranded(self) -> str:
-        """What became of the candidates that were not taken, in words."""
+        """Describe why the remaining candidates were not taken."""
         taken = {view.index for view in self.views}
         left = [
             why or "out of reach"
@@ -1048,13 +1042,13 @@ class Session:
 
 
 def _in_doubt(step: Step) -> bool:
-    """Whether what all views say together is not to be acted on, however it is believed."""
+    """Return True if the joint belief must not be acted on, whatever its value."""
     joint = step.joint[0] if step.joint else None
     return joint is not None and bool(joint.doubt)
 
 
 def _seen_anew(before: View, seen: View) -> View:
-    """A view that is seen in a better object frame: what was chosen and noticed then stays."""
+    """Update a view for an improved object frame; its choice and warnings are kept."""
     return replace(
         seen,
         next_view=before.next_view,
@@ -1069,14 +1063,14 @@ def _next_of(step: Step) -> int | None:
 
 
 def _half_diagonal(points: Float) -> float:
-    """Half the diagonal of the box around points, (N, 3), metres; 0 around none."""
+    """Return half the diagonal of the bounding box of points, (N, 3), metres; 0 for no points."""
     if not len(points):
         return 0.0
     return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
 
 
 def _checked_distance(given: float | None) -> float | None:
-    """A distance of the camera, metres, above 0; or None."""
+    """Return a camera distance, metres, checked to be above 0; or None."""
     return None if given is None else number(given, "the distance, in metres,", above=0)
 
 

@@ -1,4 +1,4 @@
-"""What was seen of an object, on a warm ground in soft light: the pictures of an episode."""
+"""Render the observed surface of an object in soft light, for the figures of episodes."""
 
 from collections.abc import Sequence
 
@@ -12,21 +12,21 @@ from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene
 from nextview.session.style import GROUND, WOOD, rgb
 from nextview.types import Floats
 
-# a surface ends where depth jumps by more from pixel to pixel, object radii
+# a larger depth step between neighbouring pixels separates surfaces, object radii
 TORN = 0.08
-# half a side of the ground that may lie in shadow, object radii, and its points along it
+# half the side of the ground with computed shadows, object radii, and its grid points per side
 SHADOW_REACH = 2.6
 SHADOW_GRID = 72
-# directions of a ball, of any length
+# random directions, not normalised
 SKY = np.random.default_rng(0).normal(size=(150, 3))
-# how much darker the ground is in full shadow: warm
+# colour factor of the ground in full shadow: a warm tint
 SHADE = np.array([0.52, 0.57, 0.64])
-# towards the lamp, camera frame: from above, left, behind the camera
+# direction to the lamp, camera frame: above, left of and behind the camera
 LAMP_DIRECTION = np.array([-0.45, -0.75, -0.8])
 
 
 def surface(seen: Observation) -> Triangles:
-    """A depth image as triangles, object frame."""
+    """Triangulate a depth image, object frame."""
     depth = (
         seen.depth
         if seen.exact
@@ -48,7 +48,7 @@ def surface(seen: Observation) -> Triangles:
         axis=0,
         return_counts=True,
     )
-    rim = edges[times == 1]  # has steps as large as pixels: they are smoothed away
+    rim = edges[times == 1]  # boundary edges, smoothed to remove pixel steps
     count = np.maximum(np.bincount(rim.ravel(), minlength=len(points)), 1)[:, None]
 
     for _ in range(5):
@@ -65,7 +65,7 @@ def surface(seen: Observation) -> Triangles:
 
 
 class SoftLight:
-    """The light on an object, as far as it was seen, and on the ground below it."""
+    """Lighting of the observed surface of an object and of the ground below it."""
 
     def __init__(self, observations: Sequence[Observation]) -> None:
         seen: list[Floats] = [
@@ -74,7 +74,7 @@ class SoftLight:
         ]
         self.surfaces = [surface(o) for o in observations]
         self._caster = RayCaster(self.surfaces)
-        # sensors see one surface at several places
+        # with sensor noise the views of one surface do not coincide
         self._off = 0.02 if all(o.exact for o in observations) else 0.15
         self.floor = float(np.percentile(np.concatenate(seen)[:, 2], 0.5)) - 0.01
         x, y = np.meshgrid(*[np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_GRID)] * 2)
@@ -87,7 +87,7 @@ class SoftLight:
         self._ground = gaussian_filter(light, 1.2, mode="nearest")
 
     def _sky(self, points: Floats, normals: Floats, balls: Floats) -> Floats:
-        """The share of the sky that each point sees."""
+        """Return the share of the sky that is visible from each point."""
         free = np.zeros(len(points))
         for ball in balls / np.linalg.norm(balls, axis=1, keepdims=True):
             free += np.isinf(
@@ -110,10 +110,10 @@ class SoftLight:
             surfaces: the surfaces.
             pose: camera-to-world, (4, 4).
             intrinsics: pinhole matrix, (3, 3), pixels.
-            shape: rows and columns of the picture.
+            shape: rows and columns of the image.
 
         Returns:
-            The picture, (H, W, 3) uint8, and the distance along each pixel's ray, (H, W).
+            The image, (H, W, 3) uint8, and the distance along each pixel's ray, (H, W).
         """
         rays = (
             PinholeCamera.of(np.asarray(intrinsics, np.float64), shape).rays.reshape(

@@ -1,4 +1,4 @@
-"""How all figures of the reports look: narrow, so that they can be read on a phone."""
+"""Common style of all figures: narrow, so that they can be read on a phone."""
 
 import re
 from io import StringIO
@@ -20,17 +20,17 @@ from nextview.types import Floats
 INK = "#1f2933"
 GREY = "#8a949e"
 FAINT = "#d5dbe1"
-# of all figures; policies: ``figures.POLICY_COLOURS``
+# colours of all figures; for policies see ``figures.POLICY_COLOURS``
 BLUE = "#0b5fa5"
 LIGHT_BLUE = "#38a0d9"
 ACCENT = "#d1495b"
-# of pictures: the page, what things stand on, the things
+# colours of rendered images: page, support surface, objects
 PAPER = "#fafaf8"
 GROUND = "#f5efe4"
 WOOD = "#e0ab6c"
-# of several things of one kind, in turn
+# colours of several series, in order
 SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
-UNKNOWN_COLOUR = 201, 210, 218  # the colour of what has no value
+UNKNOWN_COLOUR = 201, 210, 218  # for missing values
 FIGURE_STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],
@@ -54,10 +54,10 @@ FIGURE_STYLE = {
 
 
 class PlainFigure(Figure):
-    """A figure that shows names literally, in a font that has their characters."""
+    """A figure that shows names literally, in fonts that have their characters."""
 
     def draw(self, renderer: Any) -> None:
-        """Draw, after all texts are known."""
+        """Choose fonts for all texts, then draw."""
         texts = self.findobj(Text)
         for text in texts:
             text.set_parse_math(False)
@@ -84,7 +84,7 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def percent_axis(axis: Axis) -> None:
-    """Write the shares along an axis in percent, with no more digits than they need."""
+    """Format the ticks of an axis in percent, with as few digits as possible."""
     axis.set_major_formatter(
         FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %")
     )
@@ -108,13 +108,13 @@ def legend(axes: Axes, title: str | None = None) -> None:
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """A colour as three numbers from 0 to 255."""
+    """Convert a colour to three integers from 0 to 255."""
     red, green, blue = (round(255 * part) for part in matplotlib.colors.to_rgb(colour))
     return red, green, blue
 
 
 def heat(values: Floats) -> NDArray[np.uint8]:
-    """Values in the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
+    """Map values to the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
     known = np.isfinite(values)
     low, high = (
         (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
@@ -127,7 +127,7 @@ def heat(values: Floats) -> NDArray[np.uint8]:
 
 
 def to_svg(figure: Figure) -> str:
-    """A figure as SVG text, the same every time."""
+    """Return a figure as reproducible SVG text."""
     text = StringIO()
     with matplotlib.rc_context(FIGURE_STYLE):
         figure.savefig(
@@ -137,7 +137,7 @@ def to_svg(figure: Figure) -> str:
             pad_inches=0.05,
             metadata={"Date": None},
         )
-    # XML has none of these
+    # characters that XML does not allow
     return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())
 
 

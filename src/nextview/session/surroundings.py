@@ -1,4 +1,4 @@
-"""What a frame shows beside the object: surfaces to keep clear of, and walls of the room."""
+"""Surroundings of the object in a frame: obstacles to keep clear of, and walls of the room."""
 
 from dataclasses import dataclass
 
@@ -12,34 +12,33 @@ from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask
 
-MOST_SURROUNDING_POINTS = 6000  # of a frame that are looked at
-# parts of the depth between neighbouring pixels, at an edge, where a sensor makes up points
+MOST_SURROUNDING_POINTS = 6000  # sampled points per frame
+# relative depth step of an edge, where sensors measure points between the surfaces
 JUMP = 0.03
-# metres above the support plane, beside the noise, up to which a point lies on it
+# metres, tolerance for points on the support plane, in addition to the noise
 NEAR_SUPPORT = 0.02
-OWN_RADIUS = 1.1  # object radii around the centre within which a surface counts as the object's own
-FEWEST_NEAR_POINTS = 3  # that are measured near a place before it counts as occupied
-# pixels to each side that tell what lies on the line of sight to a place
+OWN_RADIUS = 1.1  # object radii; surfaces within this distance of the centre are the object's own
+FEWEST_NEAR_POINTS = 3  # least number of points near a position that is occupied
+# half the window of pixels around the line of sight to a position
 SIGHT_WINDOW = 2
-NARROWEST_WALL = 0.5  # metres that a frame shows of a wall, at least
-WALL_TOLERANCE = 0.02  # metres, beside the noise
-BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
-# share of a frame's points that may lie behind a wall: reflections, a door that stands open
+NARROWEST_WALL = 0.5  # metres, least visible extent of a wall
+WALL_TOLERANCE = 0.02  # metres, in addition to the noise
+BEHIND = 0.15  # metres; points farther behind a wall do not belong to it
+# largest share of points behind a wall, because of reflections or an open door
 MOST_POINTS_BEHIND = 0.03
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a frame shows beside the object.
+    """Everything in a frame except the object.
 
     Attributes:
         frame: the frame itself.
         noise: of its depth.
         plane: the support plane, if it is known.
-        points: some of what the frame shows, world, metres, (N, 3), edges left out.
-        tolerance: how far each point may be off, metres, (N,).
-        walls: upright planes behind which the frame shows next to nothing; their normals point to
-            the camera.
+        points: sampled points of the frame without edges, world, metres, (N, 3).
+        tolerance: uncertainty of each point, metres, (N,).
+        walls: vertical planes with almost no points behind them; their normals point to the camera.
     """
 
     frame: Frame
@@ -51,11 +50,11 @@ class Surroundings:
 
     @classmethod
     def of(cls, sighting: Sighting, around: ObjectFrame) -> "Surroundings":
-        """The surroundings of an object that a sighting shows.
+        """Compute the surroundings of an object from a sighting.
 
         Args:
             sighting: the frame, its noise and the support plane.
-            around: the object, whose own surface is no wall.
+            around: the object frame; the object's own surface is not a wall.
         """
         frame = sighting.frame
         rows, columns = _smooth_pixels(frame)
@@ -66,19 +65,19 @@ class Surroundings:
         return cls(frame, sighting.noise, sighting.plane, points, tolerance, walls)
 
     def is_near(self, places: Float, around: ObjectFrame, clearance: float) -> Mask:
-        """Whether a measured surface is near each place.
+        """Return which positions are near a measured surface.
 
-        The surfaces of the object and of the support plane do not count.
+        The surfaces of the object and of the support plane are ignored.
 
         Args:
-            places: (V, 3), world, metres.
-            around: the object.
-            clearance: how near, metres.
+            places: positions, (V, 3), world, metres.
+            around: the object frame.
+            clearance: largest distance that counts as near, metres.
 
         Returns:
             (V,) bool.
         """
-        # Only what lies as far from the object as the places do can be near them.
+        # Only points about as far from the object as the positions can be near them.
         reach = np.linalg.norm(places - around.centre, axis=1)
         away = np.linalg.norm(self.points - around.centre, axis=1)
         kept = (away > reach.min() - clearance) & (away < reach.max() + clearance)
@@ -89,7 +88,7 @@ class Surroundings:
         return (apart < clearance).sum(1) >= FEWEST_NEAR_POINTS
 
     def shows_behind(self, wall: Plane) -> bool:
-        """Whether the camera stood behind the wall of another frame, or sees something there."""
+        """Return True if the camera was behind another frame's wall, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
         return (
@@ -102,16 +101,17 @@ class Surroundings:
         around: ObjectFrame,
         margin: float,
     ) -> tuple[Mask, Mask]:
-        """Which places the frame looks through, and which are hidden by other things.
+        """Return which positions the frame shows to be free, and which are occluded.
 
         Args:
-            places: (V, 3), world, metres.
-            around: the object: what is behind it is not taken for hidden, as it has to be looked at
-                from there.
-            margin: metres in front of a place or behind it, within which a surface says neither.
+            places: positions, (V, 3), world, metres.
+            around: the object frame. Positions behind the object are not reported as occluded,
+                since the object must be viewed from there.
+            margin: distance between position and surface below which the position is neither,
+                metres.
 
         Returns:
-            Free and hidden, (V,) bool each. Of places outside of the picture neither is said.
+            Free and occluded, (V,) bool each. Positions outside the image are neither.
         """
         pose = self.frame.camera_to_world
         camera = pose[:3, 3]
@@ -136,9 +136,9 @@ class Surroundings:
         return free, blocked & ~own & ~on_plane
 
     def _depth_towards(self, seen_at: Float) -> Float:
-        """Median depth around the pixels that points, (V, 3), camera frame, project to.
+        """Return the median depth around the projections of points, (V, 3), camera frame.
 
-        NaN where nothing is measured.
+        NaN if no depth is measured there.
         """
         height, width = self.frame.shape
         ahead = seen_at[:, 2] > 1e-6
@@ -157,8 +157,7 @@ class Surroundings:
         windows = self.frame.depth[rows, columns].astype(np.float64)
         depth = windows.reshape(len(windows), len(around) ** 2)
 
-        # The middle of what is measured in each window: zeros, which mean nothing, are sorted to
-        # the front.
+        # Median of the valid depths in each window; invalid zeros are sorted to the front.
         depth = np.sort(depth, axis=1)
         measured = (depth > 0).sum(1)
         middle = depth.shape[1] - (measured + 1) // 2
@@ -169,17 +168,17 @@ class Surroundings:
 
 
 def _height(points: Float, plane: Plane | None) -> Float:
-    """Of points above the support plane, metres, (N,); infinity where no plane is known."""
+    """Return the height of points above the support plane, metres, (N,); infinity without one."""
     return np.full(len(points), np.inf) if plane is None else plane.height(points)
 
 
 def _tolerance(noise: Noise, depth: Float) -> Float:
-    """How far what is measured at some depths, metres, may be off, metres."""
+    """Return the uncertainty of measured depths, metres."""
     return 3 * noise.at(depth) * depth**2 + 0.003 * depth
 
 
 def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
-    """Rows and columns of a grid of pixels with a depth, but for those at an edge."""
+    """Return rows and columns of a grid of pixels with valid depth, without edges."""
     height, width = frame.shape
     step = max(1, int(np.sqrt(height * width / MOST_SURROUNDING_POINTS)))
     rows, columns = np.nonzero(frame.depth[step // 2 :: step, step // 2 :: step])
@@ -198,13 +197,13 @@ def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
 
 
 def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
-    """The walls of the room that a sighting shows, beside the object and before none of it."""
+    """Return the walls of the room in a sighting that do not pass through the object."""
     frame = sighting.frame
     samples = sample(frame, frame.depth > 0, sighting.noise)
     away = np.linalg.norm(samples.points - around.centre, axis=1)
     others = samples.some(away > OWN_RADIUS * around.radius)
     plane = sighting.plane
-    if plane is None:  # all that is seen is above
+    if plane is None:  # without a plane all points count as above it
         up = around.axes[2]
         plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)
     rng = np.random.default_rng(0)
@@ -212,7 +211,7 @@ def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
 
 
 def _share_behind(away: Float, tolerance: Float) -> float:
-    """Share of points, at distances before a wall, (N,), and off by so much, that lie behind it."""
+    """Return the share of points behind a wall, from distances, (N,), and tolerances."""
     return (
         float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean())
         if len(away)

@@ -1,4 +1,4 @@
-"""The front door: models, a policy, candidate viewpoints and a stopping rule."""
+"""Entry points of the library: models, policy, candidate viewpoints and stopping rule."""
 
 import os
 import warnings
@@ -52,29 +52,30 @@ if TYPE_CHECKING:
     from nextview.simulation.sensor import Sensor
 
 MOST_THREADS = 1024
-# the models that ship with the package, and their share of false alarms
+# the default models and their false-alarm rate
 DEFAULT_MODELS = "modelnet10"
 UNKNOWN_ALPHA = 0.02
-# files of captured frames, not of meshes
+# suffixes of captured frames, as opposed to meshes
 FRAME_FILES = (".mcap", ".db3", ".bag", ".png")
 
 
 @dataclass(frozen=True, repr=False)
 class System:
-    """All that is needed to recognise an object.
+    """Everything needed to recognise an object, as created by ``load``.
 
-    ``load`` makes one. It is pickled as how it was loaded.
+    It is pickled as the arguments of ``load``.
 
     Attributes:
         models: the recogniser and the map networks.
         policy: chooses the next view.
         policy_name: name of the policy.
-        sphere: the candidates.
-        stopping: decides when an episode ends.
-        unknown: share of objects of known classes that may be called unknown.
-        loaded: the arguments of ``load`` that make it.
+        sphere: the candidate viewpoints.
+        stopping: the stopping rule.
+        unknown: significance level of the test for unknown objects; 0 disables it.
+        loaded: the arguments of ``load``.
 
     Example:
+
         >>> nextview.load().recognise(sample_mesh("table"), start=33).answer
         'table'
     """
@@ -89,7 +90,7 @@ class System:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that it knows."""
+        """Names of the known classes."""
         return self.models.classes
 
     def session(
@@ -105,36 +106,35 @@ class System:
         goal: Goal = "thing",
         segmentation: "Segmenter | None" = None,
     ) -> Session:
-        """Create a session for one object; a robot needs to give only a distance.
+        """Create a session for one object. For a robot, a distance is enough.
 
-        Candidate views that touch the table, or what else the frames show, are left out: the last
-        three say more of it, see ``session.limits.Limits``.
+        Candidate views that would collide with the table or other visible surfaces are excluded,
+        see ``session.limits.Limits`` for the three limits.
 
         Args:
-            start: where to look first, an index of ``sphere``; drawn by the seed if not given.
-            seed: decides the first view and whatever the policy draws.
-            object: which object to find in the frames of a depth camera; by default the one at
-                which the first camera is aimed.
-            distance: how far from the object the camera shall stand, metres; 3 object radii by
-                default. With an object or a distance the session takes frames, else what it is
-                given first.
-            min_height: of the camera above the support plane, metres, at least; by default 0.08,
+            start: first view, an index of ``sphere``; random by default.
+            seed: of the first view and of random policies.
+            object: the object to find in the frames of a depth camera; by default the one at which
+                the first camera is aimed.
+            distance: desired distance of the camera from the object, metres; 3 object radii by
+                default. With an object or a distance, the session accepts frames; otherwise the
+                first input decides.
+            min_height: least height of the camera above the support plane, metres; by default 0.08,
                 and a tenth of the camera's distance from the object.
-            max_height: of the camera above the support plane, metres, at most; by default 2, or as
-                high as it stood.
-            clearance: metres between the camera and what the frames show; 0.1 by default, 0 for
-                any.
-            any_orientation: it is a taught thing that may be held, lean or fly: it need not rest
-                as it was taught. A frame takes about twice as long. What hangs in the air is found
-                by a mask or in a box, with ``ObservedObject(support=False)``.
-            goal: "thing" looks until it is sure which thing it is; "pose" until its pose is as
-                sure, too, see ``Session.goal``.
-            segmentation: that tells the things in frames, as that of a ``Scene``; the object is one
-                of these.
+            max_height: largest height of the camera above the support plane, metres; by default 2,
+                or the greatest height of the camera so far.
+            clearance: least distance between the camera and surfaces in the frames, metres; 0.1 by
+                default, 0 for no limit.
+            any_orientation: the object is a taught thing that need not be in a resting pose: it may
+                lean or be in a hand. A frame takes about twice as long. An object in the air must
+                be selected by a mask or a box, with ``ObservedObject(support=False)``.
+            goal: "thing" ends once the identity is confident, "pose" once the pose is confident
+                too, see ``Session.goal``.
+            segmentation: segments the objects in frames, see ``Scene``; the object is one of the
+                segments.
 
         Raises:
-            ModelError: things in any orientation are recognised by their geometry, and the models
-                know none.
+            ModelError: ``any_orientation`` needs known geometry, and the models have none.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
         drawn = int(rng.integers(len(self.sphere)))
@@ -155,12 +155,12 @@ class System:
         seed: int = 0,
         any_orientation: bool = False,
     ) -> Session:
-        """Create a session for a camera; if it delivers frames, for its object.
+        """Create a session for a camera. A camera that delivers frames also provides the object.
 
         Args:
             camera: the camera.
             start: index of the first view; None for a random one.
-            seed: of the draws.
+            seed: of the first view and of random policies.
             any_orientation: whether the object is a taught thing in any orientation.
 
         Returns:
@@ -189,28 +189,28 @@ class System:
         largest_part: bool = False,
         any_orientation: bool = False,
     ) -> Recognition:
-        """Look at an object until it is clear what it is, or the views run out.
+        """Recognise an object from as few views as needed.
 
         Args:
-            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, captured views (a
-                folder, a ROS 2 bag), or a camera: anything with ``observe(pose)``.
-            start: the first view, an index of ``sphere``; drawn by the seed if not given.
-            seed: decides the first view and whatever the policy draws.
-            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder,
-                the direction against gravity in its world, (3,); by default as its layout has it.
-            unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says
-                something of the class.
-            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of
-                ``known_sensors.SENSORS``; its errors are drawn by the seed. None for clean renders.
-            largest_part: of a mesh file, leave out all that is not connected to its largest part,
-                see ``load_mesh``. What is likely to be wrong with a file's mesh is a Python
-                warning.
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, captured views (a folder or a ROS
+                2 bag), or a camera: any object with ``observe(pose)``.
+            start: first view, an index of ``sphere``; random by default.
+            seed: of the first view and of random policies.
+            up: up axis of a mesh file, "y" or "z"; by default z, and y for GLB. For captured views,
+                the direction against gravity in the world, (3,); by default that of the layout.
+            unit: unit of length of a mesh file, one of ``mesh.UNITS``; if it is given, size counts
+                as evidence.
+            sensor: simulated depth camera: a ``Sensor``, or NAME or NAME:STRENGTH of
+                ``known_sensors.SENSORS``; its errors are drawn with the seed. None for noise-free
+                renders.
+            largest_part: keep only the largest connected part of a mesh file, see ``load_mesh``.
+                Likely problems of a mesh file are reported as Python warnings.
             any_orientation: see ``session``.
 
         Raises:
             MeshError, DatasetError: the file or the folder cannot be used.
-            UsageError: there is no such sensor, or ``what`` is nothing to look at.
-            ObservationError: the object is found in none of the captured views.
+            UsageError: the sensor is not known, or ``what`` has an unsupported type.
+            ObservationError: the object is not found in any captured view.
         """
         if largest_part and not (isinstance(what, str | Path) and not is_frames(what)):
             raise UsageError(
@@ -257,7 +257,7 @@ class System:
 
 
 def _in_any_orientation(models: Models) -> Models:
-    """The same for things that need not rest; ModelError where no geometry is known."""
+    """Return models for things in any orientation; ModelError without known geometry."""
     recogniser = models.recogniser
     if not isinstance(recogniser, KnowsAnyOrientation):
         what = "things in any orientation are recognised by their geometry, and it knows none"
@@ -274,7 +274,7 @@ def simulated(
 
     Args:
         mesh: the mesh.
-        sensor: whose errors it has; None for clean renders.
+        sensor: simulated sensor errors; None for noise-free renders.
         seed: of the errors.
 
     Returns:
@@ -306,49 +306,51 @@ def load(
     recogniser: Any = None,
     camera_accuracy: tuple[float, float] | None = None,
 ) -> System:
-    """Open models, and what belongs to them.
+    """Load models and create a system.
 
     Args:
-        models: the name of bundled models, or a folder with the card of a recogniser and, if you
-            like, cards of maps and policies. Missing maps are taken from the bundled models; they
-            do not depend on the classes. Or a list: memories with geometry, and at most one
-            network. Then a thing is named if its geometry explains the views, otherwise a class of
-            the network.
-        policy: how the next view is chosen; "gain" by default, where one was learned for these
+        models: name of bundled models, or a folder with the card of a recogniser and, optionally,
+            cards of maps and policies. Missing maps are taken from the bundled models; they do not
+            depend on the classes. Or a list: memories with geometry, and at most one network. A
+            thing is then named if its geometry explains the views, and otherwise a class of the
+            network.
+        policy: policy that chooses the next view; by default "gain" if one was trained for these
             classes, else "spread". Names are those of ``nextview.policies.registry``, of policy
             cards in the folder, or "MODULE:CLASS".
-        threshold: stop when the belief in one class reaches this after one view, and less after
-            several.
+        threshold: stop as soon as the belief in one class reaches this value; it applies after the
+            first view and decreases with every further view.
         risk: instead of ``threshold``, the largest share of wrong answers among the episodes that
             stop early; the lowest threshold that guarantees it is used.
-        max_views: stop after so many views.
-        viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or
-            poses of your own, see ``viewsphere.viewpoints_of``.
-        threads: of ONNX Runtime, 0 for one on each core.
-        unknown: p-value below which the answer is None, so this share of the objects of known
-            classes is called unknown. Objects of a size that the class never has are unknown, too.
-            0 always names a class. By default 0.02 if the recogniser has a novelty score.
-        stopping: a rule of your own: "MODULE:NAME", or a function of a
+        max_views: largest number of views.
+        viewpoints: candidate viewpoints: "40", "12", "rings:0,30,60x12", "fibonacci:60", or your
+            own directions or poses, see ``viewsphere.viewpoints_of``.
+        threads: of ONNX Runtime, 0 for one per core.
+        unknown: significance level of the test for unknown objects: the answer is None for a
+            smaller p-value, and so for this share of known objects. Objects of a size that their
+            class never has are unknown too. 0 always names a class. By default 0.02 if the
+            recogniser has a novelty score.
+        stopping: your own rule: "MODULE:NAME", or a function of a
             ``recognition.own_stopping.Believed`` and the threshold; or a ``Stopping``, which
             replaces threshold, risk and max_views.
-        recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
-            ``recognition.own_recogniser``. It is pickled with the system.
-        camera_accuracy: by how much the poses of the cameras are off, standard deviations along
-            and about each axis: (millimetres, degrees), as the calibration of hand and eye and the
-            data sheet of the arm tell. By default (3, 0.34). Poses of taught things in the world
-            are as uncertain as the cameras' poses, and views are aligned with each other by them.
+        recogniser: your own recogniser, which replaces that of the models: an object or
+            "MODULE:NAME", see ``recognition.own_recogniser``. It is pickled with the system.
+        camera_accuracy: standard deviations of the camera poses along and about each axis:
+            (millimetres, degrees), for example from hand-eye calibration and the data sheet of the
+            arm. By default (3, 0.34). They add to the uncertainty of poses in the world frame, and
+            guide the alignment of views.
 
     Returns:
         The system.
 
     Raises:
-        ModelError: there are no such models, one cannot be used, or the recogniser has no novelty
+        ModelError: the models are not known or cannot be used, or the recogniser has no novelty
             score.
-        PolicyError: there is no such policy, or it cannot be made.
-        RiskError: the error rate cannot be promised.
-        UsageError: a threshold, a rate or a number of views makes no sense.
+        PolicyError: the policy is not known or cannot be created.
+        RiskError: the error rate cannot be guaranteed.
+        UsageError: a threshold, a rate or a number of views is invalid.
 
     Example:
+
         >>> nextview.load(policy="gain", max_views=3).policy_name
         'gain'
     """
@@ -356,7 +358,7 @@ def load(
     names = _names_of(models)
     given["models"] = names if len(names) > 1 else names[0]
     _check_options(policy, threads, risk, unknown)
-    # says what is wrong with it, before anything is opened
+    # reports invalid arguments before any file is opened
     Stopping(threshold, max_views)
 
     collections = {name: find_models(name) for name in names}
@@ -370,7 +372,7 @@ def load(
     if camera_accuracy is not None:
         knows = _for_cameras(knows, camera_accuracy)
     policies = found.policies
-    # the policy of a memory belongs to its things alone
+    # the policy of a memory is valid only for its own things
     if recogniser is not None or len(names) > 1:
         policies = {
             name: card for name, card in policies.items() if name != DISCRIMINATE
@@ -382,7 +384,7 @@ def load(
         str(found.recogniser) if recogniser is None else knows.name,
     )
     if not share:
-        knows.novelty = None  # it takes time
+        knows.novelty = None  # not used, and slow
     if policy is None:
         name, made = _default_policy(policies, sphere, knows)
     else:
@@ -396,7 +398,7 @@ def load(
         )
 
     opened = Models(knows, open_maps(found.maps, made.needs, threads))
-    # a map's own policy goes to the valley for some classes, which the map's card names
+    # the card of a map lists the classes for which its policy goes to the valley
     if name in opened.maps:
         made = make_policy_anywhere(
             name,
@@ -427,7 +429,7 @@ def _check_options(
     risk: float | None,
     unknown: float | None,
 ) -> None:
-    """Refuse arguments of ``load`` that make no sense, before anything is opened; UsageError."""
+    """Check arguments of ``load`` before any file is opened; UsageError."""
     if policy is not None and not isinstance(policy, str | Path):
         raise UsageError(
             f"a policy is given by name or path, not {one_line(repr(policy))}"
@@ -459,7 +461,7 @@ def _names_of(models: Any) -> list[str]:
 
 
 def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
-    """The recogniser of one collection, or that of several together."""
+    """Open the recogniser of one collection, or a joint one of several."""
     opened = {
         name: open_recogniser(found.recogniser, threads)
         for name, found in collections.items()
@@ -470,9 +472,9 @@ def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
 
 
 def _for_cameras(recogniser: Recogniser, accuracy: Any) -> Recogniser:
-    """The same recogniser for cameras of this accuracy, millimetres and degrees.
+    """Return the recogniser for cameras of this accuracy, millimetres and degrees.
 
-    UsageError if these are no such numbers, ModelError where no geometry is known.
+    UsageError if the numbers are invalid, ModelError without known geometry.
     """
     what = "the accuracy of the cameras"
     if not isinstance(accuracy, tuple | list) or len(accuracy) != 2:
@@ -488,7 +490,7 @@ def _for_cameras(recogniser: Recogniser, accuracy: Any) -> Recogniser:
 
 
 def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:
-    """Return the share of known objects that may be called unknown.
+    """Return the significance level of the test for unknown objects.
 
     ModelError if the recogniser has no novelty score.
     """
@@ -528,8 +530,8 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
 
 
 def is_frames(path: str | Path) -> bool:
-    """Whether a path is a folder, a bag or an image of captured frames, not a mesh file."""
-    # not Path.is_dir, which raises where a name is too long
+    """Return True if a path is a folder, bag or image of captured frames, not a mesh file."""
+    # Path.is_dir raises an error if a name is too long
     return os.path.isdir(path) or os.path.splitext(path)[1].lower() in FRAME_FILES
 
 

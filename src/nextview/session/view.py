@@ -1,4 +1,4 @@
-"""One view of a session, and what followed from it."""
+"""One view of a session, with its evidence and the choice of the next view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,33 +15,32 @@ from nextview.types import Float, Floats
 
 @dataclass(frozen=True)
 class View:
-    """One view and what followed from it.
+    """One view of a session, with its evidence and the choice of the next view.
 
     Attributes:
-        index: candidate viewpoint that it was taken from, or the nearest one to where the camera
-            stood.
-        observation: what was seen.
-        alone: belief by this view alone, (classes,), by features where the geometry of all views is
-            judged together; even if nothing is seen in it.
-        belief: fused over all views so far, (classes,).
+        index: candidate viewpoint of the view, or the one nearest to the camera position.
+        observation: image of the object.
+        alone: belief from this view alone, (classes,), by features if views are judged jointly by
+            geometry; defined even if nothing is visible.
+        belief: fused belief over all views so far, (classes,).
         maps: predicted local maps by name, each (rings, 3).
-        next_view: where to look next; None where the episode ends.
+        next_view: index of the next view; None if the episode ends.
         travel: so far, grid cells.
         arc: so far, radians.
-        direction: unit vector from the object to where the camera stood, (3,).
-        azimuth_bins: Belief, over all views, in the azimuth from which the object is seen here, for
-            each class, in even steps, (classes, azimuth bins); None if the recogniser does not
-            tell.
-        values: What the policy valued each candidate view at, (V,), NaN if not considered; None at
-            the end, and for policies that value nothing.
-        score: how novel it is; None if nothing is seen in it, or the recogniser has no score.
-        warnings: what is likely to be wrong with the view; usually nothing.
-        degrees_off: between the view that was asked for and where the camera stood; 0 for a first
+        direction: unit vector from the object to the camera, (3,).
+        azimuth_bins: belief, over all views, in the azimuth of this view, for each class in even
+            steps, (classes, azimuth bins); None if the recogniser has no azimuth output.
+        values: value of each candidate view according to the policy, (V,), NaN if not considered;
+            None at the end, and for policies without values.
+        score: novelty; None if nothing is visible or the recogniser has no novelty score.
+        warnings: likely problems of the view; usually empty.
+        degrees_off: angle between the requested view and the actual camera position; 0 for a first
             frame.
-        joint: What all views up to this one say together, its poses in the object frame as it was
-            known then; None where the recogniser judges views one by one, or nothing was seen.
+        joint: joint belief from all views up to this one, with poses in the object frame as
+            estimated then; None if views are judged separately, or nothing was visible.
 
     Example:
+
         >>> view = nextview.recognise(sample_mesh("chair"), start=3).views[0]
         >>> view.index, view.belief.shape
         (3, (10,))
@@ -70,20 +69,20 @@ class View:
 
     @property
     def angles(self) -> tuple[float, float]:
-        """(elevation, azimuth) of where the camera stood, degrees."""
+        """Elevation and azimuth of the camera, degrees."""
         return float(np.degrees(elevation_of(self.direction))), float(
             np.degrees(azimuth_of(self.direction))
         )
 
 
 def is_doubtful(warned: Sequence[Sequence[ViewWarning]]) -> bool:
-    """Whether no answer is confident by some views, whatever they show.
+    """Return True if the warnings of some views rule out a confident answer.
 
     Args:
         warned: the warnings of each view, in order.
 
     Returns:
-        Whether a warning of the last one holds, or half of the views contradict others.
+        True if a warning of the last view is blocking, or half of the views contradict others.
     """
     contradicting = sum(
         any(warning.name == "contradiction" for warning in warnings)

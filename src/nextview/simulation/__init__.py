@@ -1,1 +1,1 @@
-"""The simulated camera, sensor models and cluttered scenes."""
+"""Simulated cameras, sensor models, cluttered scenes and rooms."""

@@ -1,4 +1,4 @@
-"""A robot's camera in a scene, with frames in metres and a target named as a user would."""
+"""A robot's camera in a scene, which delivers frames in metres and specifies the target."""
 
 from dataclasses import replace
 from typing import Literal, get_args
@@ -22,7 +22,7 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.types import Float
 
 Named = Literal["point", "box", "known", "mask"]
-SAME_DIRECTION = 1e-6  # radians between directions that are the same
+SAME_DIRECTION = 1e-6  # radians, tolerance of equal directions
 
 
 def sensed_camera(
@@ -30,11 +30,11 @@ def sensed_camera(
     sensor: Sensor | SensorMix | str,
     rng: np.random.Generator,
 ) -> SensedCamera:
-    """Create a camera three radii from a scene's target, which is segmented exactly.
+    """Create a camera three radii from the target of a scene, with exact segmentation.
 
     Args:
         scene: the scene.
-        sensor: whose errors it has.
+        sensor: simulated sensor errors.
         rng: source of all random numbers.
 
     Returns:
@@ -53,18 +53,18 @@ def sensed_camera(
 
 
 class RobotCamera:
-    """Gives frames of a scene, metres, to a session that runs in it live.
+    """Delivers frames of a scene, in metres, to a live session.
 
-    The scene's frame is the target's object frame, in metres. The target is named to the session by
-    a "point" in its middle, by the upright "box" that it just fits into, by its "known" object
-    frame, with the errors of the sensor's setup, or by a "mask" that tells it from all else.
+    The scene's frame is the target's object frame, in metres. The target is specified by a "point"
+    in its centre, by its upright bounding "box", by its "known" object frame with the errors of the
+    sensor's setup, or by a "mask".
 
-    A pose that cannot be reached, or from which too little of the target is measured, is answered
-    from the nearest other viewpoint where it has not stood yet. Ask only for what ``reachable``
-    allows to be answered from near. The errors of the sensor are drawn by seed 0.
+    If a pose cannot be reached, or too little of the target is visible from it, the nearest other
+    unused viewpoint is taken. Request only poses that ``reachable`` allows, to get frames close to
+    them. The sensor errors are drawn with seed 0.
     """
 
-    # the scene says where a camera can stand; see ``session.FrameCamera``
+    # the scene defines reachable poses; see ``session.FrameCamera``
     knows_reach = True
 
     def __init__(
@@ -101,13 +101,13 @@ class RobotCamera:
         self._taken = list[Float]()
 
     def reachable(self, pose: Float) -> bool:
-        """Return whether the camera can reach a pose of the scene, (4, 4), metres."""
+        """Return True if the camera can reach a pose of the scene, (4, 4), metres."""
         return bool(
             self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0]
         )
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose, (4, 4), in the believed object frame, or from near it."""
+        """Capture a frame from a pose, (4, 4), in the estimated object frame, or from near it."""
         believed = (
             self.object.object_frame
             if self.object.sightings or self.object.known
@@ -145,5 +145,5 @@ class RobotCamera:
         )
 
     def refused(self, error: ObservationError) -> None:
-        """The target is not found in the last frame: no other one is taken from there."""
+        """Report that the target was not found; the viewpoint is not used again."""
         self._refused.append(self._taken.pop())

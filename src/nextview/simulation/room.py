@@ -1,4 +1,4 @@
-"""A room as geometry: a life-size object, floor, walls, furniture, and a camera in it."""
+"""Geometry of a room: a life-size object, floor, walls, furniture, and a camera in it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,25 +20,27 @@ from nextview.types import Float, Mask
 
 # metres, standard deviation of the height of a floor or a table top
 UNEVEN_HEIGHT = 0.001
-WAVES = 12  # that an uneven top is made of
+WAVES = 12  # number of waves that form an uneven surface
 SHORTEST_WAVE = 0.25  # metres
 LONGEST_WAVE = 2.0
-# metres between the corners of an uneven top; fewer than MOST_CORNERS a side
+# metres between the vertices of an uneven surface, with at most MOST_CORNERS per side
 CORNER_SPACING = 0.1
 MOST_CORNERS = 60
-LOWEST_CAMERA = 0.06  # metres above what the target stands on: the camera's own housing
-HIGHEST_CAMERA = 1.8  # metres above the floor: what a mobile robot reaches
-ROOM_CLEARANCE = 0.1  # metres that a camera keeps from walls and things
+LOWEST_CAMERA = (
+    0.06  # metres above the support surface, because of the camera's housing
+)
+HIGHEST_CAMERA = 1.8  # metres above the floor, reach of a mobile robot
+ROOM_CLEARANCE = 0.1  # metres between a camera and walls or objects
 
 
 @dataclass(frozen=True)
 class Room:
-    """A room, and the object that is meant in it. The world is z up, metres.
+    """A room with a target object. The world frame is z up, metres.
 
     Attributes:
-        layout: what it was built of.
-        target: corners of the object that is meant, (V, 3).
-        things: triangles of all that is seen; the target is the first.
+        layout: from which it was built.
+        target: vertices of the target, (V, 3).
+        things: triangles of all visible objects; the target is the first.
     """
 
     layout: RoomLayout
@@ -47,26 +49,26 @@ class Room:
 
     @property
     def pose(self) -> Float:
-        """Of the first camera, camera-to-world, (4, 4)."""
+        """Pose of the first camera, camera-to-world, (4, 4)."""
         return np.reshape(np.array(self.layout.pose, np.float64), (4, 4))
 
     @property
     def centre(self) -> Float:
-        """The middle of the target's bounding box, (3,)."""
+        """Centre of the target's bounding box, (3,)."""
         return (self.target.min(0) + self.target.max(0)) / 2
 
     @property
     def radius(self) -> float:
-        """Of the sphere about the centre that holds the target."""
+        """Radius of the sphere around the centre that encloses the target."""
         return float(np.linalg.norm(self.target - self.centre, axis=1).max())
 
     @cached_property
     def caster(self) -> RayCaster:
-        """Casts rays at all things."""
+        """Ray caster for all objects."""
         return RayCaster(self.things)
 
     def reachable(self, pose: Float) -> bool:
-        """Return whether a mobile robot's camera can reach a pose, (4, 4)."""
+        """Return True if a mobile robot's camera can reach a pose, (4, 4)."""
         place = np.asarray(pose)[:3, 3]
         layout = self.layout
         half = np.array([layout.width, layout.depth]) / 2 - ROOM_CLEARANCE
@@ -91,16 +93,16 @@ def build_room(
     meshes: str | Path,
     max_faces: int = MAX_FACES,
 ) -> Room:
-    """Build a room of the mesh files below a folder.
+    """Build a room from the mesh files below a folder.
 
     Args:
-        layout: what stands where.
+        layout: of the room.
         meshes: the folder.
-        max_faces: triangles of all meshes together, at most.
+        max_faces: largest number of triangles of all meshes together.
 
     Raises:
-        DatasetError: a file is not the one that the room was made with.
-        MeshError: a file is no mesh, or the meshes have more triangles together.
+        DatasetError: a file differs from the one with which the room was created.
+        MeshError: a file is not a mesh, or the meshes have more triangles.
     """
     placed = [
         stood(thing, Path(meshes), max_faces, layout.name)
@@ -121,10 +123,10 @@ def build_room(
 
 
 def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles:
-    """Load a mesh and put it in its place.
+    """Load a mesh and place it in the room.
 
     Args:
-        thing: the mesh and its place.
+        thing: the mesh and its placement.
         meshes: folder of the mesh files.
         max_faces: largest number of triangles.
         name: of the room, for messages.
@@ -133,7 +135,7 @@ def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles
         Vertices, (V, 3), metres, and faces, (F, 3).
 
     Raises:
-        DatasetError: the file is not the one that the room was made with.
+        DatasetError: the file differs from the one with which the room was created.
     """
     path = meshes / thing.mesh
     if mesh_hash(path) != thing.sha256:
@@ -143,11 +145,11 @@ def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles
 
 
 def at_rest(vertices: Float, thing: Standing) -> Float:
-    """Move the vertices of a normalised mesh to the place of a thing.
+    """Transform the vertices of a normalised mesh to its placement.
 
     Args:
         vertices: (V, 3), object radii.
-        thing: the place.
+        thing: the placement.
 
     Returns:
         Vertices, (V, 3), metres.
@@ -161,7 +163,7 @@ def at_rest(vertices: Float, thing: Standing) -> Float:
 
 
 def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangles:
-    """A level rectangle about the origin that is as uneven as floors and table tops are.
+    """Return a rectangle around the origin with the unevenness of floors and table tops.
 
     Its heights are a sum of waves in all directions.
     """
@@ -189,7 +191,7 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
 
 
 def _walls(layout: RoomLayout) -> Triangles:
-    """Walls and ceiling: a box about the room; its bottom lies below the uneven floor."""
+    """Return walls and ceiling: a box around the room; its bottom is below the uneven floor."""
     below = 10 * UNEVEN_HEIGHT
     size = np.array([[layout.width, layout.depth, layout.height + below]])
     box = upright_boxes(size, np.zeros(1), np.zeros((1, 2)), -below)
@@ -197,7 +199,7 @@ def _walls(layout: RoomLayout) -> Triangles:
 
 
 def _slab_things(slab: Slab, rng: np.random.Generator) -> list[Triangles]:
-    """A box, and the uneven top that lies on it if it is a table's."""
+    """Return a box, with an uneven surface on it if it is a table top."""
     size = np.array([[slab.width, slab.depth, slab.height]])
     box = upright_boxes(
         size,
@@ -215,7 +217,7 @@ def _slab_things(slab: Slab, rng: np.random.Generator) -> list[Triangles]:
 
 
 def _inside(slab: Slab, place: Float, margin: float) -> bool:
-    """Whether a place, (3,), lies in a box or up to a margin beside it."""
+    """Return True if a position, (3,), is inside a box or within a margin of it."""
     own = rotation_z(slab.azimuth).T @ (place - (slab.x, slab.y, slab.z))
     half = np.array([slab.width, slab.depth]) / 2 + margin
     return bool(
@@ -224,13 +226,13 @@ def _inside(slab: Slab, place: Float, margin: float) -> bool:
 
 
 class RoomCamera:
-    """Gives the frames of a sensor in a room: 16-bit millimetres, the room's own world.
+    """Delivers the frames of a sensor in a room: 16-bit millimetres, in the room's world frame.
 
-    A pose is always answered by the same frame: its noise is drawn by the seed and the pose.
+    A pose always gives the same frame: its noise depends on the seed and the pose.
 
     Args:
-        room: what is looked at.
-        sensor: whose errors the depth has. Those of a setup, such as wrong poses, it has not.
+        room: the room.
+        sensor: simulated depth errors. Those of a setup, such as pose errors, are not simulated.
         seed: of the noise.
     """
 
@@ -244,10 +246,10 @@ class RoomCamera:
         )
 
     def look(self, pose: Float) -> tuple[Frame, Mask]:
-        """Look from a camera-to-world pose, (4, 4), OpenCV's axes.
+        """Capture a frame from a camera-to-world pose, (4, 4), OpenCV axes.
 
         Returns:
-            The frame, and which of its pixels show the target, (H, W) bool.
+            The frame, and the pixels of the target, (H, W) bool.
         """
         pose = np.asarray(pose, np.float64)
         rays = self._rays @ pose[:3, :3].T.astype(np.float32)

@@ -1,7 +1,7 @@
-"""What stands where in a room: one small JSON file, of which the room is built to the bit.
+"""The layout of a room: a small JSON file from which the room is rebuilt exactly.
 
-Lengths are in metres and angles in radians. The world is z up; its origin is in the middle of the
-floor.
+Lengths are in metres and angles in radians. The world frame is z up; its origin is in the centre of
+the floor.
 """
 
 from pathlib import Path
@@ -25,17 +25,17 @@ Pose = Annotated[tuple[Length, ...], Meta(min_length=16, max_length=16)]
 
 
 class Standing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A mesh at the size that it has in life, at rest on a floor or a table.
+    """A life-size mesh at rest on a floor or a table.
 
     Attributes:
         mesh: its file, below the folder of meshes.
         sha256: of that file.
         radius: its object radius.
-        x: of the middle of its bounding box.
-        y: the same.
+        x: centre of its bounding box.
+        y: centre of its bounding box.
         z: of its lowest point.
-        azimuth: by which it is turned about the vertical, after ``rotation``.
-        rotation: into the pose in which it rests, (3, 3), row by row.
+        azimuth: rotation about the vertical, applied after ``rotation``.
+        rotation: to its resting pose, (3, 3), row by row.
     """
 
     mesh: str
@@ -55,14 +55,14 @@ class Slab(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """An upright box: a table top, its legs, a cabinet.
 
     Attributes:
-        x: of its middle.
-        y: the same.
+        x: of its centre.
+        y: of its centre.
         z: of its bottom.
-        azimuth: by which it is turned about the vertical.
+        azimuth: rotation about the vertical.
         width: along its own x axis.
         depth: along its own y axis.
-        height: of it.
-        even: whether its top is flat; that of a table is not quite.
+        height: of the box.
+        even: whether its top is flat; table tops are slightly uneven.
     """
 
     x: Length
@@ -76,18 +76,18 @@ class Slab(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
 
 class RoomLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A room with a target on its floor, or on a table in it, and where a camera stands first.
+    """A room with a target on its floor or on a table, and a first camera pose.
 
     Attributes:
         name: unique in its folder, "chair_0890@room-1".
-        kind: where the target stands.
+        kind: support of the target.
         seed: with which the room was drawn.
         label: the class of the target.
-        target: the object that is meant.
+        target: the target object.
         width: of the room, along x.
         depth: of the room, along y.
         height: of the room.
-        pose: of the first camera, camera-to-world, (4, 4), row by row; OpenCV's axes, level.
+        pose: of the first camera, camera-to-world, (4, 4), row by row; OpenCV axes, level.
         objects: other meshes.
         slabs: boxes.
     """
@@ -105,10 +105,10 @@ class RoomLayout(Struct, frozen=True, forbid_unknown_fields=True):
     slabs: Annotated[tuple[Slab, ...], LAYOUT_LENGTH] = ()
 
     def save(self, path: Path) -> None:
-        """Write its file, whole or not at all. The same room makes the same bytes."""
+        """Write the file, completely or not at all. The same room gives identical files."""
         write_record(path, self)
 
     @classmethod
     def load(cls, path: str | Path) -> "RoomLayout":
-        """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
+        """Read a file written by ``save``; DatasetError if it is missing or invalid."""
         return read_record(Path(path), cls, "a room", DatasetError)

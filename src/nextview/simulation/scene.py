@@ -1,4 +1,4 @@
-"""A scene as geometry: upright things on a table, and where a camera can be."""
+"""Geometry of a scene: upright objects on a table, and reachable camera positions."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -16,10 +16,10 @@ from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 from nextview.types import Float, Mask
 
-# half the side of the square table, object radii: what stands around the target stands on it
+# half the side of the square table, object radii, with room for the clutter
 SCENE_TABLE = 3.4
-SCENE_CLEARANCE = 0.2  # what a camera needs to each side, object radii
-# of a box: from the object's circle, sides, height
+SCENE_CLEARANCE = 0.2  # clearance around a camera, object radii
+# ranges for a box: distance from the object's circle, sides, height
 BLOCK_GAP = (0.02, 0.3)
 FOOTPRINT = (0.3, 0.9)
 BLOCK_HEIGHT = (0.6, 2.6)
@@ -27,20 +27,20 @@ _CORNERS = np.array(
     [[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]
 )
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
-# every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
+# margin of every footprint, object radii, so that thin sheets have an area
 FOOTPRINT_EDGE = 1e-3
 _AROUND = FOOTPRINT_EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 @dataclass(frozen=True)
 class Item:
-    """A thing beside the target.
+    """An object next to the target.
 
     Attributes:
         vertices: (V, 3), object radii of the target.
         faces: (F, 3) vertex indices.
-        footprint: outline seen from above, (K, 2).
-        wall: whether the camera cannot be beyond it.
+        footprint: outline in the top view, (K, 2).
+        wall: whether the camera cannot be behind it.
     """
 
     vertices: Float
@@ -51,11 +51,11 @@ class Item:
 
 @dataclass(frozen=True)
 class TargetScene:
-    """A target, and the other things that stand on its table.
+    """A target, and the other objects on its table.
 
     Attributes:
         target: the object to recognise.
-        items: the other things.
+        items: the other objects.
     """
 
     target: Mesh
@@ -80,13 +80,13 @@ class TargetScene:
 
     @cached_property
     def table(self) -> Mesh:
-        """Its top, a square."""
+        """Table top, a square."""
         return Mesh(*square(SCENE_TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
         """Return the distance of cameras, (V, 3), from the nearest item or the table, (V,).
 
-        It is 0 inside, and negative below.
+        It is 0 inside an item, and negative below the table.
         """
         found = positions[:, 2] - self.floor
         for item in self.items:
@@ -100,8 +100,8 @@ class TargetScene:
     def reachable(self, positions: Float) -> Mask:
         """Return whether a camera can be at each position, (V, 3), object radii; (V,) bool.
 
-        Not nearer than SCENE_CLEARANCE to an item or the table, nor to where a wall stands before
-        the target from above.
+        It must be at least SCENE_CLEARANCE from items and the table, and not behind a wall as seen
+        from the target in the top view.
         """
         positions = points(positions, "the positions of cameras")
         free = self.clearance(positions) >= SCENE_CLEARANCE
@@ -130,7 +130,7 @@ def build_scene(
 
     Raises:
         MeshError: the meshes have more triangles.
-        DatasetError: a file is not the one that the scene was made with.
+        DatasetError: a file differs from the one with which the scene was created.
     """
     loaded: list[Mesh] = []
     for placed in (layout.target, *layout.objects):
@@ -156,11 +156,11 @@ def build_scene(
 
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:
-    """Rotate and scale a mesh and put it on the table.
+    """Rotate and scale a mesh and place it on the table.
 
     Args:
         mesh: the mesh.
-        at: its place.
+        at: its placement.
         floor: height of the table.
 
     Returns:
@@ -172,10 +172,10 @@ def place(mesh: Mesh, at: Placement, floor: float) -> Item:
 
 
 def block_item(block: Block, floor: float) -> Item:
-    """Put a box on the table.
+    """Place a box on the table.
 
     Args:
-        block: the box and its place.
+        block: the box and its placement.
         floor: height of the table.
 
     Returns:
@@ -189,7 +189,7 @@ def block_item(block: Block, floor: float) -> Item:
 
 @lru_cache(maxsize=64)
 def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
-    """Load a mesh and keep it, as the same ones stand in many scenes; see ``load_mesh``.
+    """Load a mesh with a cache, as meshes are shared between scenes; see ``load_mesh``.
 
     Args:
         path: of the file.
@@ -217,7 +217,7 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
         rng: source of all random numbers.
 
     Returns:
-        The boxes as one mesh, outside of the object's circle.
+        The boxes as one mesh, outside the object's circle.
     """
     floor = vertices[:, 2].min()
     reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
@@ -275,15 +275,18 @@ def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
 
 
 def footprint(vertices: Float) -> Float:
-    """Convex hull of what lies under some points, (V, 3) or (V, 2), counter-clockwise, (K, 2)."""
+    """Return the convex hull of points in the top view, counter-clockwise, (K, 2).
+
+    Points are (V, 3) or (V, 2).
+    """
     around = (vertices[:, None, :2] + _AROUND).reshape(-1, 2)
     return around[ConvexHull(around).vertices]
 
 
 def separation(a: Float, b: Float) -> float:
-    """Return the distance of two convex polygons along the edge normal that separates them most.
+    """Return the distance of two convex polygons along the best separating edge normal.
 
-    Corner to corner they are farther apart, never nearer. It is negative if they overlap.
+    It is a lower bound of the distance between corners, and negative if the polygons overlap.
 
     Args:
         a: corners, counter-clockwise, (K, 2); two points are a line.

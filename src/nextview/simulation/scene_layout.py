@@ -1,4 +1,4 @@
-"""The layout of a cluttered scene: a JSON file from which it is rebuilt to the bit."""
+"""The layout of a cluttered scene: a JSON file from which the scene is rebuilt exactly."""
 
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -9,13 +9,13 @@ from msgspec import Meta, Struct
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
 
-# mean share of the target that shows
+# mean visible share of the target
 CLUTTER_LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
-# names of scenes that were drawn: target, level and number
+# names of generated scenes: target, level and number
 NAMED = re.compile(r".*@(\w+)-\d+")
 SUFFIX = ".json"
 LAYOUT_VIEWS = 40
-# or radians: what is computed with more has no precision left
+# or radians; limited to preserve numerical precision
 Length = Annotated[float, Meta(ge=-1000, le=1000)]
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
@@ -23,20 +23,20 @@ LAYOUT_LENGTH = Meta(max_length=1000)
 
 
 def clutter_level(name: str) -> str:
-    """The level of a scene by its name; "" for what is none, such as a single object."""
+    """Return the clutter level in a scene's name; "" for other names, such as those of objects."""
     match = NAMED.fullmatch(name)
     return match[1] if match else ""
 
 
 def below_the_meshes(path: str) -> None:
-    """See that a path stays below the folder of meshes; ValueError if it may not."""
+    """Check that a path is below the folder of meshes; ValueError otherwise."""
     paths = PurePosixPath(path), PureWindowsPath(path)
     if not path.isprintable() or any(one.anchor or ".." in one.parts for one in paths):
         raise ValueError("a mesh is a path below the folder of meshes")
 
 
 class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """An object on the table: its mesh file and its place.
+    """An object on the table: its mesh file and its position.
 
     Attributes:
         mesh: path of the mesh file.
@@ -68,7 +68,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
         width: object radii of the target.
         depth: object radii of the target.
         height: object radii of the target.
-        wall: whether the camera cannot be beyond it.
+        wall: whether the camera cannot be behind it.
     """
 
     x: Length
@@ -81,17 +81,16 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table, in its object frame, and the things around it.
+    """A target at rest on a table, in its object frame, and the objects around it.
 
     Attributes:
         name: unique in its folder, "chair_0890@medium-1".
-        level: level of clutter, one of CLUTTER_LEVELS, or a word of your own.
-        seed: seed that the scene was drawn with.
-        target: in the middle of the table, not rotated.
+        level: clutter level, one of CLUTTER_LEVELS, or a custom word.
+        seed: with which the scene was drawn.
+        target: in the centre of the table, not rotated.
         objects: the other objects.
         blocks: boxes and walls.
-        visible: share of the picture of the target that nothing hides, from each of the 40 views;
-            () if not measured.
+        visible: visible share of the target's pixels from each of the 40 views; () if not measured.
         unreachable: indices of the views that no camera can reach.
     """
 
@@ -117,10 +116,10 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"visible has {LAYOUT_VIEWS} numbers")
 
     def save(self, path: Path) -> None:
-        """Write its file, whole or not at all. The same scene makes the same bytes."""
+        """Write the file, completely or not at all. The same scene gives identical files."""
         write_record(path, self)
 
     @classmethod
     def load(cls, path: str | Path) -> "SceneLayout":
-        """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
+        """Read a file written by ``save``; DatasetError if it is missing or invalid."""
         return read_record(Path(path), cls, "a scene", DatasetError)

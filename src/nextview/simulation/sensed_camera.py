@@ -1,4 +1,4 @@
-"""A simulated camera with a sensor: true depth, the sensor's errors, and the usual processing."""
+"""A simulated camera with a sensor: true depth, sensor errors, and the usual processing."""
 
 from dataclasses import replace
 
@@ -21,30 +21,36 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float, Float32, Mask
 
-# radius of the table that the object stands on, if nothing else is said, object radii
+# default radius of the table, object radii
 BARE_TABLE_RADIUS = 1.5
-# the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its
-# own
+# radius of the search sphere, object radii, as the object exceeds its own sphere with pose errors
 OBJECT_REACH = 1.3
-LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
-# what a pixel shows; where it shows nothing, the first
+LEFTOVER = 4.0  # size of the patches of the table that are segmented as object, pixels
+# labels of pixels; empty pixels have the first one
 OBJECT_SURFACE = 0
 TABLE_SURFACE = 1
 BOX = 2
 
 
 class SensedCamera:
-    """Looks at a normalised mesh through a sensor, as a robot would see the object.
+    """Camera that observes a normalised mesh through a sensor, as on a robot.
 
-    The object stands on a table, among boxes if the sensor's setup has any. Each frame goes through
-    ``ObservedObject``, which knows the object's frame up to the errors of the setup. The mask is
-    what was measured near the object, without boxes and most of the table. A mix of sensors is
-    drawn from now, as are the errors of the object's frame and the boxes. ``around`` hides parts of
-    the object instead of these boxes, object frame; ``table`` is a radius, object radii.
+    The object stands on a table, among boxes if the sensor's setup has any. Each frame is processed
+    by ``ObservedObject``, with an object frame that has the errors of the setup. The mask contains
+    the points measured near the object, without boxes and most of the table.
 
-    A mesh of known unit is looked at in its true size, see ``Sensor.before``, unless ``true_size``
-    is false. Any other is as large as the sensor says, as is what a mix looks at, which networks
-    are trained with.
+    A mesh with a known unit has its true size, see ``Sensor.before``. Other meshes, and all meshes
+    if the sensor is a mix, have the size defined by the sensor.
+
+    Args:
+        mesh: normalised mesh.
+        sensor: the sensor. A mix of sensors, the errors of the object frame and the boxes are drawn
+            once, here.
+        rng: source of all random numbers.
+        denoise: as for ``ObservedObject``.
+        around: occluders that replace the boxes, object frame.
+        table: radius of the table, object radii.
+        true_size: whether to use the true size of a mesh with a known unit.
     """
 
     def __init__(
@@ -71,7 +77,7 @@ class SensedCamera:
         self._camera = self._looking_at(mesh)
         self._floor = float(mesh.vertices[:, 2].min())
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
-        # of the camera in the last frame, (4, 4), in the true object frame, metres
+        # camera pose of the last frame, (4, 4), in the true object frame, metres
         self.true_pose: Float | None = None
         setup = self.sensor
         draws = rng.spawn(1)[0]
@@ -81,7 +87,7 @@ class SensedCamera:
             [*draws.normal(0, setup.tilt, 2), 0],
             degrees=True,
         ).as_matrix()
-        # where the robot takes the object to be
+        # object frame that the robot assumes
         self.object_frame = ObjectFrame(centre, float(radius), lean)
         if around is None and self.sensor.boxes:
             draws = rng.spawn(1)[0]
@@ -97,9 +103,9 @@ class SensedCamera:
         )
 
     def observe(self, pose: Float) -> Observation:
-        """Look from the direction of a pose, (4, 4), at the sensor's own distance.
+        """Observe from the direction of a pose, (4, 4), at the sensor's own distance.
 
-        If too little is found, nothing is seen.
+        If too little is found, the observation is empty.
         """
         try:
             thing = ObservedObject(
@@ -108,8 +114,8 @@ class SensedCamera:
                 denoise=self.denoise,
                 life_size=False,
             )
-            # Something of a millimetre is far out of the picture of a camera whose place is known
-            # to millimetres.
+            # An object of a millimetre is outside the image of a camera whose position has errors
+            # of millimetres.
             frame = self.frame(pose)
             if frame is None:
                 raise ObservationError("nothing is seen")
@@ -131,9 +137,9 @@ class SensedCamera:
         )
 
     def frame(self, pose: Float) -> Frame | None:
-        """Return the sensor's frame with mask and believed pose; None if too little is seen.
+        """Return the sensor's frame with mask and assumed pose; None if too little is visible.
 
-        The world is the true object frame, in metres. The pose is as in ``observe``.
+        The world frame is the true object frame, in metres. The pose is as in ``observe``.
         """
         rng = self._rng.spawn(1)[0]
         believed = self._truth.pose_in_world(pose, self.sensor.distance)
@@ -147,7 +153,7 @@ class SensedCamera:
         self.true_pose = true
         depth, whose = self._scene(true)
         measured, source = self.sensor.measure(depth, rng)
-        part = within(measured)  # nothing is measured beside it
+        part = within(measured)  # all measured pixels
         shown = whose.ravel()[source[part]]
         mask = measured > 0
         other = (shown != OBJECT_SURFACE) & (source[part] >= 0)
@@ -177,13 +183,13 @@ class SensedCamera:
         )
 
     def visible_share(self, pose: Float) -> float:
-        """Share of the object's picture that no box hides, without the sensor's errors.
+        """Return the share of the object's pixels that no box occludes, without sensor errors.
 
         Args:
             pose: as in ``observe``.
 
         Returns:
-            A number from 0 to 1; 0 if nothing of the object is in the picture.
+            A number from 0 to 1; 0 if the object is outside the image.
         """
         inside = self._truth.pose_in_object(
             self._truth.pose_in_world(pose, self.sensor.distance)
@@ -200,7 +206,7 @@ class SensedCamera:
         return 1 - np.count_nonzero(hidden) / count
 
     def _scene(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
-        """True depth of object, boxes and table, metres, and what each pixel shows."""
+        """Return the true depth of object, boxes and table, metres, and the label of each pixel."""
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth.copy()
         whose = np.full(depth.shape, OBJECT_SURFACE, np.uint8)
@@ -216,9 +222,9 @@ class SensedCamera:
         return depth * np.float32(self.sensor.radius), whose
 
     def _table(self, pose: Float) -> tuple[Part, Float]:
-        """Return the depth of the table, object radii, in the part of the picture with it.
+        """Return the depth of the table, object radii, and the part of the image that contains it.
 
-        It is infinite beside the table and from below.
+        It is infinite outside the table and from below.
         """
         height = pose[2, 3] - self._floor
         setup = self.sensor
@@ -253,7 +259,7 @@ class SensedCamera:
             )
 
     def _cropped(self, depth: Float32, mask: Mask, rng: np.random.Generator) -> Float32:
-        """Return the picture without what is beyond a line across the object."""
+        """Return the depth image cropped along a line across the object."""
         side = int(rng.integers(4))
         share = float(rng.uniform(0, self.sensor.crop))
         lines = np.flatnonzero(mask.any(axis=1 - side // 2))

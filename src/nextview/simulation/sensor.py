@@ -1,6 +1,6 @@
-"""Depth sensors as numbers: how strong each of their errors is, and those of the setup.
+"""Models of depth sensors: strengths of their errors, including those of the setup.
 
-Known ones, and a mix.
+The module also contains known sensors, and a random mix.
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -19,67 +19,70 @@ from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing.frame import Part, within
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-# two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
+# relative step of q between pixels of two surfaces, in addition to the slope of the surface
 DEPTH_EDGE = 0.02
-# the laws of noise are held here: they grow without bound towards 90 degrees
+# noise models, which diverge towards 90 degrees, are limited to this angle
 STEEPEST_INCIDENCE = np.radians(80.0)
-# pixels: a window that holds one pixel; the narrowest shadow
+# pixels: grain without correlation; narrowest shadow
 NO_GRAIN = 0.1
 NARROWEST = 1.0
-# projector columns that two neighbouring pixels of one surface may lie apart
+# largest distance of neighbouring pixels of one surface in projector columns
 WIDEST_STEP = 8
-# limits of numbers, sides of pictures, grain and strength
+# limits of settings, sides of images, grain and strength
 LARGEST_SETTING = 10_000
 SIDE = 4096
 GRAIN = 100
 STRONGEST = 100
-SENSOR_MARGIN = 16  # how far beside what there is a pixel may show it, pixels
-SENSOR_CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
-FRAMED = 1.1  # so many times as far as where an object just fits into the picture
-MOST_RADII = 40.0  # object radii from which an object is looked at at most
-ARM_LENGTH = 0.45  # metres from its centre at which it usually stands at most
+SENSOR_MARGIN = 16  # largest displacement of a surface in the image, pixels
+SENSOR_CLEARANCE = 0.25  # metres between the camera and an object of known size
+FRAMED = (
+    1.1  # camera distance relative to that at which an object just fits into the image
+)
+MOST_RADII = 40.0  # largest camera distance, object radii
+ARM_LENGTH = 0.45  # usual largest camera distance from the object's centre, metres
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A depth sensor, and the setup that it stands in. Without arguments it has no errors.
+    """A depth sensor with its setup. By default it has no errors.
 
-    The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled``
-    multiplies every strength, that is all but what the sensor is (height to radius). Deviations are
-    standard deviations; those of the setup are drawn for each axis. UsageError: numbers that no
-    sensor has.
+    The simulated object has a radius of ``radius`` metres and is ``distance`` metres away.
+    ``scaled`` multiplies all error strengths, which are all attributes after ``radius``. Deviations
+    are standard deviations; those of the setup are drawn for each axis. Invalid values raise
+    UsageError.
 
     Attributes:
         name: of the sensor.
-        height: rows of its pictures.
+        height: rows of its images.
         width: columns.
-        focal: pixels, for both axes; the principal point is in the middle.
+        focal: pixels, for both axes; the principal point is in the centre.
         baseline: between the camera and its projector, or its second camera, along x, metres.
-        grain: how far pixels err together: the correlation at a distance k is exp(-k^2 / (4
-            grain^2)).
-        nearest: least depth that it can measure, metres.
-        farthest: greatest one.
+        grain: correlation length of errors, pixels: the correlation at a distance k is exp(-k^2 /
+            (4 grain^2)).
+        nearest: least measured depth, metres.
+        farthest: greatest measured depth.
         distance: of the camera from the object's centre, metres.
         radius: of the object, metres.
-        axial: deviation of depth, in those of a Kinect: see ``kinect_axial``.
-        noise: deviation of depth, metres, the same everywhere.
-        disparity: deviation of disparity, pixels: of depth, z^2 / (focal baseline) times as much.
-        step: of the disparity, which is measured in whole steps, pixels.
-        lateral: deviation of where edges are seen, in those of a Kinect: see ``kinect_lateral``.
-        grazing: cosine of the angle of incidence below which pixels are lost, ever more up to 90
-            degrees.
-        flying: share of the pixels at edges that hang in the air between the two surfaces.
-        shadow: what is hidden from a point so many metres beside the camera, along x, is not
-            measured.
+        axial: depth noise relative to that of a Kinect: see ``kinect_axial``.
+        noise: constant depth noise, metres.
+        disparity: noise of the disparity, pixels; the depth noise is z^2 / (focal baseline) times
+            as much.
+        step: quantisation of the disparity, pixels.
+        lateral: noise of edge positions relative to that of a Kinect: see ``kinect_lateral``.
+        grazing: cosine of the angle of incidence below which pixels are lost, with a probability
+            that grows up to 90 degrees.
+        flying: share of the pixels at edges that are measured between the two surfaces.
+        shadow: pixels occluded from a point at this distance beside the camera, along x, are not
+            measured, metres.
         holes: share of the pixels without depth.
-        turned: deviation of the camera's rotation, degrees, anew in every view.
-        moved: deviation of its place, metres, anew in every view.
-        centre: deviation of the object's centre, object radii.
-        size: relative deviation of the object's radius.
-        tilt: deviation of the vertical, degrees.
-        table: share of the table around the object that is taken for the object.
-        crop: up to this share of the object's width, or height, lies outside of the picture.
-        boxes: so many boxes stand around the object on average: see ``boxes_around``.
+        turned: rotation error of the camera, degrees, drawn for every view.
+        moved: position error of the camera, metres, drawn for every view.
+        centre: error of the object's centre, object radii.
+        size: relative error of the object's radius.
+        tilt: error of the vertical, degrees.
+        table: share of the table around the object that is segmented as object.
+        crop: largest share of the object's width, or height, outside the image.
+        boxes: average number of boxes around the object: see ``boxes_around``.
     """
 
     name: str = "none"
@@ -132,7 +135,7 @@ class Sensor:
             )
 
     def scaled(self, strength: float) -> "Sensor":
-        """Return the sensor with all errors multiplied; 0 for none, STRONGEST at most."""
+        """Return the sensor with all errors multiplied by a factor from 0 to STRONGEST."""
         number(strength, "the strength of a sensor", 0, STRONGEST)
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
         return replace(
@@ -143,7 +146,7 @@ class Sensor:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width of its pictures, pixels."""
+        """Height and width of its images, pixels."""
         return self.height, self.width
 
     @property
@@ -152,15 +155,15 @@ class Sensor:
         return PinholeCamera.centred(self.focal, self.shape).matrix
 
     def to_dict(self) -> dict[str, Any]:
-        """Its name and all its numbers, for JSON."""
+        """Return its name and all settings, for JSON."""
         return asdict(self)
 
     def before(self, radius: float) -> "Sensor":
-        """The same sensor before an object of a known size, as a robot would hold it.
+        """Return the sensor in front of an object of known size, as a robot would place it.
 
-        It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where
-        the object does not fit into its picture, is nearer than what it can measure, or comes
-        closer than SENSOR_CLEARANCE. Of what is smaller than a few millimetres it measures nothing.
+        The distance in object radii is unchanged, but limited to ARM_LENGTH. It is increased if the
+        object does not fit into the image, is nearer than the sensor can measure, or is closer than
+        SENSOR_CLEARANCE. Objects smaller than a few millimetres are not measured.
 
         Args:
             radius: of the object, metres.
@@ -173,7 +176,7 @@ class Sensor:
         return replace(self, radius=radius, distance=float(distance))
 
     def draw(self, rng: np.random.Generator) -> "Sensor":
-        """Itself: what ``SensorMix`` draws anew for every object."""
+        """Return the sensor itself; a ``SensorMix`` draws one for every object."""
         return self
 
     def measure(
@@ -181,19 +184,19 @@ class Sensor:
         depth: Float32,
         rng: np.random.Generator,
     ) -> tuple[Float32, Index]:
-        """Return what the sensor measures of a true depth image.
+        """Simulate the measurement of a true depth image.
 
-        An error of strength 0 leaves the image unchanged bit for bit. Each error has its own random
+        An error of strength 0 leaves the image bitwise unchanged. Each error has its own random
         generator.
 
         Args:
-            depth: true depth, (height, width) float32, metres; 0 where there is nothing.
+            depth: true depth, (height, width) float32, metres; 0 for no surface.
             rng: source of all random numbers.
 
         Returns:
-            Depth, (height, width) float32, 0 where none was measured; and the pixel whose surface
-            each pixel shows, itself or a neighbour, as row * width + column, int64, or -1 for a
-            flying pixel.
+            Depth, (height, width) float32, 0 without valid depth; and the pixel whose surface is
+            measured in each pixel, itself or a neighbour, as row * width + column, int64, or -1 for
+            a flying pixel.
         """
         measured = depth.copy()
         sources = np.arange(depth.size).reshape(depth.shape)
@@ -218,7 +221,7 @@ class Sensor:
         if self.grazing:
             share = normal_field(grazing, q.shape, self.grain)
             cosine = np.cos(angle)
-            # no share of it, which is 1 at most, is less elsewhere
+            # the probability is 0 for all other pixels
             steep = cosine < self.grazing
             lost[steep] |= cosine[steep] < self.grazing * ndtr(share[steep])
         changed = q
@@ -256,10 +259,10 @@ class Sensor:
         return measured, sources
 
     def _noisy(self, q: Float, angle: Float, rng: np.random.Generator) -> Float:
-        """Inverse depth with the noise of depth and of disparity."""
+        """Return inverse depth with the noise of depth and of disparity."""
         z = np.where(q > 0, 1 / np.where(q > 0, q, 1), 1.0)
         along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
-        # The published laws were measured on what came out, in steps already: theirs is taken off.
+        # The published models include quantisation noise, which is subtracted here.
         steps = (self.disparity**2 - self.step**2 / 12) / (
             self.focal * self.baseline
         ) ** 2
@@ -267,7 +270,7 @@ class Sensor:
         return np.where(q > 0, q + sigma * normal_field(rng, q.shape, self.grain), 0)
 
 
-# the strengths, from axial on
+# the error strengths, from axial on
 ERRORS = tuple(field.name for field in fields(Sensor))[10:]
 
 _SETUP: dict[str, Any] = {
@@ -318,13 +321,13 @@ _ALL = (
 )
 SENSORS = {sensor.name: sensor for sensor in _ALL}
 """Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense
-D435 of 848 x 480; "setup" has no errors but those of pose, object frame, table and picture; "wrist"
-is "stereo" in such a setup."""
+D435 of 848 x 480; "setup" has only errors of pose, object frame, table and image; "wrist" is
+"stereo" in such a setup."""
 
 _SIDE = 224
 _RADIUS = SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, CAMERA_DISTANCE)[0, 0])
-# the networks' own camera
+# virtual camera of the networks
 RENDER = Sensor(
     "render",
     _SIDE,
@@ -339,7 +342,7 @@ RENDER = Sensor(
 class SensorMix:
     """Random sensors, from no errors to twice those of the known ones, in any setup.
 
-    Half of the draws look like renders, some with noise up to 0.02 object radii or with up to a
+    Half of the draws resemble renders, some with noise up to 0.02 object radii or with up to a
     quarter of the pixels missing. The others are a Kinect or a stereo camera.
 
     Attributes:
@@ -349,15 +352,15 @@ class SensorMix:
     strength: float = 1.0
 
     def __post_init__(self) -> None:
-        SENSORS["none"].scaled(self.strength)  # says what is wrong with it
+        SENSORS["none"].scaled(self.strength)  # raises an error for an invalid strength
 
     @property
     def name(self) -> str:
-        """Its name and, if it is not 1, its strength."""
+        """Name and, if it is not 1, strength."""
         return "mix" if self.strength == 1 else f"mix:{self.strength:g}"
 
     def draw(self, rng: np.random.Generator) -> Sensor:
-        """A sensor in a setup, for one object."""
+        """Draw a sensor in a setup, for one object."""
         kind = rng.choice(["render", "kinect", "stereo"], p=[0.5, 0.2, 0.3])
         if kind == "render":
             errors = {
@@ -382,7 +385,7 @@ class SensorMix:
         return replace(sensor, **_some(rng, setup)).scaled(self.strength)
 
     def to_dict(self) -> dict[str, Any]:
-        """Its name and its strength, for JSON."""
+        """Return its name and its strength, for JSON."""
         return {"name": self.name, **asdict(self)}
 
 
@@ -390,14 +393,14 @@ def _some(
     rng: np.random.Generator,
     errors: dict[str, tuple[float, float]],
 ) -> dict[str, Any]:
-    """Strengths of some errors, each with its chance of being there and its greatest strength."""
+    """Draw the strengths of some errors, each with its probability and its largest strength."""
     there, share = rng.random((2, len(errors)))
     chance, most = np.array(list(errors.values())).T
     return dict(zip(errors, (share * most * (there < chance)).tolist(), strict=True))
 
 
 def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
-    """A sensor by NAME or NAME:STRENGTH, or as it is; "mix" is another one for every object."""
+    """Return a sensor by NAME or NAME:STRENGTH; "mix" is another one for every object."""
     if isinstance(text, Sensor | SensorMix):
         return text
     name, given, strength = str(text).partition(":")
@@ -414,13 +417,13 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
     return SensorMix(times) if name == "mix" else SENSORS[name].scaled(times)
 
 
-# What the errors are made of: all on inverse depth q = 1/z, (H, W), which changes evenly on a plane
+# Components of the errors, on inverse depth q = 1/z, (H, W), which is linear on a plane
 
 
 def slopes(q: Float) -> tuple[Float, Float]:
     """Return the change per pixel along x and y, on the side where it is smaller.
 
-    It is 0 for a pixel alone.
+    It is 0 for an isolated pixel.
     """
     return _slope(q), _slope(q.T).T
 
@@ -441,9 +444,10 @@ def shifted(
     right: Index,
     down: Index,
 ) -> tuple[Float, Index]:
-    """Show in each pixel the surface of a neighbour, where the pixel's own ray meets it.
+    """Replace the surface in each pixel by that of a neighbour.
 
-    Edges move, and planes stay.
+    The depth is that at which the pixel's own ray meets the surface: edges move, and planes are
+    unchanged.
 
     Args:
         q: inverse depth, (H, W).
@@ -458,7 +462,7 @@ def shifted(
     column = np.arange(q.shape[1])
     at_row = np.clip(row + down, 0, len(q) - 1)
     at_column = np.clip(column + right, 0, q.shape[1] - 1)
-    # one index into all rows: NumPy takes half the time
+    # flat indices are twice as fast in NumPy
     at = at_row * q.shape[1] + at_column
     there = q.take(at)
     moved = (
@@ -466,7 +470,7 @@ def shifted(
         - slope[0].take(at) * (at_column - column)
         - slope[1].take(at) * (at_row - row)
     )
-    # a slope seen edge-on leads anywhere
+    # surfaces seen edge-on have unreliable slopes
     moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)
     return np.where(there > 0, moved, 0), at
 
@@ -480,7 +484,7 @@ def incidence(q: Float, slope: tuple[Float, Float], intrinsics: Float) -> Float:
         intrinsics: pinhole matrix, (3, 3), pixels.
 
     Returns:
-        Angles, (H, W), radians; 0 where there is nothing.
+        Angles, (H, W), radians; 0 for empty pixels.
     """
     camera = PinholeCamera.of(intrinsics, q.shape)
     x, y = camera.image_slopes
@@ -498,14 +502,14 @@ def incidence(q: Float, slope: tuple[Float, Float], intrinsics: Float) -> Float:
 
 
 def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
-    """Return the inverse depth on the other side of the highest step to a neighbour.
+    """Return the inverse depth on the other side of the largest step to a neighbour.
 
     Args:
         q: inverse depth, (H, W).
         slope: its change per column and per row, (H, W) each.
 
     Returns:
-        Inverse depth, (H, W); a pixel's own if there is no step.
+        Inverse depth, (H, W); that of the pixel itself if there is no step.
     """
     padded = np.pad(q, 1)
     other = q.copy()
@@ -521,10 +525,10 @@ def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
 
 
 def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
-    """Return the pixels that a projector does not reach because of something nearer.
+    """Return the pixels that a projector does not illuminate because of an occluder.
 
-    The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights
-    the nearest surface.
+    The pixel in column u is illuminated by the projector column u - focal * baseline * q, which
+    reaches the nearest surface.
 
     Args:
         q: inverse depth, (H, W).
@@ -542,13 +546,13 @@ def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
     lit = np.zeros((height, width + 2 * offset + 2))
     first_in_row = np.arange(height)[:, None] * lit.shape[1] + offset
     seen = q > 0
-    # A surface covers all projector columns from one of its pixels to the next.
+    # A surface covers all projector columns between neighbouring pixels.
     along = _slope(q)
     joined = np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= DEPTH_EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
-    # One index into all rows: NumPy takes half the time.
+    # Flat indices are twice as fast in NumPy.
     first_index, last_index = (
         first_in_row + np.rint(at).astype(int) for at in (column, last)
     )
@@ -589,7 +593,7 @@ def kinect_axial(depth: Floats, angle: Floats) -> Float:
 
 
 def kinect_lateral(angle: Floats) -> Float:
-    """Standard deviation of where a Kinect (v1) sees an edge, pixels; same source."""
+    """Return the standard deviation of edge positions in a Kinect (v1), pixels; same source."""
     angle = np.minimum(angle, STEEPEST_INCIDENCE)
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
 
@@ -616,7 +620,7 @@ def normal_field(
     if grain < NO_GRAIN:
         return white[part]
 
-    far = int(4 * grain + 0.5) + 1  # as far as the window reaches
+    far = int(4 * grain + 0.5) + 1  # radius of the window
     inside = all(
         s.start >= far and s.stop + far <= side
         for s, side in zip(part, shape, strict=True)
@@ -633,7 +637,7 @@ def normal_field(
 
 @lru_cache(maxsize=16)
 def _power(grain: float) -> float:
-    """Standard deviation of white noise of variance 1 under a Gaussian window."""
+    """Return the standard deviation of white noise of variance 1 under a Gaussian window."""
     impulse = np.zeros(8 * int(np.ceil(grain)) + 17)
     impulse[len(impulse) // 2] = 1
     return float((gaussian_filter1d(impulse, grain) ** 2).sum())

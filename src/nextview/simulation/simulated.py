@@ -1,4 +1,4 @@
-"""Error-free cameras that cast rays with Embree, at a mesh, a target, or a scene."""
+"""Error-free cameras that cast rays with Embree at a mesh, a target, or a scene."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -26,37 +26,44 @@ if TYPE_CHECKING:
 EDGE_ON = 0.01
 SLIVER = 1e-6
 STRAY = 1e-3
-"""Rounding may put a hit anywhere on the ray where the cosine between ray and normal is smaller
-than the first, or the triangle's normal, twice its area, shorter than the second. Such a hit counts
-if it is no farther than the third, object radii, from the triangle's bounding box in the camera's
+"""Rounding errors may put a hit anywhere on the ray if the cosine between ray and normal is below
+the first value, or the triangle's normal, twice its area, is shorter than the second. Such a hit is
+accepted within the third distance, object radii, from the triangle's bounding box in camera
 axes."""
 
 
 def _dot(a: Float32, b: Float32) -> Float32:
-    """Of rows of three; einsum takes three times as long."""
+    """Dot products of rows of three, three times as fast as einsum."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-# what a pixel shows
+# labels of pixels
 SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(4, dtype=np.uint8)
-# how much nearer than the target something has to be to hide it, object radii: the table touches it
+# least distance of an occluder in front of the target, object radii, as the table touches it
 OCCLUDER_GAP = 1e-4
-LARGEST_IMAGE = 16_384  # pixels that an image may be high or wide
+LARGEST_IMAGE = 16_384  # pixels, largest height or width of an image
 
 
 class SimulatedCamera:
-    """Looks at one normalised mesh from any pose, without errors.
+    """Error-free camera in front of one normalised mesh.
 
-    The image is lit by a headlight: a pixel's brightness grows with the cosine between the ray and
-    the surface normal. It is a square of ``size`` pixels that the unit sphere just fills from
-    ``distance`` object radii; or of ``shape``, height and width, through ``intrinsics``, (3, 3),
-    pixels, the first pixel's centre at 0.5.
+    The image is lit by a headlight: the brightness of a pixel is proportional to the cosine between
+    ray and surface normal.
+
+    Args:
+        mesh: normalised mesh.
+        size: side of a square image in which the unit sphere just fits from ``distance``, pixels.
+        distance: that defines the field of view, object radii.
+        intrinsics: pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5, for an image of
+            ``shape``; None for the square image.
+        shape: height and width.
 
     Raises:
-        UsageError: the size or the shape is not that of an image.
-        ObservationError: the camera stands in the object, or no pinhole has this matrix.
+        UsageError: the size or the shape is invalid.
+        ObservationError: the camera is inside the object, or the pinhole matrix is invalid.
 
     Example:
+
         >>> camera = nextview.SimulatedCamera(sample_mesh("chair"), size=64)
         >>> camera.observe(nextview.ViewSphere.named("40").poses[3]).depth.shape
         (64, 64)
@@ -87,20 +94,20 @@ class SimulatedCamera:
         self._scene = embree_scene([(vertices, mesh.faces)])
         (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
         y, x = np.indices(self.shape, np.float32, sparse=True)
-        # z = 1, so that Embree's distance is the depth
+        # rays have z = 1, so that Embree's distance is the depth
         self._rays = np.ones((*self.shape, 3), np.float32)
         self._rays[..., 0] = (x + np.float32(0.5 - cx)) / np.float32(fx)
         self._rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
         self._ray_length = np.linalg.norm(self._rays, axis=-1)
 
     def observe(self, pose: Float) -> Observation:
-        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
+        """Render an observation from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         pose = checked_pose(pose)
         rotation = pose[:3, :3].astype(np.float32)
         origin = pose[:3, 3].astype(np.float32)
         image = np.zeros(self.shape, np.uint8)
         depth = np.zeros(self.shape, np.float32)
-        # Only pixels inside the object's projected bound can hit anything: cast no others.
+        # Only pixels inside the object's projected bounding rectangle can hit anything.
         bound = self._bound(rotation, origin)
         height, width = depth[bound].shape
         if height and width:
@@ -134,7 +141,7 @@ class SimulatedCamera:
         return Observation(depth, pose, self.intrinsics, self.radius, image, exact=True)
 
     def _bound(self, rotation: Float32, origin: Float32) -> tuple[slice, slice]:
-        """Return rows and columns that hold all vertices; the whole image if one is behind."""
+        """Return rows and columns that contain all vertices; the whole image if one is behind."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         height, width = self.shape
         if z.min() <= 1e-6:
@@ -158,7 +165,7 @@ class SimulatedCamera:
 
 
 class OccludedCamera:
-    """A camera in front of the target of a scene; what hides it is cut out."""
+    """A camera in front of the target of a scene, without the occluded pixels."""
 
     def __init__(
         self,
@@ -178,7 +185,7 @@ class OccludedCamera:
         self._rays = PinholeCamera.of(pinhole(size, distance), (size, size)).rays
 
     def observe(self, pose: Float) -> Observation:
-        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
+        """Render an observation from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         seen = self._target.observe(pose)
         hidden = self._hidden(seen)
         assert seen.image is not None
@@ -189,7 +196,7 @@ class OccludedCamera:
         )
 
     def visible_share(self, pose: Float) -> float:
-        """Return the visible share of the target's picture from a pose, (4, 4)."""
+        """Return the visible share of the target's pixels from a pose, (4, 4)."""
         seen = self._target.observe(pose)
         return (
             1 - np.count_nonzero(self._hidden(seen)) / seen.visible
@@ -198,7 +205,7 @@ class OccludedCamera:
         )
 
     def _hidden(self, seen: Observation) -> Mask:
-        """Pixels of the target alone before which something stands, (H, W)."""
+        """Return the occluded pixels of the target, (H, W)."""
         there = seen.depth > 0
         rays = self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32)
         depth, _ = self._others.cast(seen.pose[:3, 3], rays)
@@ -208,7 +215,7 @@ class OccludedCamera:
 
 
 class SceneCamera:
-    """Shows a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
+    """Renders a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
 
     def __init__(
         self,
@@ -226,8 +233,9 @@ class SceneCamera:
     def look(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
         """Render the scene from a camera-to-world pose, (4, 4), object frame and radii.
 
-        Depth, (H, W) float32, object radii, 0 = nothing; and SHOWS_NOTHING, SHOWS_TARGET,
-        SHOWS_OTHER or SHOWS_TABLE, (H, W) uint8.
+        Returns:
+            Depth, (H, W) float32, object radii, 0 = nothing; and SHOWS_NOTHING, SHOWS_TARGET,
+            SHOWS_OTHER or SHOWS_TABLE, (H, W) uint8.
         """
         pose = checked_pose(pose)
         rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
@@ -244,12 +252,12 @@ def visible_shares(
     size: int,
     distance: float,
 ) -> Float:
-    """Return the share of the target's picture that nothing hides, from each pose.
+    """Return the visible share of the target's pixels from each pose.
 
     Args:
         scene: the scene.
         poses: camera-to-world, (V, 4, 4).
-        size: side of the pictures, pixels.
+        size: side of the images, pixels.
         distance: of the cameras, object radii.
 
     Returns:

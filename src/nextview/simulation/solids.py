@@ -1,7 +1,7 @@
-"""Random solids: containers, machine parts, tools, boxes, lumps. What a segmentation learns from.
+"""Random solids for training a segmentation: containers, machine parts, tools, boxes, lumps.
 
-Every function draws one solid in metres, of any place; its longest side is about what is asked for.
-None of them is a scan, and none copies a product.
+Every function draws one solid in metres at an arbitrary position, with a longest side of about the
+requested size. No solid is a scan or a copy of a product.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ Solid = tuple[
     Float, NDArray[np.int32]
 ]  # vertices, (V, 3), metres, and triangles, (F, 3)
 
-ROUND_SECTIONS = (24, 32)  # sides of a round thing's outline
-TUBE_STEPS = 16  # pieces of a bent tube
+ROUND_SECTIONS = (24, 32)  # sides of a round outline
+TUBE_STEPS = 16  # segments of a bent tube
 
 
 def random_solid(rng: Generator, size: float) -> Solid:
@@ -65,7 +65,7 @@ def random_solid(rng: Generator, size: float) -> Solid:
 
 
 def joined(parts: Sequence[Solid]) -> Solid:
-    """Several solids as one; they may overlap."""
+    """Combine several solids, which may overlap, into one."""
     vertices = np.concatenate([part[0] for part in parts])
     starts = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
     faces = np.concatenate(
@@ -77,19 +77,19 @@ def joined(parts: Sequence[Solid]) -> Solid:
 def moved(
     solid: Solid, turn: Rotation | None = None, by: Sequence[float] = (0, 0, 0)
 ) -> Solid:
-    """Turn a solid about the origin, then displace it.
+    """Rotate a solid about the origin, then translate it.
 
     Args:
         solid: the solid.
         turn: rotation; None for none.
-        by: displacement, metres.
+        by: translation, metres.
     """
     vertices = solid[0] if turn is None else turn.apply(solid[0])
     return vertices + np.asarray(by, float), solid[1]
 
 
 def extruded(rings: Sequence[Float], height: float) -> Solid:
-    """A prism over an outline with holes, from z = 0 up.
+    """Extrude an outline with holes from z = 0 upwards.
 
     Args:
         rings: the outline, (N, 2), and its holes, (M, 2) each.
@@ -121,8 +121,8 @@ def ring_points(radius: float, sides: int, centre: Sequence[float] = (0, 0)) -> 
 
     Args:
         radius: of its corners.
-        sides: how many.
-        centre: x and y of its middle.
+        sides: number of sides.
+        centre: x and y of its centre.
     """
     angles = np.arange(sides) / sides * 2 * np.pi
     return radius * np.c_[np.cos(angles), np.sin(angles)] + np.asarray(centre, float)
@@ -199,7 +199,7 @@ def cylinder(rng: Generator) -> Solid:
 
 
 def _outline(rng: Generator) -> tuple[Float, Float]:
-    """Radii and heights of a random profile from the foot up."""
+    """Return radii and heights of a random profile from the bottom up."""
     count = int(rng.integers(3, 9))
     heights = np.linspace(0, rng.uniform(0.3, 3.0), count)
     wobble = rng.normal(0, 0.25, count).cumsum() * rng.choice([0.15, 0.5, 1.0])
@@ -207,7 +207,7 @@ def _outline(rng: Generator) -> tuple[Float, Float]:
 
 
 def container(rng: Generator) -> Solid:
-    """A bottle, a bowl, a cup, a vase: full or hollow."""
+    """A solid or hollow bottle, bowl, cup or vase."""
     from trimesh.creation import revolve
 
     radii, heights = _outline(rng)
@@ -251,7 +251,7 @@ def handled_container(rng: Generator) -> Solid:
 
 
 def compound(rng: Generator) -> Solid:
-    """Two to four simple solids, each set on a face of an earlier one."""
+    """Two to four simple solids, each placed on a face of an earlier one."""
     simple = (box, cylinder, box, lump)
     parts = [simple[int(rng.integers(4))](rng)]
     for _ in range(int(rng.integers(1, 4))):
@@ -303,7 +303,7 @@ def bracket(rng: Generator) -> Solid:
 
 
 def _rectangle(left: float, low: float, width: float, height: float) -> Float:
-    """Corners of a rectangle, (4, 2)."""
+    """Return the corners of a rectangle, (4, 2)."""
     return np.array(
         [
             [left, low],
@@ -315,7 +315,7 @@ def _rectangle(left: float, low: float, width: float, height: float) -> Float:
 
 
 def _holes(rng: Generator, width: float, height: float) -> list[Float]:
-    """Up to three round holes in a row inside a rectangle."""
+    """Return up to three round holes in a row inside a rectangle."""
     count = int(rng.integers(0, 4))
     radius = 0.16 * min(width / (count + 1), height) * rng.uniform(0.6, 1.5)
     return [
@@ -343,7 +343,7 @@ def flange(rng: Generator) -> Solid:
 
 
 def bolt(rng: Generator) -> Solid:
-    """A shaft with a head: a bolt, a screw, a knob; now and then with a nut on it."""
+    """A shaft with a head: a bolt, a screw, a knob; sometimes with a nut."""
     shaft = rng.uniform(0.15, 0.4)
     length = rng.uniform(0.8, 4.0)
     head = extruded(
@@ -382,7 +382,7 @@ def pipe(rng: Generator) -> Solid:
 
 
 def gear(rng: Generator) -> Solid:
-    """A toothed wheel with a bore and perhaps a hub."""
+    """A toothed wheel with a bore and possibly a hub."""
     teeth = int(rng.integers(8, 30))
     angles = np.arange(4 * teeth) / (4 * teeth) * 2 * np.pi
     depth = rng.uniform(0.04, 0.1)
@@ -398,7 +398,7 @@ def gear(rng: Generator) -> Solid:
 
 
 def tool(rng: Generator) -> Solid:
-    """Something long and thin with a head: cutlery, pliers, hammers, brushes."""
+    """A long, thin object with a head: cutlery, pliers, hammers, brushes."""
     length = 1.0
     bend = rng.normal(0, 0.15)
     at = np.linspace(0, 1, TUBE_STEPS)
@@ -428,7 +428,7 @@ def tool(rng: Generator) -> Solid:
 
 
 def frame(rng: Generator) -> Solid:
-    """Something thin that goes round a hole: a ring, a clamp, a tray's rim, a coat hanger."""
+    """A thin object around a hole: a ring, a clamp, a tray's rim, a coat hanger."""
     kind = rng.random()
     if kind < 0.3:  # flat: a washer, a picture frame
         sides = int(rng.choice([4, 6, 32]))
@@ -452,7 +452,7 @@ def frame(rng: Generator) -> Solid:
 
 
 def chain(rng: Generator) -> Solid:
-    """A heap of thin links: a chain, a necklace, a string of beads."""
+    """A pile of thin links: a chain, a necklace, a string of beads."""
     radius = rng.uniform(0.06, 0.18)
     links = []
     place = np.zeros(2)
@@ -471,7 +471,7 @@ def chain(rng: Generator) -> Solid:
 
 
 def sheet(rng: Generator) -> Solid:
-    """Something flat with an outline of its own: a key, a spatula, a gasket, a leaf."""
+    """A flat object with an irregular outline: a key, a spatula, a gasket, a leaf."""
     count = int(rng.integers(5, 40))
     angles = np.sort(rng.uniform(0, 2 * np.pi, count))
     if np.diff(angles, append=angles[0] + 2 * np.pi).max() > 2.5:
@@ -488,7 +488,7 @@ def sheet(rng: Generator) -> Solid:
 
 
 def lump(rng: Generator) -> Solid:
-    """A ball, an egg, a fruit, a crumpled cloth: a round thing with a soft relief."""
+    """A round object with a soft relief: a ball, an egg, a fruit, a crumpled cloth."""
     from trimesh.creation import icosphere
 
     ball = icosphere(3, 0.5)

@@ -1,8 +1,8 @@
-"""Simulated tables with several things on them, at true size, and a depth camera over them.
+"""Simulated tables with several objects at true size, and a depth camera above them.
 
-Things stand or lie on a table in one of their resting poses, side by side with gaps of up to some
-centimetres. A camera in the robot's world looks at them through a sensor with its errors: those of
-the depth, of the camera's pose, and of the robot's vertical. Everything is in metres.
+Objects are in one of their resting poses, side by side with gaps of up to a few centimetres. The
+camera has the errors of a sensor: those of the depth, of the camera pose, and of the robot's
+vertical. All lengths are in metres.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from nextview.simulation.scene import footprint, separation, upright_boxes
 from nextview.simulation.sensor import Sensor
 from nextview.types import Float, Floats
 
-WIDEST_GAP = 0.10  # metres between neighbours, at most
+WIDEST_GAP = 0.10  # metres, largest gap between neighbours
 TABLE_SIDES = (1.5, 1.1)  # metres
 TABLE_THICKNESS = 0.03  # metres
 TABLE_HEIGHT = 0.75  # metres above the floor
 FLOOR_SIDE = 8.0  # metres
-STEP_OUTWARDS = 0.005  # metres by which a thing is moved outwards until it fits
+STEP_OUTWARDS = 0.005  # metres, step in which an object is moved outwards until it fits
 MOST_STEPS = 200
 PLACEMENTS_TRIED = 100
-TABLE_REACH = 0.36  # metres from the middle of the table within which things stand
+TABLE_REACH = 0.36  # metres, largest distance of an object from the centre of the table
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """A thing on a table.
+    """An object on a table.
 
     Attributes:
-        name: what it is called.
+        name: of the object.
         vertices: in the frame of its file, (V, 3) float64, metres.
         faces: triangles, (F, 3) int32.
-        pose: from the frame of its file into that of the table, (4, 4) float64, metres.
+        pose: from the frame of its file to the table frame, (4, 4) float64, metres.
     """
 
     name: str
@@ -54,16 +54,16 @@ class PlacedThing:
 
     @property
     def placed(self) -> Float:
-        """The vertices in the frame of the table, (V, 3), metres."""
+        """Vertices in the table frame, (V, 3), metres."""
         return self.vertices @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTable:
-    """Things on a table whose top is the plane z = 0, its middle at the origin.
+    """Objects on a table whose top is the plane z = 0, centred at the origin.
 
     Attributes:
-        things: what stands on it.
+        things: the objects.
     """
 
     things: tuple[PlacedThing, ...]
@@ -76,19 +76,19 @@ class SimulatedTable:
         gap: float = WIDEST_GAP,
         resting: Callable[[Mesh], Float] = resting_poses,
     ) -> SimulatedTable:
-        """Put meshes on a table, each in one of its resting poses and turned at random.
+        """Place meshes on a table, each in one of its resting poses with a random azimuth.
 
-        The first stands near the middle. Each further one is moved outwards from one of those that
-        stand already, until it is as far from all of them as was drawn.
+        The first one is placed near the centre. Each further one is moved outwards from one of the
+        others until its gap to all of them has the drawn size.
 
         Args:
             meshes: of known unit.
-            rng: draws poses, places and gaps.
-            gap: metres between neighbours, at most; down to 0.
-            resting: rotations into the poses that a mesh can rest in, (P, 3, 3).
+            rng: for poses, positions and gaps.
+            gap: largest gap between neighbours, metres; at least 0.
+            resting: function that returns the rotations of a mesh to its resting poses, (P, 3, 3).
 
         Raises:
-            UsageError: the unit of a mesh is not known, or the things do not fit on the table.
+            UsageError: the unit of a mesh is not known, or the objects do not fit on the table.
         """
         things: list[PlacedThing] = []
         outlines: list[Float] = []
@@ -120,7 +120,7 @@ def _free_place(
     rng: np.random.Generator,
     gap: float,
 ) -> Float:
-    """Where a thing with an outline, (K, 2), about the origin has a gap to all others, (2,)."""
+    """Find a position, (2,), where an outline about the origin, (K, 2), is clear of all others."""
     if not others:
         return rng.uniform(-0.05, 0.05, 2)
     for _ in range(PLACEMENTS_TRIED):
@@ -140,16 +140,15 @@ def _free_place(
 class TableCamera:
     """A depth camera in a robot's world, over a simulated table.
 
-    The robot's world is the frame of the table but for a lean by the error of the vertical. Poses
-    that the camera is brought to are those that the robot believes in.
+    The robot's world frame is the table frame, tilted by the error of the vertical. Requested poses
+    are those that the robot assumes.
 
     Attributes:
         sensor: its errors.
-        lean: from the frame of the table into the robot's world, (4, 4) float64.
-        shown: how many pixels of the last frame show each thing, (things,) int64.
-        owner: thing that each pixel of the last frame shows, -1 for none, (H, W) int64.
-        true_pose: where the camera of the last frame really stood, in the frame of the table,
-            (4, 4) float64.
+        lean: from the table frame to the robot's world frame, (4, 4) float64.
+        shown: number of pixels of each object in the last frame, (things,) int64.
+        owner: object of each pixel in the last frame, -1 for none, (H, W) int64.
+        true_pose: true camera pose of the last frame, in the table frame, (4, 4) float64.
     """
 
     def __init__(
@@ -162,10 +161,10 @@ class TableCamera:
         """Set up a camera over a table.
 
         Args:
-            table: with the things.
+            table: with the objects.
             sensor: noise model, and the errors of its setup.
-            rng: draws the errors.
-            room: what stands around the table, in its frame, metres: walls, furniture.
+            rng: for the errors.
+            room: surroundings of the table, in its frame, metres: walls, furniture.
         """
         self.sensor = sensor
         self._room = tuple(room)
@@ -181,7 +180,7 @@ class TableCamera:
         )
 
     def change(self, table: SimulatedTable) -> None:
-        """Put another table in the place of the one so far: somebody moved a thing."""
+        """Replace the table, for example after an object was moved."""
         self.table = table
         self._count = len(table.things)
         things: list[Triangles] = [
@@ -197,17 +196,17 @@ class TableCamera:
 
     @property
     def truth(self) -> dict[str, Float]:
-        """Pose of each thing's file in the robot's world, (4, 4), metres, by its name."""
+        """True pose of each object's file in the robot's world, (4, 4), metres, by name."""
         return {thing.name: self.lean @ thing.pose for thing in self.table.things}
 
     def frame(self, pose: Float) -> Frame:
-        """Look from a pose in the robot's world.
+        """Capture a frame from a pose in the robot's world.
 
         Args:
             pose: camera-to-world, (4, 4), metres, OpenCV axes.
 
         Raises:
-            ObservationError: nothing is seen from there.
+            ObservationError: nothing is visible from there.
         """
         rng = self._rng.spawn(1)[0]
         true = np.linalg.inv(self.lean) @ pose
@@ -239,13 +238,13 @@ def poses_around(
     distance: float,
     centre: Float,
 ) -> Float:
-    """Level cameras around a place, that look at it.
+    """Return level camera poses around a point, aimed at it.
 
     Args:
         azimuths: radians, (V,).
         elevation: radians.
         distance: metres.
-        centre: what they look at, (3,), metres.
+        centre: the point, (3,), metres.
 
     Returns:
         Camera-to-world poses, (V, 4, 4), metres, OpenCV axes.

@@ -1,8 +1,8 @@
-"""Random worlds for a depth camera: tables, floors, bins, shelves, belts and rooms of things.
+"""Random worlds for a depth camera: tables, floors, bins, shelves, belts and rooms with objects.
 
-Things are dropped on a height map: they stand side by side, lie on each other, and fill bins. What
-they rest on, what encloses them, and what is behind them are labelled, too. A segmentation learns
-from them (``training/segmentation_training.py``).
+Objects are dropped onto a height map: they stand side by side, lie on each other, and fill bins.
+The surfaces below them, containers and background are labelled, too. The worlds are used to train a
+segmentation (``training/segmentation_training.py``).
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ from nextview.simulation.sensor import SENSORS, Sensor
 from nextview.simulation.solids import Solid, moved, random_solid, tube
 from nextview.types import Float, Float32, Index, Mask
 
-# label of what carries things: table tops, floors, boards, the bottoms of bins
+# label of support surfaces: table tops, floors, boards, the bottoms of bins
 SURFACE = -1
-# label of all else that is no thing: walls, sides of bins, people, grippers
+# label of everything else that is not an object: walls, sides of bins, people, grippers
 BACKGROUND = -2
 HOLE = -3  # label of a pixel without depth
 
 MAP_CELLS = 160  # cells on each side of a height map
 DROPS_TRIED = 25
-# by which it is found how far a solid can be pushed, from each side
+# rays from each side that measure how far a solid can be pushed
 CONTACT_RAYS = 1500
-STACKED = 0.5  # share of piled things that are put on the last one
-# share of levels whose things are turned by quarters, so that their sides meet
+STACKED = 0.5  # share of piled objects that are placed on the last one
+# share of levels whose objects are rotated by quarter turns, so that their sides are parallel
 ALIGNED = 0.4
 STEPS_OUTWARDS = 60
-SMALL_FURNITURE = 0.8  # metres: a monitor or a night stand
-RAISED = 0.7  # share of small furniture that stands on other furniture, if there is any
-LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
+SMALL_FURNITURE = 0.8  # metres, size of a monitor or a night stand
+RAISED = 0.7  # share of small furniture placed on other furniture, if there is any
+LEAST_STABLE = 0.03  # least probability of a resting pose
 LARGEST_SHAPE = 20_000  # triangles
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A solid with the poses in which it rests.
+    """A solid with its resting poses.
 
     Attributes:
         solid: vertices, (V, 3), metres, and triangles, (F, 3).
-        resting: rotations into its stable poses, (P, 3, 3), at least one; their outlines' longest
-            rectangles lie along x and y.
+        resting: rotations to its stable poses, (P, 3, 3), at least one; the smallest rectangles
+            around their outlines are parallel to x and y.
     """
 
     solid: Solid
@@ -66,7 +66,7 @@ class Shape:
         try:
             hull = Trimesh(*solid).convex_hull
             poses, shares = compute_stable_poses(hull, n_samples=1)
-        except (QhullError, ValueError):  # flat or degenerate: as it is drawn
+        except (QhullError, ValueError):  # flat or degenerate: original orientation
             return cls(solid, np.eye(3)[None])
         likely = poses[shares > LEAST_STABLE][:, :3, :3]
         if not len(likely):
@@ -76,7 +76,7 @@ class Shape:
 
 
 def _squared(turn: Float, corners: Float) -> Float:
-    """Turn on about z, so that the smallest rectangle around an outline lies along x and y.
+    """Rotate about z so that the smallest rectangle around the outline is parallel to x and y.
 
     Args:
         turn: rotation, (3, 3).
@@ -91,15 +91,15 @@ def _squared(turn: Float, corners: Float) -> Float:
 
 @dataclass(eq=False)
 class World:
-    """Solids in place, each with its label.
+    """Solids in their poses, each with its label.
 
     Attributes:
         solids: in the world, metres, z up.
-        labels: of each: the number of a thing, SURFACE or BACKGROUND.
-        focus: what the camera looks at, (3,).
-        scale: metres, the size of a typical thing.
+        labels: of each: the number of an object, SURFACE or BACKGROUND.
+        focus: point at which the camera is aimed, (3,).
+        scale: typical size of an object, metres.
         elevations: of the camera, degrees, least and greatest.
-        yaw: direction from which it may look, radians; None for any.
+        yaw: viewing direction of the camera, radians; None for any.
     """
 
     focus: Float
@@ -110,34 +110,34 @@ class World:
     labels: list[int] = field(default_factory=list)
 
     def add(self, solid: Solid, label: int) -> None:
-        """Put a solid where it is.
+        """Add a solid.
 
         Args:
-            solid: in place, metres.
-            label: the number of a thing, SURFACE or BACKGROUND.
+            solid: in its pose, metres.
+            label: the number of an object, SURFACE or BACKGROUND.
         """
         self.solids.append(solid)
         self.labels.append(label)
 
     @property
     def things(self) -> int:
-        """How many things there are."""
+        """Number of objects."""
         return max([0, *(label + 1 for label in self.labels)])
 
 
 class HeightMap:
-    """The heights of a level and of what lies on it, on a grid of square cells."""
+    """The heights of a level and of the objects on it, on a grid of square cells."""
 
     def __init__(
         self, side: float, centre: Float, level: float, inside: float | None = None
     ) -> None:
-        """Begin with an empty level.
+        """Create an empty level.
 
         Args:
             side: of the square, metres.
-            centre: of it, (2,).
+            centre: of the square, (2,).
             level: its height, metres.
-            inside: half the width of the part in which things may lie; None for all.
+            inside: half the width of the area for objects; None for all.
         """
         self.cell = side / MAP_CELLS
         self.low = np.asarray(centre, float) - side / 2
@@ -161,18 +161,18 @@ class HeightMap:
         """Lower a solid until it touches something.
 
         Args:
-            shape: in its orientation; moved so that its place is free.
-            rng: draws the place.
+            shape: in its orientation; it is translated to a free position.
+            rng: for the position.
             piled: whether it may lie on others.
-            gap: metres kept from others where it may not.
-            spread: metres from the middle within which it is put.
-            ceiling: height that it must not reach, metres.
-            beside: others on the level, to one of which it is pushed until they touch; not where it
-                may lie on them.
+            gap: distance from others if it may not lie on them, metres.
+            spread: largest distance from the centre, metres.
+            ceiling: height limit, metres.
+            beside: others on the level, against one of which it is pushed until they touch; not
+                used if it may lie on them.
             axes: horizontal directions along which it is pushed, (A, 3); None for any.
 
         Returns:
-            The solid in place; None where there is no room.
+            The solid in its pose; None if there is no room.
         """
         vertices, faces = shape
         low = vertices.min(0)
@@ -217,7 +217,7 @@ class HeightMap:
         return None
 
     def _places(self, rng: Generator, piled: bool, spread: float) -> Iterator[Float]:
-        """Places to try, (2,) each: at random, or from a place near the middle outwards."""
+        """Iterate over positions, (2,) each: random ones, or from near the centre outwards."""
         angle = rng.uniform(0, 2 * np.pi)
         start = self.centre + rng.normal(0, spread / 2, 2)
         if piled:
@@ -232,18 +232,18 @@ class HeightMap:
             yield start + step * 1.5 * self.cell * way
 
     def _cells(self, at: Index, shape: tuple[int, ...]) -> Float | None:
-        """The heights of so many cells from one on, a view; None where they leave the map."""
+        """Return a view of a block of cells; None if it leaves the map."""
         if (at < 0).any() or (at + shape > MAP_CELLS).any():
             return None
         return self.heights[at[0] : at[0] + shape[0], at[1] : at[1] + shape[1]]
 
     def _is_free(self, at: Index, outline: Mask) -> bool:
-        """Whether nothing lies in an outline, (h, w) bool, whose first cell is ``at``."""
+        """Return True if an outline, (h, w) bool, whose first cell is ``at``, is free."""
         here = self._cells(at, outline.shape)
         return here is not None and not (here[outline] > self.level + 1e-9).any()
 
     def _profiles(self, solid: Solid) -> tuple[Float, Float]:
-        """Heights of the lower and the upper side over the cells of a solid's outline."""
+        """Return the lower and the upper height over the cells of a solid's outline."""
         vertices, _ = solid
         low = vertices.min(0)
         high = vertices.max(0)
@@ -264,9 +264,9 @@ def _pushed(solid: Solid, others: Sequence[Solid], axes: Float | None) -> Solid:
     """Push a solid horizontally until it touches one of some others.
 
     Args:
-        solid: in place, apart from the others.
-        others: in place.
-        axes: directions along which it may be pushed, (A, 3); None for any.
+        solid: in its pose, apart from the others.
+        others: in their poses.
+        axes: directions of the push, (A, 3); None for any.
     """
     vertices, faces = solid
     middles = np.array([other[0].mean(0) for other in others])
@@ -292,13 +292,13 @@ def _pushed(solid: Solid, others: Sequence[Solid], axes: Float | None) -> Solid:
 def slab(
     size: Sequence[float], centre: Sequence[float] | Float, top: float, yaw: float = 0.0
 ) -> Solid:
-    """A box with its top at a height.
+    """Return a box with its top at a given height.
 
     Args:
         size: its sides, metres, (3,).
-        centre: x and y of its middle.
+        centre: x and y of its centre.
         top: height of its top.
-        yaw: turned by so many radians.
+        yaw: rotation about z, radians.
     """
     box = upright_boxes(
         np.asarray(size, float)[None],
@@ -312,12 +312,12 @@ def slab(
 def draw_shapes(
     rng: Generator, count: int, others: Sequence[Solid] = ()
 ) -> list[Shape]:
-    """Draw solids of unit size, and find how they rest.
+    """Draw solids of unit size, and find their resting poses.
 
     Args:
         rng: source of all random numbers.
-        count: how many.
-        others: solids of any size of which a third is taken, such as meshes of toys.
+        count: number of solids.
+        others: solids of any size that provide a third of them, such as meshes of toys.
     """
     shapes = []
     for _ in range(count):
@@ -352,9 +352,8 @@ def draw_world(
     """Draw a world.
 
     Args:
-        shapes: of things, of unit size.
-        furniture: life-size, metres, z up, standing on z = 0; may be empty: then there are no
-            rooms.
+        shapes: of objects, of unit size.
+        furniture: life-size, metres, z up, standing on z = 0; if it is empty, there are no rooms.
         rng: source of all random numbers.
         kind: one of ``KINDS``; None for any.
     """
@@ -377,7 +376,7 @@ def _level(
     scale: float,
     kind: str,
 ) -> World:
-    """Things on a table, a floor or a belt, beside and on each other."""
+    """Draw objects on a table, a floor or a belt, side by side and on each other."""
     world = World(np.array([0, 0, scale / 3]), scale, (12.0, 88.0))
     yaw = rng.uniform(0, np.pi)
     if kind == "floor":
@@ -407,7 +406,7 @@ def _level(
 def _table_top(
     world: World, rng: Generator, yaw: float, belt: bool, scale: float
 ) -> float:
-    """Add a table, or a belt with rails, over a floor; return how far it reaches, metres."""
+    """Add a table, or a belt with rails, over a floor; return its extent, metres."""
     height = rng.uniform(0.35, 1.0)
     length = max(rng.uniform(0.35, 1.8), 5 * scale)
     width = max(length * rng.uniform(0.5, 1.0), 4 * scale)
@@ -437,7 +436,7 @@ def _table_top(
 
 
 def _disc(radius: float) -> Solid:
-    """A round table top with its upper side at z = 0."""
+    """Return a round table top with its upper side at z = 0."""
     from nextview.simulation.solids import extruded, ring_points
 
     return moved(extruded([ring_points(radius, 40)], 0.03), by=(0, 0, -0.03))
@@ -450,7 +449,7 @@ def _behind(
     raised: bool,
     scale: float,
 ) -> None:
-    """Add walls, furniture and people behind a working place."""
+    """Add walls, furniture and people behind a workplace."""
     floor = -rng.uniform(0.5, 0.9) if raised else 0.0
     for _ in range(int(rng.choice([0, 0, 1, 1, 2]))):
         angle = rng.uniform(0, 2 * np.pi)
@@ -471,7 +470,7 @@ def _behind(
 
 
 def _person(rng: Generator) -> Solid:
-    """A standing or sitting figure of capsules, on z = 0, metres."""
+    """Return a standing or sitting figure made of capsules, on z = 0, metres."""
     from nextview.simulation.solids import joined, lump
 
     tall = rng.uniform(1.2, 1.9)
@@ -497,7 +496,7 @@ def _person(rng: Generator) -> Solid:
 
 
 def _hands(world: World, rng: Generator) -> None:
-    """Now and then a hand or a gripper reaches in from above, with or without a thing."""
+    """Sometimes add a hand or a gripper from above, with or without an object."""
     if rng.random() > 0.08:
         return
     size = max(world.scale, 0.04)
@@ -520,7 +519,7 @@ def _hands(world: World, rng: Generator) -> None:
 
 
 def _number(rng: Generator) -> int:
-    """How many things there are: one, a few, or many."""
+    """Draw the number of objects: one, a few, or many."""
     return int(rng.choice([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24]))
 
 
@@ -534,19 +533,21 @@ def _fill(
     piled: float,
     ceiling: float = np.inf,
 ) -> None:
-    """Drop things on a level.
+    """Drop objects onto a level.
 
     Args:
-        world: that they are added to.
+        world: to which they are added.
         ground: the level.
         shapes: of unit size.
         rng: source of all random numbers.
-        count: how many are tried.
+        count: number of attempts.
         gap: metres between neighbours.
         piled: share of them that may lie on others.
-        ceiling: height below which they stay.
+        ceiling: height limit.
     """
-    alike = rng.random() < 0.2  # of one kind: rows of boxes, a bin of one part
+    alike = (
+        rng.random() < 0.2
+    )  # copies of one shape, such as rows of boxes or a bin of one part
     base = rng.uniform(0, 2 * np.pi)
     aligned = rng.random() < ALIGNED
     quarters = base + np.arange(4) * np.pi / 2
@@ -596,7 +597,7 @@ def _bin(
     rng: Generator,
     scale: float,
 ) -> World:
-    """Things poured into a bin or a tray that stands on a table or a floor."""
+    """Draw objects poured into a bin or a tray on a table or a floor."""
     world = World(np.array([0, 0, scale / 2]), scale, (35.0, 88.0))
     half = scale * rng.uniform(1.6, 5.0, 2)
     if rng.random() < 0.4:
@@ -630,7 +631,7 @@ def _bin(
         np.stack([x, y, 0 * x], -1).reshape(-1, 3)
     )
     outside = (np.abs(own[:, :2]) > half - inner.cell).any(1).reshape(x.shape)
-    inner.heights[outside] = max(tall, 6 * scale)  # a thing stays within the walls
+    inner.heights[outside] = max(tall, 6 * scale)  # keeps objects within the walls
     count = int(rng.choice([1, 2, 3, 5, 5, 8, 12, 20, 30]))
     _fill(
         world, inner, shapes, rng, count, 0.0, float(rng.choice([0.2, 1.0])), 5 * scale
@@ -640,7 +641,7 @@ def _bin(
 
 
 def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
-    """Things on the boards of a shelf, seen from the front."""
+    """Draw objects on the boards of a shelf, seen from the front."""
     clear = scale * rng.uniform(1.6, 3.5)
     width = scale * rng.uniform(6, 14)
     deep = scale * rng.uniform(2.5, 5)
@@ -671,7 +672,7 @@ def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
 
 
 def _room(shapes: Sequence[Shape], furniture: Sequence[Solid], rng: Generator) -> World:
-    """Life-size furniture on a floor, before walls, with or without things on it."""
+    """Draw life-size furniture on a floor, in front of walls, with or without objects on it."""
     world = World(np.array([0, 0, 0.4]), 1.0, (5.0, 55.0))
     world.add(slab((14, 14, 0.1), (0, 0), 0), SURFACE)
     for angle in rng.uniform(0, 2 * np.pi, int(rng.integers(0, 3))):
@@ -704,11 +705,11 @@ def _room(shapes: Sequence[Shape], furniture: Sequence[Solid], rng: Generator) -
 
 @dataclass(frozen=True, eq=False)
 class LabelledFrame:
-    """What a camera measures of a world, and what each pixel is.
+    """A simulated depth image of a world with labels.
 
     Attributes:
-        depth: (H, W) float32, metres; 0 where nothing was measured.
-        labels: thing of each pixel, SURFACE, BACKGROUND or HOLE, (H, W) int16.
+        depth: (H, W) float32, metres; 0 without valid depth.
+        labels: object of each pixel, SURFACE, BACKGROUND or HOLE, (H, W) int16.
         intrinsics: pinhole matrix, (3, 3); the first pixel's centre is at 0.5.
         pose: of the camera in the world, (4, 4).
     """
@@ -720,20 +721,20 @@ class LabelledFrame:
 
     @property
     def up(self) -> Float:
-        """Direction against gravity in the camera's axes, (3,)."""
+        """Direction against gravity in camera axes, (3,)."""
         return self.pose[2, :3]
 
 
 def photograph(
     world: World, rng: Generator, shape: tuple[int, int], views: int
 ) -> list[LabelledFrame]:
-    """Look at a world from some places, each time through another sensor.
+    """Capture a world from several poses, each time with another sensor.
 
     Args:
-        world: what there is.
+        world: the world.
         rng: source of all random numbers.
-        shape: rows and columns of the pictures.
-        views: how many.
+        shape: rows and columns of the images.
+        views: number of images.
     """
     caster = RayCaster(world.solids)
     label_of = np.array([*world.labels, HOLE])
@@ -746,7 +747,7 @@ def photograph(
         depth, owner = caster.cast(pose[:3, 3], rays @ pose[:3, :3].T)
         clean = np.where(np.isfinite(depth), depth, 0).reshape(shape).astype(np.float32)
         if (clean > 0).mean() < 0.2 or np.median(clean[clean > 0]) < 0.12:
-            views -= 1  # the camera stands behind or in something
+            views -= 1  # the camera is behind or inside something
             continue
 
         labels = label_of[owner]
@@ -760,7 +761,7 @@ def photograph(
 
 
 def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
-    """A camera-to-world pose, (4, 4), that looks at the middle of a world."""
+    """Draw a camera-to-world pose, (4, 4), aimed at the centre of a world."""
     elevation = np.radians(rng.uniform(*world.elevations))
     azimuth = rng.uniform(0, 2 * np.pi)
     if world.yaw is not None:
@@ -781,7 +782,7 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
 
 
 def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
-    """A sensor whose pictures were made so much smaller, with its errors at that size."""
+    """Draw a sensor whose images are downscaled to this shape, with its errors at that size."""
     known = SENSORS[str(rng.choice(["none", "kinect", "stereo", "stereo"]))]
     focal = known.focal / known.width * shape[1] * rng.uniform(0.8, 1.6)
     smaller = shape[1] / known.width
@@ -803,7 +804,7 @@ def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
 
 
 def _warp(rng: Generator, shape: tuple[int, int]) -> Float32:
-    """Factors of depth that change slowly over the picture, as of a badly calibrated camera."""
+    """Draw smooth scale errors of the depth, as in a badly calibrated camera."""
     if rng.random() < 0.5:
         return np.ones(shape, np.float32)
     coarse = rng.normal(0, rng.uniform(0, 0.004), (4, 5))
@@ -813,7 +814,7 @@ def _warp(rng: Generator, shape: tuple[int, int]) -> Float32:
 
 
 def _blind_spots(depth: Float32, labels: Index, rng: Generator) -> Float32:
-    """Take away depth where a thing is dark or shines, and in patches."""
+    """Remove depth from dark or shiny objects, and from random patches."""
     depth = depth.copy()
     for thing in np.unique(labels[labels >= 0]):
         if rng.random() < 0.04:

@@ -1,1 +1,1 @@
-"""Training of networks, fits to their predictions, and export: everything that needs torch."""
+"""Training and export of networks, and fits to their predictions: everything that needs torch."""

@@ -27,7 +27,7 @@ FEATURE_CHANNELS = 1280
 
 
 class Depthwise(nn.Conv2d):
-    """A kernel for each channel, always in float32: in bfloat16 its gradient is slow on a CPU."""
+    """Depthwise convolution, always in float32, because its bfloat16 gradient is slow on a CPU."""
 
     def __init__(self, width: int, kernel: int, stride: int) -> None:
         super().__init__(
@@ -46,7 +46,7 @@ class Depthwise(nn.Conv2d):
 
 
 class InvertedBottleneck(nn.Module):
-    """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape."""
+    """Expansion, depthwise convolution, projection; with a shortcut if the shape is unchanged."""
 
     def __init__(
         self,
@@ -90,10 +90,10 @@ class InvertedBottleneck(nn.Module):
 
 
 class RecogniserNetwork(nn.Module):
-    """Images (B, channels, H, W) in 0 .. 1 to the logits (B, classes), in a tuple.
+    """Network from images, (B, channels, H, W) in 0 to 1, to logits, (B, classes), in a tuple.
 
-    With ``azimuths``, also the log-likelihoods of so many azimuth bins given each class, (B,
-    classes, azimuths).
+    With ``azimuths``, it also returns the log-likelihoods of this number of azimuth bins given each
+    class, (B, classes, azimuths).
     """
 
     dropout = 0.0
@@ -122,7 +122,7 @@ class RecogniserNetwork(nn.Module):
         return self.answers(self.features(x))
 
     def answers(self, features: Tensor) -> tuple[Tensor, ...]:
-        """What ``forward`` returns, by features (B, F)."""
+        """Return the outputs of ``forward`` for features, (B, F)."""
         features = F.dropout(features, self.dropout, self.training)
         logits = self.fc(features)
         if self.side is None:
@@ -168,13 +168,13 @@ class LiteNet(RecogniserNetwork):
         self.finish(FEATURE_CHANNELS, classes, azimuths)
 
     def features(self, x: Tensor) -> Tensor:
-        """Of images, (B, F)."""
+        """Compute features of images, (B, F)."""
         x = self.stages(self.relu(self.norm0(self.stem(x))))
         return self.avgpool(self.relu(self.norm1(self.head(x)))).flatten(1)
 
 
 def _norm(width: int) -> nn.BatchNorm2d:
-    # EfficientNet's epsilon: checkpoints count on it
+    # EfficientNet's epsilon, as in published checkpoints
     return nn.BatchNorm2d(width, eps=1e-3)
 
 
@@ -189,7 +189,7 @@ RESNETS = {
 
 
 class Residual(nn.Module):
-    """A shortcut around two 3x3 convolutions, or if ``narrow`` around 1x1, 3x3 and 1x1."""
+    """A shortcut around two 3x3 convolutions, or if ``narrow``, around 1x1, 3x3 and 1x1."""
 
     def __init__(self, inputs: int, width: int, stride: int, narrow: bool) -> None:
         super().__init__()
@@ -256,13 +256,13 @@ class ResNet(RecogniserNetwork):
                 inputs = (64 << stage) * (4 if narrow else 1)
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.finish(inputs, classes, azimuths)
-        # each block begins as the identity, which steadies large rates
+        # each block starts as the identity, which stabilises large learning rates
         for module in self.modules():
             if isinstance(module, Residual):
                 nn.init.zeros_(getattr(module, f"bn{module.length}").weight)
 
     def features(self, x: Tensor) -> Tensor:
-        """Of images, (B, F)."""
+        """Compute features of images, (B, F)."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(x))))
         for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
             x = stage(x)
@@ -291,7 +291,7 @@ def recogniser_network(
 
 
 def _dense(between: tuple[nn.Module, ...]) -> nn.Sequential:
-    """The fully connected layers after the points of a cloud are pooled."""
+    """Return the fully connected layers after pooling over the points of a cloud."""
     first = (nn.Linear(1024, 512), nn.BatchNorm1d(512))
     second = (nn.Linear(512, 256), *between, nn.BatchNorm1d(256))
     return nn.Sequential(*first, nn.ReLU(inplace=True), *second, nn.ReLU(inplace=True))
@@ -348,7 +348,7 @@ class PointNet(nn.Module):
         self.head = _dense((nn.Dropout(dropout),)).append(
             nn.Linear(256, rings * columns)
         )
-        # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
+        # Start inside the range of the targets, as a ReLU with negative input has no gradient.
         nn.init.constant_(self.head[-1].bias, 0.5)
         self.shape = (rings, columns)
 
@@ -400,13 +400,13 @@ def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
         sphere: the viewpoints of the maps.
 
     Returns:
-        -1, 0, +1 for a window; 0, 1, ... once round for the whole sphere.
+        -1, 0, +1 for a window; 0, 1, ... once around for the whole sphere.
     """
     return [-1, 0, 1] if recipe.extent == "window" else list(range(sphere.azimuths))
 
 
 def orthogonality(matrix: Tensor) -> Tensor:
-    """Return how far matrices, (B, k, k), are from orthogonal.
+    """Return the deviation of matrices, (B, k, k), from orthogonality.
 
     It is the mean Frobenius norm of I - A A^T (thesis, equation 2).
     """
@@ -420,7 +420,7 @@ def orthogonality(matrix: Tensor) -> Tensor:
 
 
 class Convolutions(nn.Module):
-    """Two convolutions with a shortcut around them."""
+    """Two convolutions with a shortcut."""
 
     def __init__(self, inputs: int, width: int, dilation: int = 1) -> None:
         super().__init__()
@@ -466,5 +466,5 @@ class SegmentationNet(nn.Module):
 
 
 def _twice(x: Tensor) -> Tensor:
-    """A picture of twice as many rows and columns."""
+    """Upsample an image to twice as many rows and columns."""
     return F.interpolate(x, scale_factor=2, mode="nearest")

@@ -1,4 +1,4 @@
-"""Fits of calibration, error rates, sizes and valleys to held-out predictions."""
+"""Fit calibration, error rates, sizes and valleys to held-out predictions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,17 +35,17 @@ from nextview.training.fitting_set import (
 )
 from nextview.types import Float, Floats, Index, Mask
 
-# of promised error rates
+# thresholds with guaranteed error rates
 PROMISED_THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 
 @dataclass(frozen=True)
 class FittedCalibration:
-    """What ``fit_calibration`` wrote into the card.
+    """Result of ``fit_calibration``.
 
     Attributes:
         calibration: the calibration.
-        objects: number of objects that it was fitted to.
+        objects: number of objects in the fit.
         before: negative log-likelihood over 1 to 5 views before the fit.
         after: the same after the fit.
     """
@@ -86,7 +86,7 @@ def fit_calibration(
         _check_recogniser(card, model, predictions, table)
         table = _held_out(predictions, table, card, model)
         data = Predictions.joined([table, *load_sensed(sensed, table)])
-        walks = 1 + 8000 // len(data)  # few objects are walked over more often
+        walks = 1 + 8000 // len(data)  # more walks per object if there are few objects
         calibration = fit_temperature(
             data,
             np.random.default_rng([seed, 0]),
@@ -118,7 +118,7 @@ def _held_out(
     card: Path,
     model: ModelCard,
 ) -> Predictions:
-    """The objects that a card calls held out of its training, without duplicates."""
+    """Return the objects that a card lists as held out of its training, without duplicates."""
     once = deduplicated(for_fitting(table).labels, table.depth_entropy)
     kept = once[np.isin(np.array(table.names)[once], model.held_out)]
     if len(kept) == 0:
@@ -134,9 +134,9 @@ def _check_recogniser(
     predictions: Path,
     table: Predictions,
 ) -> None:
-    """Refuse predictions by another recogniser than a card's.
+    """Reject predictions of another recogniser than a card's.
 
-    Those that name none are the user's word.
+    Predictions without the name of a recogniser are accepted.
     """
     by = table.models.get("recogniser")
     if card.sha256 != by[1] if by else card.classes != table.classes:
@@ -191,7 +191,7 @@ class Walks:
 
     @property
     def numbers(self) -> Index:
-        """Of the views so far, 1, 2, ..."""
+        """Return the numbers of views so far, 1, 2, ..."""
         return np.arange(1, self.totals.shape[1] + 1)
 
     def loss(self, calibration: Calibration) -> float:
@@ -271,7 +271,7 @@ def loss(
 
     Args:
         data: predictions of held-out objects.
-        calibration: to be judged.
+        calibration: to evaluate.
         rng: source of all random numbers.
         n_views: largest number of views that are fused.
         walks: number of random walks of each kind over every object.
@@ -323,7 +323,7 @@ def fit_risk(
 def _promise(sure: Float, wrong: Mask, weights: Float, delta: float) -> Float:
     """Return the guaranteed error rate of each threshold, (T,).
 
-    Confidences and mistakes are (walks * N, views).
+    Confidences and errors are (walks * N, views).
     """
     promised = np.ones(len(PROMISED_THRESHOLDS))
     worst = 0.0
@@ -366,18 +366,18 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
 
 
 RADII = np.geomspace(0.02, 20, 93)  # metres; steps of 7.8 %
-# share of the objects of a class that may have any size: toys, and models in wrong units
+# share of the objects of a class with an arbitrary size: toys, and models in wrong units
 ANY_SIZE = 0.05
 
 
 @dataclass(frozen=True)
 class FittedSize:
-    """What ``fit_size`` wrote into the card.
+    """Result of ``fit_size``.
 
     Attributes:
         size: the sizes of each class.
-        objects: number of objects that the sizes come from.
-        weighed_on: number of other objects that the weight was fitted to.
+        objects: number of objects that define the sizes.
+        weighed_on: number of other objects that define the weight.
         before: negative log-likelihood of single views without the size.
         after: the same with the size.
     """
@@ -394,16 +394,16 @@ def fit_size(
     predictions: Path,
     card: Path,
 ) -> FittedSize:
-    """Fit the sizes of the objects of each class, for stores and cameras that know the scale.
+    """Fit the sizes of the objects of each class, for stores and cameras with a known scale.
 
     The result is written into the card. Run nextview predict again to update existing predictions;
     it does not run the networks again.
 
     Args:
-        store: view store that knows the unit of its meshes (nextview render --unit). The fit
-            uses its training objects, except those in the predictions.
+        store: view store with a known unit of its meshes (nextview render --unit). The fit uses its
+            training objects, except those in the predictions.
         predictions: predictions of training objects that the recogniser has not seen (nextview
-            predict --held-out). They determine the weight of the size beside the shape.
+            predict --held-out). They determine the weight of the size relative to the shape.
         card: card of the recogniser, into which "size" is written.
     """
     views = ViewStore.open(store)
@@ -471,7 +471,7 @@ def densities(radii: Float, labels: Index, classes: int) -> Float:
         logs = np.log(radii[labels == c])
         if len(logs) < 2 or np.ptp(logs) == 0:
             raise DatasetError("every class needs objects of several sizes")
-        # the deviation of a Gaussian with these quartiles
+        # standard deviation of a Gaussian with these quartiles
         middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34
         deviation = logs.std(ddof=1)
         width = len(logs) ** -0.2 * (min(middle, deviation) or deviation)
@@ -485,7 +485,7 @@ def fit_weight(
     radii: Float,
     log_density: Float,
 ) -> tuple[SizeEvidence, float, float]:
-    """Fit the weight of the size beside the logits of single views.
+    """Fit the weight of the size relative to the logits of single views.
 
     The temperature is fitted together with the weight.
 
@@ -522,12 +522,12 @@ def fit_weight(
 
 @dataclass(frozen=True)
 class FittedValleys:
-    """What ``fit_valleys`` wrote into the card.
+    """Result of ``fit_valleys``.
 
     Attributes:
         classes: for which the valley is the better view.
-        gains: by how much, for each class.
-        objects: number of objects that they were chosen by.
+        gains: of the valley over the peak, for each class.
+        objects: number of objects in the fit.
     """
 
     classes: tuple[str, ...]
@@ -581,9 +581,9 @@ def valley_gains(
     maps: Floats,
     labels: Index,
 ) -> dict[int, float]:
-    """Return what the valley of a map gains over its peak for each class.
+    """Return the gain of a map's valley over its peak for each class.
 
-    The gain is that of the belief in the truth after the second view.
+    The gain is that of the belief in the true class after the second view.
 
     Args:
         sphere: the viewpoints.
@@ -592,7 +592,7 @@ def valley_gains(
         labels: true classes, (N,) int64.
 
     Returns:
-        Mean gain by the index of the class.
+        Mean gain by class index.
     """
     n, v, classes = logits.shape
     objects = np.repeat(np.arange(n), v)
@@ -610,7 +610,7 @@ def valley_gains(
 
     def belief_in_truth(valley_classes: tuple[int, ...]) -> Float:
         policy = MapPeak(sphere, "map", valley_classes)
-        second = policy.next_views(state, np.random.default_rng(0))  # it draws nothing
+        second = policy.next_views(state, np.random.default_rng(0))  # deterministic
         return fuse(np.stack([seen, logits[objects, second]], 1))[
             np.arange(n * v),
             labels[objects],

@@ -1,4 +1,4 @@
-"""Export finished runs: an ONNX file with half-precision weights, and its card."""
+"""Export finished runs as an ONNX file with half-precision weights, and a card."""
 
 import logging
 import warnings
@@ -53,7 +53,7 @@ SMALL_WEIGHT = 2**17
 
 
 class ShippedRecogniser(nn.Module):
-    """The exported recogniser: from input bytes to the mean logits and all features."""
+    """The exported recogniser: from input bytes to mean logits and all features."""
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class ShippedRecogniser(nn.Module):
 
 
 class ShippedMap(nn.Module):
-    """The exported map network: the map of the window and, if it has it, of the sphere."""
+    """The exported map network: the map of the window and, if available, of the sphere."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -119,8 +119,8 @@ def export_onnx(
         outputs: names of the outputs.
         path: of the file.
         bits: of each weight: 8, 16 or 32.
-        sides: multiple of which the last two sizes of the input may be any; None for those of the
-            example.
+        sides: the last two dimensions of the input may be any multiple of this number; None for
+            those of the example.
     """
     free = {0: torch.export.Dim("batch")}
     if sides is not None:
@@ -128,7 +128,7 @@ def export_onnx(
             axis: sides * torch.export.Dim(name)
             for axis, name in ((2, "rows"), (3, "columns"))
         }
-    # it warns that torchvision is not installed
+    # suppress a warning that torchvision is not installed
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -145,7 +145,7 @@ def export_onnx(
     model = program.model_proto
     if bits < 32:
         _shrink(model.graph, bits)
-    # The exporter notes source lines and stack traces of the machine.
+    # Remove source lines and stack traces that the exporter adds.
     graph = model.graph
     for part in (
         model,
@@ -164,7 +164,7 @@ def export_onnx(
 
 
 def _shrink(graph: onnx.GraphProto, bits: int) -> None:
-    """Store large float32 weights in 16 or 8 bits and widen them where they are used."""
+    """Store large float32 weights in 16 or 8 bits and convert them back where they are used."""
     nodes = []
     scales = []
     for weight in graph.initializer:
@@ -205,11 +205,11 @@ def _shrink(graph: onnx.GraphProto, bits: int) -> None:
 
 @dataclass(frozen=True)
 class Exported:
-    """A model that was exported.
+    """An exported model.
 
     Attributes:
         card: path of its card.
-        difference: largest difference between the answers of torch and of ONNX on real views.
+        difference: largest difference between the outputs of torch and of ONNX on real views.
     """
 
     card: Path
@@ -218,12 +218,12 @@ class Exported:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A network that is to ship, and how its file is judged.
+    """A network to be exported, and the data that verify its file.
 
     Attributes:
         sample: views on which file and network are compared.
         judging: validation objects.
-        seen: views of an object, as the network takes them.
+        seen: returns the views of an object as network input.
         scores: of the answers for these objects, (N, V, ...).
     """
 
@@ -235,7 +235,7 @@ class _Candidate:
     scores: Callable[[Float32], dict[str, Any]]
 
     def answers(self, card: Path) -> Callable[[NDArray], Float32]:
-        """From views to what the file says of them."""
+        """Return a function from views to the outputs of the file."""
         if self.card.is_recogniser:
             recogniser = NetworkRecogniser(card)
             return lambda seen: recogniser.from_inputs(seen).logits
@@ -260,18 +260,18 @@ def export_recogniser(
 
     Args:
         run: folder of a run of nextview train recogniser.
-        store: view store that it was trained on.
+        store: view store on which it was trained.
         out: folder for NAME.onnx and NAME.json.
-        ensemble: further runs on the same store and input, whose logits are averaged with those of
-            RUN.
+        ensemble: further runs with the same store and input, whose logits are averaged with those
+            of RUN.
         bits: bits per weight in the file.
         name: name of the model; by default recogniser-DATASET, after the mesh folder of the store.
         note: text to add to the card.
         overwrite: replace an existing model.
 
     Raises:
-        ModelError: a run is not finished or of another store, runs do not fit together, or the
-            file's answers differ.
+        ModelError: a run is not finished or used another store, runs are not compatible, or the
+            outputs of the file differ.
         ResultsError: the model exists.
     """
     folders = run, *ensemble
@@ -336,7 +336,7 @@ def run_network(
     Args:
         run: folder of the run.
         recipe: of the run.
-        views: the view store that it was trained on.
+        views: view store of the training.
 
     Returns:
         The network, in evaluation mode.
@@ -356,13 +356,13 @@ def export_map(
     overwrite: bool = False,
     track: TrackProgress = silently,
 ) -> Exported:
-    """Export a trained map network: ONNX, with a card of its validation scores.
+    """Export a trained map network to ONNX with a card of its validation scores.
 
     Args:
         run: folder of a run of nextview train map.
-        store: view store that it was trained on.
+        store: view store on which it was trained.
         out: folder for NAME.onnx and NAME.json.
-        predictions: predictions that a map of the confidence was trained on.
+        predictions: for a map of the confidence: predictions on which it was trained.
         bits: bits per weight in the file.
         name: name of the model; by default MEASURE-DATASET, after the mesh folder of the store.
         note: text to add to the card.
@@ -452,7 +452,7 @@ def _export(
     overwrite: bool,
     track: TrackProgress,
 ) -> Exported:
-    """Write ONNX file and card once the file agrees with the network; both or neither."""
+    """Write ONNX file and card if the file agrees with the network; both or neither."""
     name = candidate.card.name
     sample = candidate.sample
     if Path(name).name != name:

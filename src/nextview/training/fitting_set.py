@@ -1,4 +1,4 @@
-"""Predictions for fits: never of the test split, nor of the recogniser's training objects."""
+"""Predictions for fits, which never contain the test split or the recogniser's training objects."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,15 +22,15 @@ from nextview.types import Floats, Index
 
 
 def hold_out(labels: Index, measured: Floats, folds: int, seed: int) -> list[Index]:
-    """Divide objects into parts of which each is held out from one network.
+    """Divide objects into parts, each of which is held out from one network.
 
     Every class is spread evenly; copies of a shape stay together.
 
     Args:
         labels: class of each object, (N,).
-        measured: depth entropy of the views, (N, V), by which copies are found.
+        measured: depth entropy of the views, (N, V), which identifies copies.
         folds: number of parts.
-        seed: of the draw.
+        seed: of the random division.
 
     Returns:
         Index of the objects of each part.
@@ -45,16 +45,18 @@ def hold_out(labels: Index, measured: Floats, folds: int, seed: int) -> list[Ind
         )
     rng = np.random.default_rng([seed, folds])
     group = duplicate_groups(measured)
-    # one object stands for its group
+    # one object represents its group
     first = rng.permutation(np.unique(group, return_index=True)[1])
-    first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
+    first = first[
+        np.argsort(labels[first], kind="stable")
+    ]  # distributed class by class
     fold_of_group = np.empty(len(first), np.int64)
     fold_of_group[group[first]] = np.arange(len(first)) % folds
     return [np.flatnonzero(fold_of_group[group] == k) for k in range(folds)]
 
 
 def for_fitting(predictions: Predictions) -> Predictions:
-    """The predictions; PredictionsError if they hold objects of the test split."""
+    """Return the predictions; PredictionsError if they contain objects of the test split."""
     if (predictions.splits == "test").any():
         raise PredictionsError(
             "these predictions hold objects of the test split, to which nothing may be fitted"
@@ -104,7 +106,7 @@ def blind_walks(
     n_views: int,
     rng: np.random.Generator,
 ) -> Index:
-    """Return the views of a policy that knows only where it has been.
+    """Return the views of a policy that uses only its previous views.
 
     Args:
         sphere: the viewpoints.
@@ -135,14 +137,14 @@ def card_to_fit(
     path: Path,
     recogniser: bool = True,
 ) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
-    """Open a card for a fit; only one run may do so at a time.
+    """Open a card for a fit, with a lock against other runs.
 
     Args:
         path: of the card.
         recogniser: whether it must be the card of a recogniser.
 
     Yields:
-        The card, and ``write(name, about, sources, **fields)``, which writes what was fitted to
+        The card, and ``write(name, about, sources, **fields)``, which writes the result of a fit to
         sources.
 
     Raises:

@@ -51,15 +51,16 @@ with extras():
     import torch
     from torch import Tensor, nn
 
-# policies, one for each fold, and their mean value
+# policies, one per fold, and their mean value
 Best = tuple[tuple[Gain, ...], Value]
 BOUND = 1e-5
-"""Largest difference of the file's answers from those of the networks in double precision, relative
-to the largest answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
+"""Largest allowed difference between the outputs of the file and of the networks in double
+precision, relative to the largest output above 1. For gains this is a fiftieth of the lowest travel
+weight."""
 
 
 class Perceptrons(nn.Module):
-    """Perceptrons averaged over an object and its mirror image: (B, D) to cells (B, V)."""
+    """Perceptrons averaged over an object and its mirror image: (B, D) to cells, (B, V)."""
 
     def __init__(
         self,
@@ -75,7 +76,7 @@ class Perceptrons(nn.Module):
         self.register_buffer("cells_flip", torch.as_tensor(cells_flip))
 
     def each(self, x: Tensor) -> Tensor:
-        """Of each perceptron, without the mirror image, (E, B, V)."""
+        """Return the outputs of each perceptron, without the mirror image, (E, B, V)."""
         x = x.expand(len(self.weights[0]), *x.shape)
         for i, (weights, bias) in enumerate(
             zip(self.weights, self.biases, strict=True)
@@ -90,7 +91,7 @@ class Perceptrons(nn.Module):
 
 
 class RowByRow(nn.Module):
-    """``Perceptrons`` as they ship: every row is a product of its own, (1, in) by (in, out)."""
+    """``Perceptrons`` as exported: every row is a separate product, (1, in) by (in, out)."""
 
     def __init__(self, networks: Perceptrons) -> None:
         super().__init__()
@@ -100,8 +101,8 @@ class RowByRow(nn.Module):
         n = self.networks
         x = torch.stack([told, told[:, n.features_flip]], 1)[:, :, None, None]
         for i, (weights, bias) in enumerate(zip(n.weights, n.biases, strict=True)):
-            # Twice the weights: with one perceptron they would be a matrix, and all rows one
-            # product.
+            # The weights are duplicated, as a single perceptron would be one matrix product for
+            # all rows.
             x = (
                 torch.matmul(
                     torch.relu(x) if i else x,
@@ -114,7 +115,7 @@ class RowByRow(nn.Module):
 
 @dataclass(frozen=True)
 class Score:
-    """The score of a ``Gain`` by networks in torch.
+    """The score of a ``Gain``, computed by networks in torch.
 
     Attributes:
         networks: perceptrons whose mean is the score.
@@ -135,7 +136,7 @@ def walk(
     recipe: GainRecipe,
     rng: np.random.Generator,
 ) -> list[NDArray]:
-    """Collect the states that policies meet when each is followed once over every object.
+    """Collect the states when each policy is followed once over every object.
 
     Args:
         table: the objects.
@@ -144,8 +145,8 @@ def walk(
         rng: source of all random numbers.
 
     Returns:
-        Of S states: features, (S, D) float32; value of each choice less the mean over the free
-        ones, (S, V) float32, with cells as in ``policies.learned_tables``; which are free, (S, V)
+        For S states: features, (S, D) float32; value of each choice minus the mean over the free
+        ones, (S, V) float32, with cells as in ``policies.learned_tables``; free choices, (S, V)
         bool; and the objects, (S,) int64.
     """
     sphere = table.data.sphere
@@ -189,7 +190,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     Args:
         table: the objects of the fold.
         recipe: of the training.
-        fold: number of the fold, which together with the seed decides all draws.
+        fold: number of the fold, which together with the seed determines all random numbers.
 
     Yields:
         After every epoch the policy, at travel weight 0 and over all views.
@@ -268,7 +269,7 @@ def best_epoch(
     tables: Sequence[ReplayTable],
     recipe: GainRecipe,
 ) -> Iterator[Best]:
-    """Follow the trainings of all folds and keep the best epoch.
+    """Run the training of all folds and keep the best epoch.
 
     Args:
         folds: the trainings, see ``train``.
@@ -295,7 +296,7 @@ def best_epoch(
 
 
 def averaged(policies: Sequence[Gain]) -> Gain:
-    """One policy whose networks are those of all."""
+    """Combine policies into one with the networks of all."""
     networks = [
         policy.score.networks for policy in policies if isinstance(policy.score, Score)
     ]
@@ -318,13 +319,13 @@ def averaged(policies: Sequence[Gain]) -> Gain:
 
 
 def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -> float:
-    """Write a trained policy, NAME.onnx and NAME.json, replacing files of these names.
+    """Write a trained policy to NAME.onnx and NAME.json, replacing existing files.
 
     Args:
         card: path of the card.
         policy: the policy.
         about: content of the card.
-        features: of states by which the exported network is compared, (S, D) float32.
+        features: states on which the exported network is compared, (S, D) float32.
 
     Returns:
         Largest difference between the networks in torch and in ONNX.
@@ -351,7 +352,7 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -
             {FEATURES_INPUT: features.astype(np.float32)},
         )[0]
 
-        # what is written has to answer as what was trained
+        # the exported file must agree with the trained networks
         difference = float(np.abs(answers - expected).max())
         if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
             differ = f"differ by {difference:.2g} from the networks'"
@@ -372,16 +373,16 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -
 
 @dataclass(frozen=True)
 class TrainedGain:
-    """A gain policy that was trained and written.
+    """A trained and exported gain policy.
 
     Attributes:
         card: path of its card.
-        objects: number of objects that it was trained on.
-        validated_on: objects that it was validated on, in words.
+        objects: number of training objects.
+        validated_on: description of the validation objects.
         value: mean objective after 2, 3, ... views at travel weight 0, (views - 1,).
         travel_weight: the chosen weight of travel.
         states: number of states in which the exported file was compared with the networks.
-        difference: largest difference of its answers from those of the networks.
+        difference: largest difference of its outputs from those of the networks.
     """
 
     card: Path
@@ -412,24 +413,24 @@ def train_gain(
     Args:
         predictions: predictions of training objects that the recogniser has not seen (nextview
             predict --held-out).
-        out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
-        validation: predictions of other such objects, which choose the epoch and the travel weight.
-            By default PREDICTIONS choose them, in folds.
+        out: card to write (NAME.json); the networks are written next to it (NAME.onnx).
+        validation: predictions of other such objects, which select the epoch and the travel weight.
+            By default PREDICTIONS select them by cross-validation.
         folds: without VALIDATION: number of folds; one policy is trained without each fold and
             validated on it, and the result is the mean of all.
         travel_weight: weight of a grid cell of travel; by default the lowest at which the policy
             travels no farther than a random walk in the local window.
         local: choose only views of the local window.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to
-            learn from as well.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), as
+            additional training data.
         overwrite: replace existing files.
 
     Raises:
         UsageError, ResultsError: the card is not called NAME.json, or exists.
-        PredictionsError: the predictions lack what the recipe takes, are of the test split or do
-            not belong together.
-        DatasetError, ModelError: there are too few objects for the folds; or the ONNX file's
-            answers differ.
+        PredictionsError: the predictions lack inputs of the recipe, are of the test split or do not
+            belong together.
+        DatasetError, ModelError: there are too few objects for the folds; or the outputs of the
+            ONNX file differ.
     """
     if out.suffix != ".json":
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
@@ -477,10 +478,10 @@ def train_gain(
 
 @dataclass(frozen=True)
 class _Data:
-    """What is learned from, and what validates: tables side by side, one pair for each fold.
+    """Training and validation data, as parallel lists with one pair for each fold.
 
     Attributes:
-        about: of a policy that is trained on it, as yet without its table.
+        about: card of a policy trained on it, without its table.
     """
 
     learned: list[ReplayTable]
@@ -497,7 +498,7 @@ def _sources(
     sensed: Sequence[Path],
     recipe: GainRecipe,
 ) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
-    """Open and check what is learned from and what it is judged on."""
+    """Open and check training and validation data."""
     table = Predictions.load(predictions).deduplicate()
     other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
@@ -533,7 +534,7 @@ def _load(
     table, other, variants, sources = _sources(predictions, validation, sensed, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        # of few objects each has a fold of its own
+        # few objects have one fold each
         folds = min(folds, len(np.unique(_shapes(table), axis=0)))
         validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
@@ -590,12 +591,12 @@ def _shapes(p: Predictions) -> Floats:
 
 
 def _targets(p: Predictions) -> list[str]:
-    """Names of the objects, without their scenes."""
+    """Return the names of the objects, without their scenes."""
     return [name.partition("@")[0] for name in p.names]
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
-    """Refuse predictions without what the policy is to take from them."""
+    """Reject predictions that lack inputs of the policy."""
     lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
     if lacking:
         known = ", ".join((*INPUTS, VISIBILITY, *in_order(p.maps)))

@@ -1,4 +1,4 @@
-"""Network inputs of a whole store, computed once and kept beside it."""
+"""Network inputs of a whole store, computed once and stored next to it."""
 
 import os
 import time
@@ -24,7 +24,7 @@ from nextview.recognition.network_input import (
 )
 from nextview.types import Index
 
-# views are mostly background and flat faces: a sixth is left, or less
+# views are mostly background and flat faces, and compress to a sixth or less
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
 AGAIN = "delete it, and it is made again"
 
@@ -65,7 +65,7 @@ class PackedViews:
 
 
 def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
-    """Return the folder in which the inputs of a store are kept.
+    """Return the folder with the inputs of a store.
 
     Args:
         store: path of the view store.
@@ -88,18 +88,18 @@ def ready_inputs(
     kind: InputKind = "geometry",
     track: TrackProgress = silently,
 ) -> PackedViews:
-    """Return the inputs of a store and compute them if they are not there.
+    """Return the inputs of a store, which are computed if they do not exist.
 
     Args:
         path: of the view store.
         size: side of the inputs, pixels.
         kind: of the inputs.
-        track: follows the computation.
+        track: callable that shows progress.
 
     Returns:
         Inputs, (N, V, C, size, size) uint8.
     """
-    # not above: the processes that compute inputs need no torch
+    # imported here, because the worker processes need no torch
     from nextview.training.runs import is_first
 
     target = inputs_path(path, size, kind)
@@ -117,13 +117,13 @@ def ready_inputs(
 
 
 def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
-    """Compute and write the inputs of all objects; yields how many are done."""
+    """Compute and write the inputs of all objects; yields the number of finished ones."""
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done).tolist()
 
     for first in chosen[
         :1
-    ]:  # a size that the views do not have is refused before anything is made
+    ]:  # raises an error for an unsupported size before any file is written
         from_store(spec, store, first)
     places = np.zeros((len(store), len(store.sphere), 2), np.int64)
     with new_folder(target) as part:
@@ -155,7 +155,7 @@ def _packed(path: Path, spec: InputSpec, i: int) -> list[bytes]:
 
 
 def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
-    """Load the inputs of a store that ``ready_inputs`` computed.
+    """Load the inputs of a store that ``ready_inputs`` has computed.
 
     Args:
         path: of the view store.

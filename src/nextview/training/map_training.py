@@ -1,4 +1,4 @@
-"""Train a map network, which predicts one value for every view, from a view store."""
+"""Train a map network, which predicts the value of every view, from a view store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,12 +36,12 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-# of N objects from V views, what the network sees
+# network inputs of N objects from V views
 NetworkViews = NDArray[Any] | PackedViews
 
 
 class Windows(OwnBatches):
-    """Batches of inputs and maps, (B, rings, columns), drawn from values, (N, V)."""
+    """Batches of inputs and maps, (B, rings, columns), taken from values, (N, V)."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Windows(OwnBatches):
         n = len(self) * self.batch
         v = len(self.poses)
         batch = self.batch
-        # every object as often as any other, and each of its views before one comes again
+        # all objects equally often, and each of their views once before any is repeated
         if self.training:
             turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
             views = np.resize(
@@ -85,7 +85,7 @@ class Windows(OwnBatches):
             order = rng.permutation(len(views))[:n]
             objects = objects[order]
             views = views[order]
-        else:  # the same spread of views every time
+        else:  # the same evenly spread views every time
             objects = np.repeat(self.objects, self.recipe.views_per_object)[:n]
             views = (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
@@ -104,7 +104,7 @@ class Windows(OwnBatches):
             target = self.values[o[:, None, None], self.around[w]]
             if self.recipe.input == "cloud":
                 seen = cloud_input(seen[:, points].astype(np.float32), self.poses[w])
-                # y runs to the left of the camera; the mirror stands in the cloud's own middle.
+                # y points to the left of the camera; the cloud is mirrored about its centre.
                 y = seen[m][..., 1]
                 seen[m, :, 1] = y.max(1, keepdims=True) + y.min(1, keepdims=True) - y
             else:
@@ -116,12 +116,12 @@ class Windows(OwnBatches):
 def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
     """Return the loss of the predicted peak.
 
-    It is the mean negative log-likelihood that a cell drawn by its logit is near the true peak.
+    It is the mean negative log-likelihood that a cell sampled by its logit is near the true peak.
 
     Args:
         logits: of the cells, (B, rings, columns).
         goal: the true map, (B, rings, columns).
-        reach: distance from the true peak that still counts, cells.
+        reach: largest accepted distance from the true peak, cells.
 
     Returns:
         The loss, a scalar.
@@ -222,7 +222,9 @@ def train_map(
     hardware: Hardware = Hardware(),
     track: TrackProgress = silently,
 ) -> list[Path]:
-    """Train a network that predicts a measure of the views around one; resumes.
+    """Train a network that predicts a measure of the surrounding views from one view.
+
+    An interrupted run resumes.
 
     Args:
         store: view store made by nextview render, with the 40 views and the measure (nextview
@@ -231,12 +233,12 @@ def train_map(
             squared error.
         predictions: for --measure confidence: predictions of the store's training split by the
             recogniser whose confidence is to be predicted.
-        weights: folder of a finished run from which a ResNet of the same depth and input starts:
-            that of a recogniser, or that of a map network to continue.
+        weights: folder of a finished run whose weights initialise a ResNet of the same depth and
+            input: that of a recogniser, or that of a map network to continue.
 
     Raises:
-        DatasetError: the store lacks what it takes, or another process trains in the same folder.
-        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` holds
+        DatasetError: the store lacks required data, or another process trains in the same folder.
+        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` contains
             another run.
     """
     views = ViewStore.open(store)
@@ -250,7 +252,7 @@ def train_map(
         validation,
         "" if there.all() else ": of the others no map is known",
     )
-    held_out = [views.names[i] for i in aside[1]]  # those without values too
+    held_out = [views.names[i] for i in aside[1]]  # including objects without values
     run = new_run(
         recipe,
         weights,
@@ -302,7 +304,7 @@ def target_of(
     store: ViewStore,
     predictions: Predictions | None = None,
 ) -> tuple[NDArray, NDArray]:
-    """Return the values that a map network learns.
+    """Return the target values of a map network.
 
     Args:
         measure: name of the measure, or "confidence".
@@ -311,7 +313,7 @@ def target_of(
 
     Returns:
         Values of all views, (N, V), scaled to 0 to 1 over each object's views (the confidence is
-        not scaled); and which objects have them, (N,) bool.
+        not scaled); and the objects that have values, (N,) bool.
 
     Raises:
         UsageError: there are no predictions for the confidence, or predictions for another measure.

@@ -1,6 +1,6 @@
-"""How the bundled models are trained; a comment beside a field is its help.
+"""Training recipes. The docstring of an attribute is its help on the command line.
 
-No torch: the command line reads it.
+This module does not import torch, as the command line uses it.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ class Hardware:
     """Devices and precision; see docs/training.md for several devices.
 
     Attributes:
-        devices: number of processes, each with its own GPU if there are any; they share every
-            batch.
-        accelerator: "auto" uses GPUs if there are any.
+        devices: number of processes, each with its own GPU if available; every batch is divided
+            among them.
+        accelerator: "auto" uses GPUs if available.
         precision: use 16-mixed on GPUs older than Ampere.
     """
 
@@ -48,7 +48,7 @@ def _check(
 
 @dataclass(frozen=True)
 class RecogniserRecipe:
-    """How the recogniser is trained.
+    """Training of the recogniser.
 
     Attributes:
         network: ResNet, or EfficientNet-Lite0 with a fifth of the computation of a ResNet-18.
@@ -62,25 +62,25 @@ class RecogniserRecipe:
         lr: peak learning rate of AdamW.
         weight_decay: weight decay of AdamW.
         smoothing: label smoothing.
-        azimuth_bins_weight: weight of the loss of the azimuth bin beside that of the class; 0 for
-            no bins. All objects of a class must have the same orientation in their files, as in
-            ModelNet10.
+        azimuth_bins_weight: weight of the loss of the azimuth bin relative to that of the class; 0
+            for no bins. All objects of a class must have the same orientation in their files, as
+            in ModelNet10.
         validation_share: share of the training split that is held out for validation.
         deformed_share: probability that a view is drawn from the deformed objects, if there are
             any.
         seed: seed of all random draws.
-        ensemble_seed: seed of the initial weights and draws of one network of an ensemble; --seed
-            decides the validation objects of all.
+        ensemble_seed: seed of the initial weights and random numbers of one network in an ensemble;
+            --seed determines the validation objects of all.
         input: input of the network: the geometry that a depth camera measures, or a shaded image.
         augment: by default views are augmented: mirrored, shifted, scaled, partly hidden.
-        balanced: by default rare classes are drawn more often; otherwise every view is drawn once
+        balanced: by default rare classes are drawn more often; otherwise every view is used once
             in turn.
         lr_schedule: schedule of the learning rate: one cycle up and down, or halved every fifth
             epoch.
         patience: stop after so many epochs without a better class mean on validation; 0 never stops
             early.
         interpolation: position of the final weights between the initial (0) and the trained ones
-            (1). Less than 1 keeps more of what the network learned before (Wortsman et al., "Robust
+            (1). Values below 1 retain more of the initial network (Wortsman et al., "Robust
             fine-tuning of zero-shot models", CVPR 2022).
     """
 
@@ -129,23 +129,23 @@ THESIS_RECOGNISER = RecogniserRecipe(
     balanced=False,
     lr_schedule="halving",
 )
-"""As published (thesis, section 5.1). The epochs and the validation part are ours: the text names
-neither, and its map networks settle around the tenth epoch (section 6.2.2)."""
+"""As published (thesis, section 5.1). The number of epochs and the validation share are not stated
+there; the map networks of the thesis converge around the tenth epoch (section 6.2.2)."""
 
 
 @dataclass(frozen=True)
 class MapRecipe:
-    """How a map network is trained.
+    """Training of a map network.
 
     Attributes:
-        measure: measure of views that is predicted: one that the store holds (nextview measure), or
-            "confidence", the belief of the recogniser in its answer, and 0 where the answer is
-            wrong, which needs --predictions.
+        measure: measure to predict: one in the store (nextview measure), or "confidence", the
+            belief of the recogniser in its answer, and 0 if the answer is wrong, which needs
+            --predictions.
         input: input of the network: the geometry of the view for a ResNet, or the partial cloud for
             a PointNet, as published.
         layers: number of layers of the ResNet.
         size: side of the ResNet's input image, pixels.
-        points: number of points drawn from each cloud in training; validation and use take all
+        points: number of points sampled from each cloud in training; validation and use take all
             1,024.
         extent: predicted views: the local window, or all views.
         epochs: passes over the training objects.
@@ -154,8 +154,8 @@ class MapRecipe:
         lr: peak learning rate of AdamW.
         weight_decay: weight decay of AdamW.
         orthogonality_weight: weight of the orthogonality terms of the PointNet's transforms.
-        peak_weight: weight of the cross-entropy of the window's highest cell, beside the squared
-            error of all cells.
+        peak_weight: weight of the cross-entropy of the window's highest cell, relative to the
+            squared error of all cells.
         peak_sharpness: for --peak-weight: values are divided by it to give log-odds.
         peak_reach: for --peak-weight: 0 for the highest cell alone, 1 for its four neighbours too.
         mirror: by default half of the views are mirrored left to right, with their maps.
@@ -208,15 +208,15 @@ THESIS_MAP = MapRecipe(
     mirror=False,
     lr_schedule="tenth",
 )
-"""As published (thesis, sections 2.2.3 and 5.1): PointNet, every view once an epoch.
+"""As published (thesis, sections 2.2.3 and 5.1): PointNet, every view once per epoch.
 
-The epochs are ours.
+The number of epochs is our choice.
 """
 
 
 @dataclass(frozen=True)
 class GainRecipe:
-    """How the gain policy is trained.
+    """Training of the gain policy.
 
     Attributes:
         inputs: inputs of the networks: belief, view, place, azimuth_bin and any maps of the
@@ -226,10 +226,10 @@ class GainRecipe:
             needs a recogniser with azimuth bins.
         objective: value of a view: the belief in the true class after it, its logarithm, or whether
             the answer is right.
-        max_views: number of views in an episode; the values of the second to this one are learned.
+        max_views: number of views in an episode; values are learned from the second view on.
         hidden: width of the two hidden layers.
-        networks_per_fold: networks that are averaged in each fold; each weights the objects by a
-            bootstrap draw of its own.
+        networks_per_fold: networks that are averaged in each fold; each is trained with its own
+            bootstrap weights of the objects.
         epochs: number of epochs, each with new episodes of all objects.
         episodes: episodes of each object in one epoch.
         batch: states per step.
@@ -258,18 +258,18 @@ class GainRecipe:
 
 @dataclass(frozen=True)
 class SegmentationRecipe:
-    """How the segmentation network is trained.
+    """Training of the segmentation network.
 
     Attributes:
-        frames: simulated frames to learn from.
+        frames: number of simulated training frames.
         width: channels of the first layers; the deeper ones have up to four times as many.
         epochs: passes over the frames.
         batch: frames per step.
-        lr: peak learning rate of AdamW; it rises over the first steps and falls as a cosine.
+        lr: peak learning rate of AdamW, with warm-up and cosine decay.
         weight_decay: weight decay of AdamW.
-        validation_share: share of the meshes that is held out for validation, and number of the
-            frames that are drawn for it, as a share of --frames.
-        seed: seed of all random draws, those of the frames too.
+        validation_share: share of the meshes that is held out for validation, and number of
+            validation frames relative to --frames.
+        seed: seed of all random numbers, including those of the frames.
         patience: stop after so many epochs without a lower loss on validation; 0 never stops early.
     """
 

@@ -1,4 +1,4 @@
-"""The stage from a view store to a trained recogniser."""
+"""Train a recogniser from a view store."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,11 +37,11 @@ with extras():
 
 @dataclass(frozen=True)
 class StoredInputs:
-    """Where views of the training objects come from: their own store or one of deformed copies.
+    """Inputs of training objects, from their own store or from one of deformed copies.
 
     Attributes:
         inputs: (rows, V, C, S, S).
-        row: of each object in the inputs, -1 for none.
+        row: row of each object in the inputs, -1 for none.
         azimuth_bins: (rows, V).
     """
 
@@ -51,7 +51,7 @@ class StoredInputs:
 
 
 class Views(OwnBatches):
-    """Batches of input, (B, C, S, S) uint8, label and azimuth bin, new in each epoch."""
+    """Batches of input, (B, C, S, S) uint8, label and azimuth bin, drawn anew in each epoch."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Views(OwnBatches):
         v = self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
-            turn = rng.random(n)  # of the view, as a part of all views
+            turn = rng.random(n)  # selects the view, as a share of all views
         else:
             objects, views = np.divmod(rng.permutation(len(self.objects) * v)[:n], v)
             objects = self.objects[objects]
@@ -119,7 +119,7 @@ class Views(OwnBatches):
 def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     """Mirror, shift, stretch, roll, hide and add noise to inputs, (B, C, S, S) in 0 to 1.
 
-    Which of them were mirrored is returned as well.
+    Also returns which inputs were mirrored.
     """
     b, _, _, s = x.shape
     on = {"device": x.device}
@@ -138,7 +138,7 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
         F.affine_grid(theta, list(x.shape), align_corners=False),
         align_corners=False,
     )
-    # A rectangle of background, in half of the images, as if something stood in front.
+    # A rectangle of background in half of the images, to simulate occlusion.
     side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
     corner = torch.rand(b, 2, **on) * (1 - side)
     grid = (torch.arange(s, **on) + 0.5) / s
@@ -167,7 +167,7 @@ class RecogniserModule(L.LightningModule):
         self.net = recogniser_network(recipe, classes, azimuths).to(
             memory_format=torch.channels_last
         )
-        for name in ("hits", "seen", "lost"):  # of each class in validation
+        for name in ("hits", "seen", "lost"):  # per class in validation
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
     def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
@@ -261,7 +261,7 @@ class RecogniserModule(L.LightningModule):
 
 
 class ValidationViews(OwnBatches):
-    """Every fifth view of the validation objects, shifted by one from object to object."""
+    """Every fifth view of the validation objects, with an offset of one from object to object."""
 
     def __init__(
         self,
@@ -327,7 +327,7 @@ def fit_recogniser(
         name: torch.lerp(start[name].to(values), values, recipe.interpolation)
         if values.is_floating_point()
         else values
-        for name, values in best.net.state_dict().items()  # counters stay those of the end
+        for name, values in best.net.state_dict().items()  # counters are not interpolated
     }
     best.net.load_state_dict(way)
 
@@ -347,7 +347,7 @@ def mirror_planes(store: ViewStore, objects: Index) -> Float:
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
-    # the plane through a view also holds the one opposite
+    # the plane through a view also contains the opposite view
     planes = range(max(1, n // 2))
     mirrored = [measured[:, :, (2 * plane - np.arange(n)) % n] for plane in planes]
     symmetry = np.stack([(measured * image).sum((1, 2)) for image in mirrored], 1)
@@ -358,7 +358,7 @@ def mirror_planes(store: ViewStore, objects: Index) -> Float:
 
 
 def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> Float32:
-    """Return the azimuth bin from which each view sees its object.
+    """Return the azimuth bin of each view of each object.
 
     Args:
         store: the view store.
@@ -377,7 +377,7 @@ def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> Float32:
 def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
     """Return the mean cross-entropy of the azimuth bin, given the true class.
 
-    Between two bins, both count by their nearness.
+    Azimuths between two bins are weighted linearly.
 
     Args:
         likely: log-probabilities of the bins, (B, classes, bins).
@@ -405,22 +405,24 @@ def train_recogniser(
     hardware: Hardware = Hardware(),
     track: TrackProgress = silently,
 ) -> list[Path]:
-    """Train the recogniser on the training split of a store; resumes.
+    """Train the recogniser on the training split of a store.
+
+    An interrupted run resumes.
 
     Args:
         store: view store made by nextview render.
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the best
             class mean.
         deformed: stores of the same objects or some of them, stretched and rotated (nextview render
-            --stretch .25 --rotated --seed 1 and so on) or through sensors (--sensor mix);
-            they may have other viewpoints.
-        weights: published checkpoint to start from (torchvision's of the same depth, or
-            EfficientNet-Lite0's), or folder of a run to continue, on other data or for longer.
+            --stretch .25 --rotated --seed 1 and so on) or through sensors (--sensor mix); they may
+            have other viewpoints.
+        weights: published checkpoint that initialises the network (torchvision's of the same depth,
+            or EfficientNet-Lite0's), or folder of a run to continue, on other data or for longer.
 
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.
-        ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds
-            another run.
+        ModelError: the weights cannot be used, or were trained on validation objects; or ``out``
+            contains another run.
     """
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation_share, recipe.seed)
@@ -457,7 +459,7 @@ def _source(
     planes: Float | None,
     track: TrackProgress,
 ) -> StoredInputs:
-    """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
+    """Return the inputs of a store, and the row of each object of ``views``, -1 for none."""
     rows = store.rows_of(views.names)
     if (rows[needed] < 0).all():
         raise DatasetError(f"{store.path}: holds none of the training objects")

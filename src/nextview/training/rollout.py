@@ -1,4 +1,4 @@
-"""Replay predictions: the states that a policy meets, and the value of each next view."""
+"""Replay predictions: the states of a policy's episodes, and the value of each next view."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -47,14 +47,14 @@ class ReplayTable:
     ) -> "ReplayTable":
         """Select some of the objects of predictions.
 
-        They are calibrated here if their recogniser is not.
+        If their recogniser has no calibration, it is fitted here.
 
         Args:
             predictions: of the objects.
             kept: indices of the objects.
             rng: source of all random numbers.
             sensed: predictions of the same objects through sensors.
-            scenes: in which the objects stand; None for those of the predictions.
+            scenes: scenes of the objects; None for those of the predictions.
 
         Returns:
             The table.
@@ -76,13 +76,13 @@ class ReplayTable:
 
 @dataclass(frozen=True)
 class DecisionState:
-    """N episodes, one for each object, when the next view is to be chosen.
+    """N episodes, one for each object, when the next view is chosen.
 
     Attributes:
-        state: what the policy sees.
+        state: input of the policy.
         total: sum of the log-evidence so far, (N, D).
         travel: so far, grid cells, (N,).
-        seen: weighted number of views in which anything was seen, (N,).
+        seen: weighted number of views with a visible object, (N,).
     """
 
     state: EpisodeState
@@ -218,7 +218,7 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
     Returns:
         Values, (N, V) float64.
     """
-    # a view in which nothing is seen has no weight in the sum
+    # a view without a visible object has no weight in the sum
     counts = table.data.seen.astype(np.float64)
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
     return value_after(
@@ -278,7 +278,7 @@ def judge(
     return Value(*reached)
 
 
-# tables, each with the policy that is followed over its objects
+# tables, each with a policy to follow over its objects
 Judged = Sequence[tuple[ReplayTable, Policy]]
 TRAVEL_WEIGHTS = (
     0.0,
@@ -296,7 +296,7 @@ TRAVEL_WEIGHTS = (
     0.05,
     0.1,
 )
-"""Of a grid cell of travel, in the unit of the objective."""
+"""Weights of a grid cell of travel, in the unit of the objective."""
 
 
 def judge_all(
@@ -312,7 +312,7 @@ def judge_all(
         judged: tables, each with its own policy.
         n_views: views of each episode.
         kind: one of OBJECTIVES.
-        seed: of the draws.
+        seed: of the random numbers.
         rounds: episodes with each object.
 
     Returns:
@@ -339,7 +339,7 @@ def fit_travel_weight(
         judged: tables, each with its own policy.
         n_views: views of each episode.
         kind: one of OBJECTIVES.
-        seed: of the draws.
+        seed: of the random numbers.
 
     Returns:
         The weight, value per grid cell; the largest one if all travel farther.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from pickle import UnpicklingError  # raised by torch where it refuses to unpickle
+from pickle import UnpicklingError  # raised by torch if it refuses to unpickle
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -46,14 +46,14 @@ N = TypeVar("N", bound=nn.Module)
 
 
 class OwnBatches(IterableDataset):
-    """A data set that makes its own batches from the epoch and the device's share."""
+    """A dataset that creates its own batches from the epoch and the device's share."""
 
     epoch = 0
     share = slice(None)
 
 
 class Batches(L.LightningDataModule):
-    """Sets of training and validation, each of which makes its own batches."""
+    """Training and validation datasets that create their own batches."""
 
     def __init__(self, training: IterableDataset, validation: IterableDataset) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ class Batches(L.LightningDataModule):
 
 
 def _loader(batches: IterableDataset) -> DataLoader:
-    # on a CPU a batch takes milliseconds to make, and a second to learn from
+    # on a CPU, creating a batch takes milliseconds, and a training step a second
     gpu = torch.cuda.is_available()
     ahead: dict[str, Any] = (
         {"num_workers": 1, "prefetch_factor": 4, "pin_memory": True} if gpu else {}
@@ -85,7 +85,7 @@ def _loader(batches: IterableDataset) -> DataLoader:
 
 
 class StepSeed(L.Callback):
-    """Seeds torch by epoch, step and device, so that a resumed run draws the same."""
+    """Seeds torch by epoch, step and device, so that a resumed run uses the same random numbers."""
 
     def on_train_batch_start(
         self,
@@ -94,7 +94,7 @@ class StepSeed(L.Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Seed the draws of a batch by its number, so that a resumed run repeats them.
+        """Seed torch by the number of the batch, so that a resumed run repeats its random numbers.
 
         Args:
             trainer: Lightning's trainer.
@@ -114,7 +114,7 @@ class StepSeed(L.Callback):
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints in place, so that a kill never costs the old one.
+    """Writes checkpoints atomically, so that an interruption never damages the previous one.
 
     Lightning would copy them from the system's temporary folder.
     """
@@ -125,7 +125,7 @@ class WholeCheckpoints(TorchCheckpointIO):
         path: str | Path,
         storage_options: Any = None,
     ) -> None:
-        """Write a checkpoint, complete or not at all.
+        """Write a checkpoint, completely or not at all.
 
         Args:
             checkpoint: its content.
@@ -136,24 +136,24 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 
 def save_whole(values: dict[str, Any], path: Path) -> None:
-    """Write values with torch, complete or not at all.
+    """Write values with torch, completely or not at all.
 
     Args:
-        values: the values by their names.
+        values: the values by name.
         path: of the file, which is replaced.
     """
     written = io.BytesIO()
-    # into a file it would turn a full disk into a RuntimeError
+    # written to memory first, as torch reports a full disk as a RuntimeError
     torch.save(values, written)
     with new_file(path, overwrite=True) as part:
         part.write_bytes(written.getbuffer())
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read what ``save_whole`` wrote; only tensors and containers are created."""
+    """Read a file written by ``save_whole``; only tensors and containers are created."""
     try:
         with warnings.catch_warnings():
-            # Torch warns of pickles that are not its own before it refuses them.
+            # Torch warns about foreign pickles before it rejects them.
             warnings.filterwarnings("ignore", "Detected pickle protocol")
             return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -166,7 +166,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 class Log(L.Callback):
-    """Writes a row per epoch to log/metrics.csv, and keeps the rows over a resume."""
+    """Writes a row per epoch to log/metrics.csv, and keeps existing rows when a run resumes."""
 
     def __init__(self, out: Path) -> None:
         self.path = out / "log/metrics.csv"
@@ -218,7 +218,7 @@ class Log(L.Callback):
 
 
 class Checkpoint(ModelCheckpoint):
-    """Keeps the best epoch by a score, or the last one; the folder may have been moved since."""
+    """Keeps the best epoch by a score, or the last one; the folder may be moved between runs."""
 
     def __init__(
         self,
@@ -261,22 +261,22 @@ def fit(
     mode: Literal["min", "max"],
     hardware: Hardware = Hardware(),
 ) -> L.LightningModule:
-    """Train a module by its ``recipe``.
+    """Train a module with its ``recipe``.
 
     Args:
         module: the module.
         training: batches of training data.
         validation: batches of validation data.
         out: folder of the run; an unfinished run in it is resumed.
-        select: name of the score by which the best epoch is chosen.
+        select: name of the score that selects the best epoch.
         mode: whether the lowest ("min") or the highest ("max") score is the best.
         hardware: devices and precision.
 
     Returns:
-        The module as it was after its best epoch.
+        The module after its best epoch.
     """
     recipe: Any = module.recipe
-    # The last checkpoint comes last: it holds the states of the others.
+    # The last checkpoint comes last, as it contains the states of the others.
     callbacks = [
         StepSeed(),
         Log(out),
@@ -289,7 +289,7 @@ def fit(
         )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
-        # All of them describe what is meant here: a run that resumes, and data sets that make their
+        # Lightning's warnings concern intended behaviour: resuming, and datasets that create their
         # own batches.
         warnings.filterwarnings("ignore", module="lightning")
         warnings.filterwarnings("ignore", message=".*LeafSpec")
@@ -298,7 +298,7 @@ def fit(
             precision=hardware.precision,
             accelerator=hardware.accelerator,
             devices=hardware.devices,
-            # Batch norm sees the whole batch, as on one device; torch has this for GPUs alone.
+            # Batch norm uses the whole batch, as on one device; torch supports this on GPUs only.
             sync_batchnorm=hardware.devices > 1
             and hardware.accelerator != "cpu"
             and torch.cuda.is_available(),
@@ -314,7 +314,7 @@ def fit(
         best = out / "best.ckpt"
         resume = last if last.exists() and read_checkpoint(last) else None
         try:
-            # Numbers too small for the normal format are slow on CPUs and mean nothing here.
+            # Denormal numbers are slow on CPUs and irrelevant here.
             torch.set_flush_denormal(True)
             trainer.fit(
                 module,
@@ -323,9 +323,8 @@ def fit(
                 weights_only=True,
             )
         finally:
-            torch.set_flush_denormal(False)  # it holds for the whole process
-    # Too few objects for one batch of validation leave nothing to choose by: the last epoch is
-    # kept.
+            torch.set_flush_denormal(False)  # the setting is global for the process
+    # Without a complete validation batch there is no score, and the last epoch is kept.
     module.load_state_dict(
         read_checkpoint(best if best.exists() else last)["state_dict"]
     )
@@ -335,7 +334,8 @@ def fit(
 def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[str, Any]:
     """Create the optimiser and the schedule of its learning rate.
 
-    It is AdamW with one cycle over all steps, or with a rate that falls every fifth epoch.
+    It is AdamW with a one-cycle schedule over all steps, or with a rate that falls every fifth
+    epoch.
 
     Args:
         parameters: of the network.
@@ -344,7 +344,7 @@ def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[st
         falls: factor by which the rate falls.
 
     Returns:
-        What Lightning's ``configure_optimizers`` returns.
+        The return value of Lightning's ``configure_optimizers``.
     """
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
     if recipe.lr_schedule == "one-cycle":
@@ -367,18 +367,18 @@ def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[st
 
 
 def is_first() -> bool:
-    """Whether this process is the one of a training's that writes for all of them."""
+    """Return True if this is the process that writes files for all processes of a training."""
     return rank_zero_only.rank == 0
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a run's folder says of it.
+    """Description of a run, stored in its folder.
 
     Attributes:
         recipe: settings of the training.
         weights: SHA-256 of the initial weights; None for random ones.
         held_out: names of the validation objects.
-        validation: names of the objects by which the checkpoint is selected; the same in new runs.
+        validation: names of the objects that select the checkpoint; in new runs the same.
         commands: commands that led to the run.
     """
 
@@ -407,7 +407,7 @@ def new_run(
         The description.
 
     Raises:
-        DatasetError: the initial weights were trained on a part of the validation objects.
+        DatasetError: the initial weights were trained on some of the validation objects.
     """
     before = [line for source in made for line in source.commands]
 
@@ -442,9 +442,9 @@ def new_run(
 
 
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
-    """Train a network into the folder of a run unless it is there already.
+    """Train a network into the folder of a run unless it exists already.
 
-    Other processes are kept out, except those of the other devices of this run.
+    Other processes are locked out, except those of the other devices of this run.
 
     Args:
         out: folder of the run.
@@ -452,7 +452,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
         train: trains and returns the network.
 
     Raises:
-        ModelError: the folder holds a run of another recipe, other initial weights or other
+        ModelError: the folder contains a run with another recipe, other initial weights or other
             objects.
     """
     with only_one(out) if is_first() else nullcontext():
@@ -495,7 +495,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
 
 
 def read_run(out: Path) -> Run:
-    """A finished run."""
+    """Read the description of a finished run."""
     if not (out / "run.json").exists():
         raise ModelError(f"{out}: holds no training run")
     run = read_record(out / "run.json", Run, "a training run")
@@ -548,14 +548,14 @@ def load_run(network: N, run: Path) -> N:
         network.load_state_dict(_read_state(path))
     except (
         RuntimeError
-    ):  # names every parameter that is missing, foreign or of another shape
+    ):  # names every parameter that is missing, unknown or of another shape
         raise ModelError(
             f"{path}: not the weights of the network that {run}/run.json describes"
         ) from None
     return network.eval()
 
 
-# names of parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``
+# patterns of parameter names in ports of EfficientNet to PyTorch, and names in a ``LiteNet``
 LITE_NAMES = {
     r"^_conv_": "",
     "^_blocks": "stages",
@@ -568,7 +568,7 @@ LITE_NAMES = {
 def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> None:
     """Load initial parameters into a network.
 
-    The last layers keep their values if those of the file have another shape.
+    The last layers are not loaded if those of the file have another shape.
 
     Args:
         network: the network.
@@ -588,7 +588,7 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
     own = network.state_dict()
     first = "stem.weight" if lite else "conv1.weight"
     for name, value in own.items():
-        # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches.
+        # Files from before PyTorch 0.4.1, including some of torchvision's, have no batch counters.
         lacks = name not in state and (
             name.endswith("_tracked") or name.startswith("side.")
         )
@@ -607,7 +607,7 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
     ):
         colours = state[first].shape[1]
         channels = own[first].shape[1]
-        # each colour's kernel is dealt out to the channels in turn
+        # the colour kernels are assigned to the channels cyclically
         turn = torch.arange(max(colours, channels))
         share = torch.zeros(colours, channels)
         share[turn % colours, turn % channels] = 1

@@ -1,4 +1,4 @@
-"""Export of a finished run of the segmentation network: an ONNX file and its card."""
+"""Export a finished run of the segmentation network as an ONNX file and its card."""
 
 from collections.abc import Iterator
 from copy import deepcopy
@@ -35,7 +35,7 @@ with extras():
 
 LARGEST_DIFFERENCE = 0.01  # between the outputs of torch and of the file
 FRAMES_COMPARED_WITH_TORCH = 4
-WEIGHT_BITS = (16, 32)  # the first that keep the outputs
+WEIGHT_BITS = (16, 32)  # the first one that preserves the outputs is used
 
 
 def export_segmentation(
@@ -101,7 +101,7 @@ def export_segmentation(
 def _write_weights(
     network: SegmentationNet, frames: LabelledFrames, card: Path, bits: int
 ) -> None:
-    """Write a network beside its card, which as yet says no more than what it takes and gives."""
+    """Write a network next to its card, which describes only inputs and outputs at this point."""
     weights = card.with_suffix(".onnx")
     weights.unlink(missing_ok=True)
     example = frames.example(0, None).features
@@ -118,7 +118,7 @@ def _write_weights(
 
 
 def folded(network: SegmentationNet) -> SegmentationNet:
-    """A copy of a network, in evaluation mode, with its normalisations in its convolutions."""
+    """Return a copy of a network, in evaluation mode, with batch norm folded into convolutions."""
     network = deepcopy(network).eval()
     for module in network.modules():
         for name, child in module.named_children():
@@ -132,12 +132,12 @@ def largest_difference(
     written: SegmentationNetwork,
     frames: LabelledFrames,
 ) -> float:
-    """Compare the outputs of a network and of its file on the first frames, whole and in part.
+    """Compare the outputs of a network and of its file on the first frames, whole and cropped.
 
     Args:
         network: in evaluation mode.
         written: the file.
-        frames: to compare them on.
+        frames: for the comparison.
     """
     found = 0.0
     for index in range(min(FRAMES_COMPARED_WITH_TORCH, len(frames))):

@@ -1,4 +1,4 @@
-"""Training of the segmentation network on simulated frames with labels."""
+"""Train the segmentation network on simulated frames with labels."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -33,16 +33,16 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-FILES_AT_ONCE = 6  # that are in memory, and whose frames are mixed
-WARM_UP = 200  # steps in which the learning rate rises, at most a tenth of all
-LAST_RATE = 0.01  # of the peak
-CLASS_WEIGHT = 2.0  # of its loss, beside that of pairs
-BORDER_WEIGHT = 4.0  # of pairs of different things, which are few
+FILES_AT_ONCE = 6  # files in memory, whose frames are shuffled together
+WARM_UP = 200  # steps of the warm-up, at most a tenth of all
+LAST_RATE = 0.01  # last learning rate, relative to the peak
+CLASS_WEIGHT = 2.0  # of the class loss, relative to that of pairs
+BORDER_WEIGHT = 4.0  # of pairs of different objects, which are rare
 LARGEST_GRADIENT = 5.0
 
 
 class LabelledBatches(OwnBatches):
-    """Batches of frames: mixed, mirrored and with a gravity of their own, or as they are."""
+    """Batches of frames: shuffled, mirrored and with a random up direction, or unchanged."""
 
     def __init__(
         self,
@@ -80,12 +80,12 @@ class LabelledBatches(OwnBatches):
                 )
 
     def batches(self, frames: int) -> int:
-        """Number of batches of so many frames."""
+        """Return the number of batches for a number of frames."""
         return max(1, frames // self.recipe.batch)
 
     @property
     def steps(self) -> int:
-        """Number of batches of an epoch."""
+        """Number of batches per epoch."""
         counts = [file.frames for file in self.files]
         starts = range(0, len(counts), FILES_AT_ONCE)
         return sum(self.batches(sum(counts[k : k + FILES_AT_ONCE])) for k in starts)
@@ -95,7 +95,7 @@ def batch_of(examples: Sequence[Example]) -> tuple[Tensor, ...]:
     """Stack examples; the order is that of the attributes of ``Example``.
 
     Args:
-        examples: of pictures of one size.
+        examples: of images with the same size.
     """
     rows = zip(*(vars(example).values() for example in examples), strict=True)
     return tuple(torch.from_numpy(np.stack(row)) for row in rows)
@@ -162,7 +162,7 @@ class SegmentationModule(L.LightningModule):
         return self._loss(batch, "")
 
     def validation_step(self, batch: tuple[Tensor, ...], _: int) -> None:
-        """Note the loss of a batch; see Lightning.
+        """Log the loss of a batch; see Lightning.
 
         Args:
             batch: see ``batch_of``.
@@ -187,11 +187,11 @@ class SegmentationModule(L.LightningModule):
 
 
 def rate_at(steps: int, step: int) -> float:
-    """The learning rate of a step as a share of the peak: a short rise, then a cosine.
+    """Return the learning rate of a step as a share of the peak: warm-up, then cosine decay.
 
     Args:
         steps: of the whole training.
-        step: number of the step, from 0 on.
+        step: number of the step, from 0.
     """
     rise = min(WARM_UP, max(1, steps // 10))
     fall = 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
@@ -199,7 +199,7 @@ def rate_at(steps: int, step: int) -> float:
 
 
 def files_of(run: Path, recipe: SegmentationRecipe) -> list[list[FrameFile]]:
-    """The files of frames to learn from, and of those to validate on.
+    """Return the files of training frames, and of validation frames.
 
     Args:
         run: folder of the run.
@@ -223,21 +223,22 @@ def train_segmentation(
     hardware: Hardware = Hardware(),
     track: TrackProgress = silently,
 ) -> Path:
-    """Train the network that parts a frame into things, on simulated frames; resumes.
+    """Train the network that segments frames into objects, on simulated frames.
 
     The frames show generated solids on tables, floors, shelves and belts and in bins. They are
-    drawn first, into OUT/frames.
+    generated first, into OUT/frames. An interrupted run resumes.
 
     Args:
         out: folder for frames, checkpoints, logs and network.pt, the network of the epoch with the
-            lowest loss on validation.
-        meshes: folder of further things, of any size; if it has splits, the training split is used.
-        furniture: folder of furniture of ModelNet10's classes, for rooms and backgrounds.
-        workers: number of processes that draw frames; by default one for each core.
+            lowest validation loss.
+        meshes: folder of further objects, of any size; if it has splits, the training split is
+            used.
+        furniture: folder of furniture with ModelNet10 classes, for rooms and backgrounds.
+        workers: number of processes that generate frames; by default one per core.
 
     Raises:
         DatasetError: a folder cannot be used, or another process trains in the same folder.
-        ModelError: ``out`` holds another run.
+        ModelError: ``out`` contains another run.
     """
     used, held_out = WorldMeshes.of(meshes, furniture).divided(
         recipe.validation_share, recipe.seed
@@ -267,16 +268,16 @@ def fit_segmentation(
     out: Path,
     hardware: Hardware = Hardware(),
 ) -> SegmentationNet:
-    """Train a network on frames that are drawn.
+    """Train a network on generated frames.
 
     Args:
-        files: to learn from, and to validate on.
+        files: training files, and validation files.
         recipe: of the training.
         out: folder of the run.
         hardware: devices and precision.
 
     Returns:
-        The network of the epoch with the lowest loss on validation.
+        The network of the epoch with the lowest validation loss.
     """
     training, validation = (
         LabelledBatches(part, recipe, vary)

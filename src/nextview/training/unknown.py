@@ -27,32 +27,32 @@ from nextview.training.fitting_set import card_to_fit
 from nextview.types import Float, Float32, Index
 
 REMEMBERED_VIEWS = 3
-"""Remembered views of each known object as its mesh has it, and as many of a stretched copy."""
+"""Stored views of each known object in its original shape, and as many of a stretched copy."""
 CALIBRATION_VIEWS = 5
 """Views of each held-out object, for each of ``CONDITIONS``."""
 MAX_ELEVATION = np.radians(75.0)
 """Views are drawn between the horizontal plane and this elevation."""
 DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
-"""No real object stands along the axes of a data set, and few have the proportions of one of its
-meshes.
+"""Real objects are not aligned with the axes of a dataset, and few have the proportions of one of
+its meshes.
 """
 CONDITIONS = 2 * len(DEFORMATIONS)
-"""Through the sensor and without one, each deformation: of views of a held-out object, in this
-order.
+"""Conditions of the views of a held-out object: all deformations through the sensor, then all
+without one.
 """
-QUANTILES_FITTED = 201  # of the quantiles
+QUANTILES_FITTED = 201  # number of quantiles
 
 _log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
 class FittedUnknown:
-    """What ``fit_unknown`` fitted to.
+    """Result of ``fit_unknown``.
 
     Attributes:
-        objects: how many objects are remembered.
-        held_out: how many other objects the score was calibrated on.
-        left_out: how many meshes were left out; which and why is logged.
+        objects: number of objects with stored views.
+        held_out: number of other objects, on which the score was calibrated.
+        left_out: number of meshes left out; the log gives names and reasons.
     """
 
     objects: int
@@ -73,17 +73,17 @@ def fit_unknown(
     The novelty score of a view is its distance to the nearest stored views of the training objects.
     The scores of known classes are measured on the objects that the card lists as held out. All
     objects are rotated about the vertical at random; half of them are stretched. The stored views
-    are written to NAME.novelty.safetensors beside the card, and their SHA-256 into the card. An
+    are written to NAME.novelty.safetensors next to the card, and their SHA-256 to the card. An
     interrupted run starts over.
 
     Args:
         meshes: folder of the meshes that the recogniser was trained on; its test split is not used.
         card: card of the recogniser.
-        sensor: simulated depth camera of half of the calibration views, NAME or NAME:STRENGTH.
-        seed: seed of all random draws.
-        workers: number of processes; by default one for each core.
+        sensor: simulated depth camera for half of the calibration views, NAME or NAME:STRENGTH.
+        seed: seed of all random numbers.
+        workers: number of processes; by default one per core.
     """
-    sensor_named(sensor)  # refused here, not by every object
+    sensor_named(sensor)  # raises an error before any work is done
     with card_to_fit(card) as (model, write):
         entries = [
             e
@@ -124,8 +124,8 @@ def fit_unknown(
             " turned at random and half of them stretched, half of the views through the sensor"
             f" {sensor}"
         )
-        # Killed between the two files, this leaves a card without a score, not one with the hash of
-        # another.
+        # An interruption between the two files leaves a card without a score, not one with a wrong
+        # hash.
         write("novelty", "nothing, the fit was cut off", [], novelty_sha256="")
         write(
             "novelty",
@@ -142,10 +142,10 @@ def _looked_at(
     seed: int,
     entry: Entry,
 ) -> Float32 | str:
-    """Embeddings of views of a mesh, or why there are none.
+    """Return embeddings of views of a mesh, or the reason why there are none.
 
-    Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation,
-    (deformations, views, F).
+    For a held-out object, (CONDITIONS, views, F). For any other, noise-free views of each
+    deformation, (deformations, views, F).
     """
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     try:
@@ -173,7 +173,7 @@ def _looked_at(
 def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
     """Return embeddings of views from random directions, (views, F).
 
-    They are fewer where the object is often not seen.
+    There are fewer if the object is often not visible.
     """
     tries = 4 * wanted
     elevations = rng.uniform(0, MAX_ELEVATION, tries)
@@ -194,14 +194,14 @@ def fit_novelty(
     labels: Index,
     n_views: int = CALIBRATION_VIEWS,
 ) -> Novelty:
-    """Returns a novelty score of views, calibrated on objects that are not among the known ones.
+    """Return a novelty score of views, calibrated on objects that are not among the known ones.
 
     Args:
-        known: embeddings of views to remember, (..., F).
+        known: embeddings of views to store, (..., F).
         held_out: embeddings of views of N other objects, (N, conditions, views, F); the first half
-            of the conditions through a sensor, the others without one's errors.
+            of the conditions through a sensor, the others without sensor errors.
         labels: classes of these N objects, (N,).
-        n_views: up to so many views of an object the mean score is calibrated.
+        n_views: largest number of views of an object for which the mean score is calibrated.
     """
     rows = as_stored(known.reshape(-1, known.shape[-1]))
     plain = np.array([[0, 1], [0, 1]], np.float32)

@@ -1,1 +1,1 @@
-"""Ways to look: the explorer, recordings, figures."""
+"""Interactive explorer, recordings for the Rerun viewer, and HTML pages."""

@@ -1,4 +1,4 @@
-"""What the last view of a walk showed and changed, as a piece of HTML."""
+"""HTML summary of a walk's last view."""
 
 from base64 import b64encode
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from nextview.types import Float, Mask
 from nextview.viewers.exploration import Walk
 
 MAP_CELL = 11  # side of a cell of a map, pixels
-SHOWN_CLASSES = 5  # classes of which the belief is shown
+SHOWN_CLASSES = 5  # number of listed classes
 CARD_STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
 .nv h3 {{ margin: 0 0 0.1em; font-size: 20px }}
@@ -37,7 +37,7 @@ CARD_STYLE = f"""<style>
 
 
 def walk_card(walk: Walk) -> str:
-    """The walk so far: image, maps and values, belief before and after, and every view."""
+    """Return the summary of a walk: image, maps and values, belief before and after, and all views."""
     if not walk.views:
         return (
             f'{CARD_STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view'
@@ -71,7 +71,7 @@ def walk_card(walk: Walk) -> str:
 
 
 def _pose(walk: Walk) -> str:
-    """Where the thing is, or why that is not known; nothing for models that know no geometry."""
+    """Return the pose of the object, or why it is not known; "" for models without geometry."""
     result = walk.session.result
     if result.why_no_pose:
         return f"<p>No pose: {escape(result.why_no_pose)}.</p>"
@@ -87,14 +87,14 @@ def _pose(walk: Walk) -> str:
 
 
 def preview_card(observation: Observation, walk: Walk) -> str:
-    """Describe what a camera that is being dragged would see.
+    """Describe the preview of a camera that is being dragged.
 
     Args:
-        observation: what it would see.
+        observation: preview from the camera.
         walk: the walk.
 
     Returns:
-        HTML: the picture, and the leading things as remembered from the nearest view.
+        HTML: the image, and the stored views of the leading things nearest to the camera.
     """
     direction = direction_of(observation.pose)
     nearest, _ = walk.sphere.nearest(direction)
@@ -104,12 +104,12 @@ def preview_card(observation: Observation, walk: Walk) -> str:
 
 
 def class_card(label: str) -> str:
-    """What the object is."""
+    """Return the true class of the object."""
     return f'{CARD_STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
 
 
 def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Colour a grey picture, (H, W), as (H, W, 3): things on a ground; black is empty."""
+    """Colour a grey image, (H, W), as (H, W, 3): objects on a ground; black is empty."""
     wood = np.minimum(
         np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15),
         255,
@@ -124,7 +124,7 @@ def _image(pixels: NDArray[np.uint8], width: int) -> str:
 
 
 def _figures(walk: Walk, view: View) -> str:
-    """The image, and the value of each view where they lie on rings; the highest ring on top."""
+    """Return the image, and the value of each view if views lie on rings, the highest ring on top."""
     elevation, azimuth = view.angles
     where = (
         f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° around"
@@ -162,14 +162,14 @@ def _table(rows: Iterable[Iterable[str]]) -> str:
 
 
 def geometry_card(walk: Walk, direction: Float, what: str) -> str:
-    """The two leading hypotheses as rendered from a direction, (3,), and where they differ.
+    """Render the two leading hypotheses from a direction, (3,), and mark their differences.
 
-    Nothing where no geometry is known, or only one hypothesis is left.
+    Empty if no geometry is known, or only one hypothesis is left.
 
     Args:
         walk: the episode so far.
         direction: from the object to the camera, (3,).
-        what: the view is, in the heading.
+        what: name of the view, for the heading.
     """
     rivals = walk.rival_pictures(direction)
     outlook = walk.session.outlook
@@ -192,14 +192,14 @@ def geometry_card(walk: Walk, direction: Float, what: str) -> str:
 
 
 def differing(rivals: RivalPictures) -> NDArray[np.uint8]:
-    """What shows of either hypothesis, faint, and the pixels in which they differ, (S, S, 3)."""
+    """Blend both hypotheses faintly and highlight pixels in which they differ, (S, S, 3)."""
     either: Mask = np.asarray(rivals.pictures.any(0))
     drawn = np.where(either[..., None], rgb(FAINT), rgb(GROUND))
     return np.where(rivals.different[..., None], rgb(ACCENT), drawn).astype(np.uint8)
 
 
 def rivals_card(walk: Walk, view: int | None = None) -> str:
-    """Describe the two most likely taught things as they are remembered from a view.
+    """Show the stored views of the two most likely taught things from a viewpoint.
 
     Args:
         walk: the walk.
@@ -238,7 +238,7 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
 
 
 def _beliefs(walk: Walk) -> str:
-    """The classes believed most: belief now, what this view says alone, and the change."""
+    """Return the most likely classes: belief, belief from this view alone, and the change."""
     view = walk.views[-1]
     classes = walk.session.models.classes
     rows = []
@@ -249,7 +249,7 @@ def _beliefs(walk: Walk) -> str:
     )
     highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
     counted = sum(view.observation.seen for view in walk.views)
-    # none is drawn where it is infinite
+    # an infinite threshold is not drawn
     threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
     mark = f'<b style="left:{threshold:.1f}%"></b>' if np.isfinite(threshold) else ""
 

@@ -1,4 +1,4 @@
-"""The state of the explorer: an object, one or two walks, and the policies' values."""
+"""The state of the explorer: an object, one or two walks, and the values of their policies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ class StoredViews:
         self._radius = radius if 0 < radius < np.inf else None
 
     def observe(self, pose: Float) -> Observation:
-        """The stored view nearest to a pose, (4, 4), object frame; its own pose comes with it."""
+        """Return the stored view nearest to a pose, (4, 4), object frame, with its actual pose."""
         k, _ = self.sphere.nearest(direction_of(pose))
         seen = (
             self._depth[k],
@@ -61,7 +61,7 @@ class StoredViews:
 
 @dataclass(frozen=True)
 class ShownObject:
-    """An object that can be opened by its name.
+    """An object that can be opened by name.
 
     Attributes:
         name: of the object.
@@ -109,7 +109,7 @@ def shown_objects(
             ShownObject(store.names[k], partial(StoredViews, store, k), labels[k])
             for k in rows
         )
-    # A mesh of its own, outside of class folders, has no label.
+    # A single mesh outside class folders has no label.
     return tuple(
         ShownObject(
             entry.name,
@@ -121,9 +121,9 @@ def shown_objects(
 
 
 class Walk:
-    """The views of an object so far, and what is believed after them.
+    """The views of an object so far, and the beliefs after them.
 
-    It ends after all views only.
+    In contrast to an episode, it ends only after all views.
     """
 
     def __init__(
@@ -146,12 +146,12 @@ class Walk:
 
     @property
     def views(self) -> list[View]:
-        """Those taken, in order."""
+        """Views in order."""
         return self.session.views
 
     @property
     def stopped(self) -> bool:
-        """Whether the stopping rule would have ended it by now."""
+        """True if the stopping rule would have ended the walk."""
         if not self.views:
             return False
         seen = np.array([view.observation.seen for view in self.views])
@@ -163,17 +163,17 @@ class Walk:
 
     @property
     def next_view(self) -> int | None:
-        """Where the policy looks next; None after all views."""
+        """Next view according to the policy; None after all views."""
         return None if self.session.done else self.session.view
 
     @property
     def values(self) -> Float | None:
-        """The policy's values of the views, (V,), NaN if not considered; None before a view."""
+        """Values of the views, (V,), NaN if not considered; None before the first view."""
         return self.views[-1].values if self.views else None
 
     @property
     def rivals(self) -> Rivals | None:
-        """The two most likely taught things, and how they differ from each view.
+        """The two most likely taught things, and their differences in each view.
 
         None before the first view, and for models without a memory.
         """
@@ -210,14 +210,14 @@ class Walk:
         rivals: Rivals,
         view: int,
     ) -> list[tuple[str, NDArray[np.uint8]]]:
-        """Return the rivals' names and their remembered pictures from a candidate view.
+        """Return the names and stored images of the rivals from a candidate view.
 
         Args:
             rivals: the two most likely classes.
             view: index of the view.
 
         Returns:
-            Name and picture, (64, 64) uint8, of both.
+            Name and image, (64, 64) uint8, of both.
         """
         recogniser = self.session.models.recogniser
         assert isinstance(recogniser, TaughtRecogniser)
@@ -238,11 +238,11 @@ class Walk:
         ]
 
     def rival_pictures(self, direction: Float) -> RivalPictures | None:
-        """The two leading hypotheses as a camera in some direction, (3,), would see them.
+        """Render the two leading hypotheses from a direction, (3,).
 
         Returns:
-            As they lie, with the pixels in which they differ; None where nothing can be foreseen by
-            geometry, or there is one hypothesis only.
+            Images in the estimated poses, with the pixels in which they differ; None if the
+            geometry is not known, or there is only one hypothesis.
         """
         outlook = self.session.outlook
         return (
@@ -253,12 +253,12 @@ class Walk:
 
     @property
     def visited(self) -> list[int]:
-        """The candidate views that were taken, or are nearest to a pose that was taken."""
+        """Candidate views that were taken, or that are nearest to a pose that was taken."""
         return [view.index for view in self.views]
 
     @property
     def points(self) -> Float32:
-        """All points seen so far, (N, 3), object frame, object radii."""
+        """All observed points so far, (N, 3), object frame, object radii."""
         seen = [view.observation.points for view in self.views if view.observation.seen]
         return np.concatenate([np.zeros((0, 3), np.float32), *seen])
 
@@ -273,11 +273,11 @@ class Walk:
         )
 
     def step(self) -> View:
-        """Take the view that the policy asks for."""
+        """Take the next view according to the policy."""
         return self.look(self.session.view)
 
     def with_policy_of(self, system: System) -> "Walk":
-        """The same views under another policy: what would it do now?"""
+        """Return a walk with the same views under another policy."""
         other = Walk(system, self.camera, self.start, self.seed)
         for view in self.views:
             other.session.update(view.observation)
@@ -293,8 +293,8 @@ def remembered_picture(
 ) -> NDArray[np.uint8]:
     """Draw a taught thing in a resting pose.
 
-    It is drawn from the memory's surface, or else from the mesh that was taught; if neither is
-    there, the stored picture is returned.
+    It is rendered from the memory's surface, or from the mesh of the scan; if neither is available,
+    the stored image is returned.
 
     Args:
         recogniser: the memory.
@@ -303,7 +303,7 @@ def remembered_picture(
         azimuth: index of the azimuth bin.
 
     Returns:
-        Picture, (64, 64) uint8.
+        Image, (64, 64) uint8.
     """
     memory = recogniser.memory
     about = recogniser.card.memory
@@ -312,7 +312,7 @@ def remembered_picture(
     surface = memory.surfaces.surface(thing, about.things[thing].name)
     try:
         if surface is None:
-            # resting poses are told from the file's own axes
+            # resting poses are relative to the axes of the file
             standing = load_mesh(about.things[thing].source, up="z")
         else:
             standing = make_mesh(surface.vertices, surface.faces, surface.name)
@@ -325,7 +325,7 @@ def remembered_picture(
 
 
 class Exploration:
-    """An object among some, its camera, and a walk for each of one or two policies.
+    """A list of objects, the camera of the current one, and a walk for each of one or two policies.
 
     Options are those of ``nextview.load``.
     """
@@ -356,24 +356,24 @@ class Exploration:
 
     @property
     def policies(self) -> list[str]:
-        """Names of the policies that are compared."""
+        """Names of the compared policies."""
         return [system.policy_name for system in self.systems]
 
     @property
     def mesh(self) -> Mesh | None:
-        """The object; None if there are only stored views of it."""
+        """Mesh of the object; None if there are only stored views."""
         return self._opened if isinstance(self._opened, Mesh) else None
 
     def show(self, name: str) -> None:
-        """Go to another object, and start over."""
+        """Select another object, and start over."""
         self._begin(self.objects[name], self.objects[name].open(), self.sensor)
 
     def use_sensor(self, sensor: str | None) -> None:
-        """Look through another sensor, and start over."""
+        """Select another sensor, and start over."""
         self._begin(self.shown, self._opened, sensor)
 
     def restart(self) -> None:
-        """Forget all views; a sensor errs anew in the same way."""
+        """Forget all views; the errors of the sensor are repeated."""
         self.use_sensor(self.sensor)
 
     def _begin(
@@ -401,7 +401,7 @@ class Exploration:
         )
 
     def compare(self, policies: Sequence[str | None]) -> None:
-        """Use one policy, or two side by side; those that walked before keep their views."""
+        """Use one policy, or two side by side; policies used before keep their views."""
         systems = [self._load(policy) for policy in policies]
         walks = [
             self.walks[min(k, len(self.walks) - 1)].with_policy_of(system)
@@ -417,7 +417,7 @@ class Exploration:
                 walk.step()
 
     def walk_on(self) -> bool:
-        """Let each policy that has not stopped take its next view. Returns whether any did."""
+        """Let each policy that has not stopped take its next view. Returns True if any did."""
         walks = [
             walk for walk in self.walks if not walk.stopped and not walk.session.done
         ]
@@ -426,7 +426,7 @@ class Exploration:
         return bool(walks)
 
     def preview(self, where: Float) -> Observation:
-        """Return what would be seen from a position, (3,), object radii, without noise."""
+        """Render a noise-free observation from a position, (3,), object radii."""
         return self._camera(self._opened).observe(self.pose_towards(where))
 
     def pose_towards(self, position: Float) -> Float:

@@ -1,4 +1,4 @@
-"""The explorer's page: passes clicks to an ``Exploration`` and draws its state."""
+"""The web page of the explorer: passes clicks to an ``Exploration`` and draws its state."""
 
 import errno
 import gzip
@@ -31,24 +31,24 @@ with extras():
     import viser
     from websockets.asyncio import server as websocket
 
-SAND = "#e9dfd0"  # at the foot of the background
+SAND = "#e9dfd0"  # at the bottom of the background
 NO_ANSWER = "nothing"
 CLEAN = "clean renders"
 APART = 8.5  # between two objects side by side, object radii
-LAMP_PLACE = (-4.0, -5.0, 8.0)  # where it hangs
-# between the views of a policy that walks, seconds: long enough to see each
+LAMP_PLACE = (-4.0, -5.0, 8.0)  # position of the lamp
+# seconds between the views of a policy that runs on its own
 PAUSE = 0.5
 PAGE_TITLE = "nextview explore"
-VISER_TITLE = "<title>Viser</title>"  # of every page that viser makes
+VISER_TITLE = "<title>Viser</title>"  # default title of viser's pages
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
 _starting = threading.Lock()
 
 
 class Page:
-    """A page in the browser on an exploration, served at a host and a port.
+    """A web page that shows an exploration, served at a host and a port.
 
-    All who open it see and drive the same.
+    All visitors see and control the same exploration.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Page:
         )
         gui.set_panel_label(PAGE_TITLE)
         scene.set_up_direction("+z")
-        # darkens a little towards the ground
+        # slightly darker towards the ground
         sky = np.linspace(rgb(PAPER), rgb(SAND), 256)
         scene.set_background_image(sky.astype(np.uint8)[:, None])
         scene.configure_default_lights(False)
@@ -97,12 +97,12 @@ class Page:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         host = self.server.get_host()
         name = "localhost" if host in ("0.0.0.0", "127.0.0.1") else host
         return f"http://{name}:{self.server.get_port()}"
 
-    # What can be clicked
+    # Controls
 
     def _controls(self, gui: viser.GuiApi) -> None:
         exploration = self.exploration
@@ -124,7 +124,7 @@ class Page:
             list(exploration.objects),
             initial_value=exploration.shown.name,
         )
-        # and no Markdown: viser would take a name for HTML
+        # not Markdown, in which viser would interpret a name as HTML
         self._label = gui.add_html("")
         self._policy = gui.add_dropdown(
             "Policy",
@@ -181,9 +181,9 @@ class Page:
         )
 
     def _act(self, act: Callable[[], Any], client: viser.ClientHandle | None) -> Any:
-        """Do one thing at a time.
+        """Run one action at a time.
 
-        An error is shown, and the page stays as it was; then None is returned.
+        An error is shown, the page is unchanged, and None is returned.
         """
         with self._lock:
             try:
@@ -206,7 +206,7 @@ class Page:
 
     @contextmanager
     def _silence(self) -> Iterator[None]:
-        """Take no notice of choices that the page itself changes."""
+        """Ignore changes of controls that the page itself makes."""
         self._quiet = True
         try:
             yield
@@ -246,7 +246,7 @@ class Page:
         self._rebuild()
 
     def _drawn(self, take: Callable[[], Any]) -> bool:
-        """Take views and draw them. Returns what taking them returns, as a truth."""
+        """Take views and draw them. Returns the result of taking them as a bool."""
         taken = bool(take())
         self._draw()
         return taken
@@ -275,10 +275,10 @@ class Page:
         while self._act(lambda: self._drawn(self.exploration.walk_on), client):
             time.sleep(PAUSE)
 
-    # What is shown
+    # Drawing
 
     def _rebuild(self) -> None:
-        """Other objects, or another number of walks."""
+        """Rebuild the page for other objects, or another number of walks."""
         for shown in (*self._scenes, *self._panels):
             shown.remove()
 
@@ -337,9 +337,9 @@ class Page:
 
 
 def _listed(value: object, options: Collection[str]) -> str:
-    """What was chosen from a list.
+    """Return a choice from a list, checked.
 
-    Whoever reaches the page can send anything, also the name of a plugin: refused.
+    A client can send any value, including the name of a plugin, which is rejected.
     """
     if not isinstance(value, str) or value not in options:
         raise UsageError(f"{value!r} is none of the options here")
@@ -347,11 +347,11 @@ def _listed(value: object, options: Collection[str]) -> str:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """Start the server of a page that only its own scripts can control.
+    """Start a server whose page can be controlled only by its own scripts.
 
     Args:
-        host: address to listen at.
-        port: to listen at; the next free one if it is taken.
+        host: address to listen on.
+        port: to listen on; the next free one if it is taken.
 
     Returns:
         The server.
@@ -374,7 +374,7 @@ def serve(host: str, port: int) -> viser.ViserServer:
 
         return plain(handler, *address, process_request=check, **options)
 
-    with _starting:  # viser has no option for a check of requests
+    with _starting:  # viser has no option to check requests
         websocket.serve = guarded  # type: ignore[assignment, misc]
         try:
             server = viser.ViserServer(
@@ -385,12 +385,14 @@ def serve(host: str, port: int) -> viser.ViserServer:
             )
         finally:
             websocket.serve = plain  # type: ignore[misc]
-    server.request_share_url = lambda verbose=True: None  # no visitor opens a tunnel
+    server.request_share_url = lambda verbose=True: (
+        None
+    )  # visitors must not open a tunnel
     return server
 
 
 def titled(page: str, title: str) -> str:
-    """A page of viser's under a title of its own, which the tab of the browser shows.
+    """Replace the title of a viser page, which is shown in the browser tab.
 
     Args:
         page: HTML.
@@ -400,7 +402,7 @@ def titled(page: str, title: str) -> str:
 
 
 def _with_title(response: Any) -> Any:
-    """What the server answers, with the title of the explorer where it is the page itself."""
+    """Replace the title in a response if it contains the page."""
     if response is None or "text/html" not in response.headers.get("Content-Type", ""):
         return response
     zipped = response.headers.get("Content-Encoding") == "gzip"
@@ -413,11 +415,11 @@ def _with_title(response: Any) -> Any:
 
 
 def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | None:
-    """Decide by its headers whether a request is refused.
+    """Decide from its headers whether to reject a request.
 
-    There are two ways in which a page of another site can reach this machine. By this machine's
-    address: then Origin names the site. By a name of its own that points to this address: then Host
-    has that name.
+    A page of another site can reach this machine in two ways. If it uses this machine's address,
+    the header Origin names the site. If it uses its own name that points to this address, the
+    header Host has that name.
 
     Args:
         hosts: values of the header Host.
@@ -425,7 +427,7 @@ def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | 
         served: name or address under which the page is served.
 
     Returns:
-        Why it is refused; None if it is answered.
+        The reason; None if the request is accepted.
     """
     name = _host_name(hosts[0]) if len(hosts) == 1 else None
     if name is None:
@@ -440,15 +442,15 @@ def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | 
 
 
 def _host_name(host: str) -> str | None:
-    """The name in a header Host, without its port; None if there is none, or it cannot be read."""
+    """Return the name in a header Host, without its port; None if it is missing or invalid."""
     try:
         return urlsplit(f"//{host}").hostname
-    except ValueError:  # a bracket that is not closed, and no address within brackets
+    except ValueError:  # an unclosed bracket, or an invalid address in brackets
         return None
 
 
 def _place(origin: str) -> str | None:
-    """Host and port of a header Origin; None if they cannot be read."""
+    """Return host and port of a header Origin; None if it is invalid."""
     try:
         return urlsplit(origin).netloc.lower()
     except ValueError:
@@ -456,7 +458,7 @@ def _place(origin: str) -> str | None:
 
 
 def _check_address(host: str, port: int) -> None:
-    """Try the address: viser would wait for ever."""
+    """Check that the address can be used; viser would wait forever."""
     whole(port, "a port", 0, 65535)
     try:
         if not host:

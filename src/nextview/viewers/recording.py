@@ -22,24 +22,24 @@ TIMELINE = "step"
 
 
 class Recorder:
-    """Records a session; add it to ``Session.observers``, or call it with a session.
+    """Recorder of a session; add it to ``Session.observers``, or call it with a session.
 
-    On the timeline ``step`` the file holds, in the object frame and object radii:
+    On the timeline ``step`` the file contains, in the object frame and object radii:
 
     - ``world/camera``: pose and pinhole of the last view; ``depth`` and ``image`` below it.
-    - ``world/views/K`` and ``world/seen/K``: pose of view K, and the points that were seen from
-      there. Where a later frame shows better where the object is, they are written anew.
-    - ``world/thing``: the scan of the thing that is believed most, where it was found.
-    - ``world/candidates``: the candidate views, in the colours of what the policy values them at,
-      and ``world/next``: the one that it chose.
+    - ``world/views/K`` and ``world/seen/K``: pose of view K, and its observed points. They are
+      written again when a later frame improves the estimate of the object's position.
+    - ``world/thing``: the scan of the most likely thing in its estimated pose.
+    - ``world/candidates``: the candidate views, coloured by value, and ``world/next``: the chosen
+      one.
     - ``belief/CLASS``, ``threshold``, ``travel/cells``, ``travel/radians``: numbers over the steps,
-    as they were then.
-    - ``belief_now``, ``this_view_alone``, ``values``: bars over classes, and over the views that
-    the policy considered.
+      as they were then.
+    - ``belief_now``, ``this_view_alone``, ``values``: bar charts over classes, and over the views
+      that the policy considered.
     - ``maps/NAME``: predicted maps. ``log``: each step in words, with its warnings.
 
-    The file can be read at any time; it is complete once the session is done, or after ``close``.
-    UsageError if its name does not end in .rrd, or it cannot be written.
+    The file can be read at any time; it is complete once the session is done, or after ``close``. A
+    UsageError is raised if its name does not end in .rrd, or it cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -56,7 +56,7 @@ class Recorder:
         self._open = True
 
     def __call__(self, session: "Session") -> None:
-        """Write what is new in a session."""
+        """Record the changes of a session."""
         if not (self._open and session.views):
             return
         step = len(session.views)
@@ -80,7 +80,7 @@ class Recorder:
             self.close()
 
     def close(self) -> None:
-        """Complete the file; nothing more is written."""
+        """Complete the file; nothing more can be written."""
         if self._open:
             self._stream.disconnect()
         self._open = False
@@ -118,7 +118,7 @@ class Recorder:
         )
 
     def _log_surface(self, session: "Session") -> None:
-        """The scan of the thing that is believed most, where it was found."""
+        """Record the scan of the most likely thing in its estimated pose."""
         posed = session.result.posed_surface
         if posed is None:
             if self._shows_surface:
@@ -164,7 +164,7 @@ class Recorder:
             )
 
     def _log_choice(self, session: "Session", view: "View", step: int) -> None:
-        """What the policy values the views at, and where it goes; again if it is asked again."""
+        """Record the values of the views and the chosen one, each time it is chosen."""
         places = session.sphere.poses[:, :3, 3]
         visited = [earlier.index for earlier in session.views]
 
@@ -207,7 +207,7 @@ class Recorder:
 
 
 def blueprint() -> rrb.Blueprint:
-    """How the viewer arranges a recording at first."""
+    """Return the initial layout of the viewer."""
     camera = "world/camera"
     bars = {
         "belief": "belief_now",

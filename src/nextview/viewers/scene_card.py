@@ -1,6 +1,6 @@
-"""What a scene knows of each object, as HTML, and a page of it beside a picture.
+"""HTML summary of the objects in a scene, and a static page with a picture.
 
-The page is one file without scripts. The base installation can write it.
+The page is one file without scripts, and needs no optional dependencies.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nextview.scene.scene import Scene
 from nextview.session.style import FAINT, INK, PAPER
 from nextview.viewers.scene_shapes import colour_of
 
-PAGE_CANDIDATES = 4  # things whose belief is shown for an object
+PAGE_CANDIDATES = 4  # listed candidates per object
 LEAST_BELIEF = 0.005  # smaller beliefs are not shown
 PANEL = f"""<style>
 .nv {{ position: fixed; z-index: 9; top: 0; right: 0; bottom: 0; width: 330px; overflow-y: auto;
@@ -71,14 +71,14 @@ def write_picture_page(
     title: str = "On the table",
     overwrite: bool = False,
 ) -> None:
-    """Write a page with a picture of a scene, and the name, place and beliefs of each object.
+    """Write a page with a picture of a scene, and the name, position and beliefs of each object.
 
     Args:
         scene: with at least one frame.
         path: of the page, .html.
-        picture: PNG file; the page embeds it.
+        picture: PNG file, which is embedded in the page.
         title: heading of the page.
-        overwrite: whether an existing page is replaced.
+        overwrite: whether to replace an existing page.
 
     Raises:
         SessionError: the scene has no frame yet.
@@ -100,11 +100,11 @@ def write_picture_page(
 
 
 def scene_card(scene: Scene, title: str) -> str:
-    """What is known of each object, as HTML.
+    """Return the summary of all objects as HTML.
 
     Args:
-        scene: with one frame at least.
-        title: of what was looked at.
+        scene: with at least one frame.
+        title: of the scene.
     """
     objects = scene.objects
     count = len(scene.frames)
@@ -116,13 +116,13 @@ def scene_card(scene: Scene, title: str) -> str:
     if not objects:
         said = f"{frames}: nothing stands on the plane"
     parts = "".join(_object_card(thing) for thing in objects)
-    # reached by Tab, so that it can be scrolled without a mouse
+    # can be focused with Tab and scrolled without a mouse
     panel = '<div class="nv" role="region" aria-label="what was found" tabindex="0">'
     return f"{PANEL}{panel}<h1>{escape(title)}</h1><p>{said}</p>{parts}</div>"
 
 
 def _object_card(thing: SceneObject) -> str:
-    """What is known of an object, as HTML."""
+    """Return the summary of an object as HTML."""
     colour = colour_of(thing)
     sure = "confident" if thing.confident else "not confident"
     off = thing.pose_uncertainty

@@ -1,6 +1,6 @@
-"""A scene as a page for the browser: all in place on the table in 3D, and belief for each object.
+"""Interactive 3D page of a scene: objects in their poses on the table, with beliefs.
 
-The page is one file. It needs no server, and can be sent to somebody.
+The page is one file. It needs no server, and can be shared.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ with extras():
 
     from nextview.viewers.page import serve, titled
 
-FRUSTUM_PIXELS = 200  # pixels of a frame's picture in its camera
-PAGE_FRUSTUM = 0.045  # metres, size of a camera that is drawn
-AROUND = 0.08  # metres of the table around all that stands on it
-PAGE_TABLE_THICKNESS = 0.01  # metres, of the table that is drawn
-STEEP = 0.8  # height over level distance from which the page looks at first
-FAR = 2.0  # radii of the scene from which it does
-ASIDE = np.radians(50.0)  # from the last camera
-UNSURE = 0.6  # opacity of what is not confident
-HULL = 0.35  # and of the hull of an unknown object
+FRUSTUM_PIXELS = 200  # width of the image in a camera frustum, pixels
+PAGE_FRUSTUM = 0.045  # metres, size of a camera frustum
+AROUND = 0.08  # metres of table around the objects
+PAGE_TABLE_THICKNESS = 0.01  # metres
+STEEP = 0.8  # height of the initial viewpoint, relative to its horizontal distance
+FAR = 2.0  # distance of the initial viewpoint, in radii of the scene
+ASIDE = np.radians(50.0)  # azimuth of the initial viewpoint from the last camera
+UNSURE = 0.6  # opacity of objects that are not confident
+HULL = 0.35  # opacity of the hull of an unknown object
 
 
 def write_scene_page(
@@ -46,17 +46,17 @@ def write_scene_page(
     title: str = "On the table",
     overwrite: bool = False,
 ) -> None:
-    """Write what a scene knows as a page: the scans in place, cameras, beliefs.
+    """Write a 3D page of a scene: registered scans, cameras, beliefs.
 
     Args:
-        scene: with one frame at least.
+        scene: with at least one frame.
         path: of the page, .html.
-        title: of what was looked at.
-        overwrite: whether a page that exists is replaced.
+        title: of the scene.
+        overwrite: whether to replace an existing page.
 
     Raises:
-        SessionError: no frame was taken in yet.
-        UsageError: the file is of another name.
+        SessionError: the scene has no frame yet.
+        UsageError: the file name has another suffix.
         ResultsError: the page exists, or cannot be written.
     """
     if not scene.frames:
@@ -67,7 +67,7 @@ def write_scene_page(
         raise UsageError(f"{path}: a page is called .html")
     with redirect_stdout(
         StringIO()
-    ):  # viser would tell of a server that nobody is to open
+    ):  # suppress viser's message about a temporary server
         server = serve("127.0.0.1", 0)
         try:
             draw_scene_in_3d(server, scene)
@@ -83,11 +83,11 @@ def write_scene_page(
 
 
 def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
-    """Draw the table, the scans in place, what the frames show, and where the cameras stood.
+    """Draw the table, the registered scans, the observed points and the cameras.
 
     Args:
         server: of the page.
-        scene: with one frame at least.
+        scene: with at least one frame.
     """
     top = scene.tops[0]
     objects = scene.objects
@@ -135,7 +135,7 @@ def _look_at_it(
     middle: Float,
     radius: float,
 ) -> None:
-    """Look at it first from beside the last camera, farther away and above."""
+    """Set the initial viewpoint: beside the last camera, farther away and higher."""
     up = scene.tops[0].up
     back = scene.frames[-1].camera_to_world[:3, 3] - middle
     back = back - (back @ up) * up
@@ -153,7 +153,7 @@ def _draw_table(
     middle: Float,
     radius: float,
 ) -> None:
-    """The plane on which all stands, as a disc."""
+    """Draw the support plane as a disc."""
     top = scene.tops[0]
     normal = top.plane.normal
     foot = middle - float(top.plane.height(middle[None])[0]) * normal
@@ -170,7 +170,7 @@ def _draw_table(
 
 
 def _draw_object(server: viser.ViserServer, scene: Scene, thing: SceneObject) -> None:
-    """A scan where it was found, or the hull of what was seen of an unknown object; its name."""
+    """Draw the registered scan or, for an unknown object, the hull of its points; and its name."""
     colour = rgb(colour_of(thing))
     name = f"/objects/{thing.number}"
     shape = placed_shape(thing)
@@ -209,7 +209,7 @@ def _draw_frame(
     number: int,
     pose: Float,
 ) -> None:
-    """A camera where it stood, with its picture."""
+    """Draw a camera in its pose, with its image."""
     frame = scene.frames[number]
     height, width = frame.shape
     picture = Image.fromarray((255 * grey_picture(frame)).astype(np.uint8))

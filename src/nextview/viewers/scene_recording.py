@@ -1,4 +1,4 @@
-"""Recordings of a scene for the Rerun viewer."""
+"""Record a scene for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ with extras():
     import rerun.blueprint as rrb
 
 FRAME_TIMELINE = "frame"
-LABEL_ABOVE = 0.02  # metres above an object at which its name stands
-RECORDED_FRUSTUM = 0.08  # metres, of a camera that is drawn
+LABEL_ABOVE = 0.02  # metres, height of a name above its object
+RECORDED_FRUSTUM = 0.08  # metres, size of a camera frustum
 
 
 class SceneRecorder:
-    """Records a scene; call it with the scene after each frame.
+    """Recorder of a scene; call it with the scene after each frame.
 
-    On the timeline ``frame`` the file holds, in the world and in metres:
+    On the timeline ``frame`` the file contains, in the world frame and in metres:
 
-    - ``world/camera``: pose, pinhole and depth of the last frame; ``world/cameras/K`` of frame K,
+    - ``world/camera``: pose, pinhole and depth of the last frame; ``world/cameras/K`` for frame K,
       and ``world/way`` between them.
-    - ``world/seen/K``: the points above the table that frame K shows.
-    - ``world/objects/N``: the scan of object N where it was found, or the hull of what was seen of
-      an unknown one, and ``world/objects/N/name``. Cleared once the object is gone.
-    - ``world/next``: where to look next.
-    - ``belief/N NAME``: the belief in each name that an object had, over the frames.
+    - ``world/seen/K``: the points of frame K above the table.
+    - ``world/objects/N``: the registered scan of object N, or the hull of an unknown object's
+      points, and ``world/objects/N/name``. Cleared once the object is gone.
+    - ``world/next``: the next view.
+    - ``belief/N NAME``: the belief in each name of an object over the frames.
     - ``log``: each frame in words.
 
-    The file can be read at any time; it is complete after ``close``. Where the frames were taken
-    in before the first call, the objects are those of the last one.
+    The file can be read at any time; it is complete after ``close``. If frames were added to the
+    scene before the first call, the objects are those after the last of them.
 
     Args:
         path: of the file, .rrd.
 
     Raises:
-        UsageError: its name does not end in .rrd, or it cannot be written.
+        UsageError: the name does not end in .rrd, or the file cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -61,7 +61,7 @@ class SceneRecorder:
         self._open = True
 
     def __call__(self, scene: Scene) -> None:
-        """Write what is new in a scene."""
+        """Record the changes of a scene."""
         if not self._open:
             return
 
@@ -84,13 +84,13 @@ class SceneRecorder:
         self._stream.flush()
 
     def close(self) -> None:
-        """Complete the file; nothing more is written."""
+        """Complete the file; nothing more can be written."""
         if self._open:
             self._stream.disconnect()
         self._open = False
 
     def _log_frame(self, scene: Scene, number: int) -> None:
-        """A camera where it stood, its depth, the points that it saw, and the way so far."""
+        """Record a camera in its pose, its depth and points, and the camera path so far."""
         frame = scene.frames[number]
         pose = frame.camera_to_world
         height, width = frame.shape
@@ -117,7 +117,7 @@ class SceneRecorder:
         )
 
     def _log_object(self, thing: SceneObject) -> None:
-        """An object where it was found, its name, and the belief in it."""
+        """Record an object in its pose, its name, and the belief in it."""
         name = f"world/objects/{thing.number}"
         shape = placed_shape(thing)
         if shape is None:
@@ -147,7 +147,7 @@ class SceneRecorder:
             self._stream.log(f"belief/{entity}", rr.Scalars(thing.confidence))
 
     def _log_next(self, scene: Scene) -> None:
-        """Where to look next; nowhere once all is sure."""
+        """Record the next view; none once the scene is done."""
         target = None if scene.done else scene.target
         places = np.zeros((0, 3)) if target is None else target[None, :3, 3]
         self._stream.log(
@@ -156,17 +156,17 @@ class SceneRecorder:
         )
 
     def _log_text(self, scene: Scene) -> None:
-        """What is known after the last frame, in words."""
+        """Record a description of the scene after the last frame."""
         for thing in scene.objects:
             self._stream.log("log", rr.TextLog(repr(thing), level=rr.TextLogLevel.INFO))
 
 
 def record_scene(scene: Scene, path: str | Path) -> None:
-    """Write a scene, as it is, as a recording for the Rerun viewer.
+    """Write the current state of a scene as a recording for the Rerun viewer.
 
     Args:
-        scene: with one frame at least.
-        path: of the file, .rrd; one of that name is replaced.
+        scene: with at least one frame.
+        path: of the file, .rrd; an existing file is replaced.
     """
     recorder = SceneRecorder(path)
     recorder(scene)
@@ -174,7 +174,7 @@ def record_scene(scene: Scene, path: str | Path) -> None:
 
 
 def scene_blueprint() -> rrb.Blueprint:
-    """How the viewer arranges a recording at first."""
+    """Return the initial layout of the viewer."""
     table = rrb.Spatial3DView(origin="world", name="table")
     depth = rrb.Spatial2DView(origin="world/camera", name="last frame")
     belief = rrb.TimeSeriesView(origin="belief", name="belief over the frames")

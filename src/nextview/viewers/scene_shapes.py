@@ -1,4 +1,4 @@
-"""What pages and recordings of a scene draw: shapes and colours of objects, points of frames."""
+"""Shapes and colours of objects, and points of frames, for pages and recordings of scenes."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.session.style import GREY
 
-MOST_POINTS = 12_000  # of a frame or of an object that are drawn
+MOST_POINTS = 12_000  # largest number of drawn points of a frame or an object
 
 
 def placed_shape(thing: SceneObject) -> Triangles | None:
-    """The scan of an object where it was found; of an unknown one the hull of what was seen.
+    """Return the scan of an object in its pose; for an unknown object, the hull of its points.
 
     Args:
         thing: the object.
 
     Returns:
-        Vertices, (V, 3) float64, world, metres, and faces, (F, 3) int32; None where what was seen
-        has no volume.
+        Vertices, (V, 3) float64, world, metres, and faces, (F, 3) int32; None if the points have no
+        volume.
     """
     posed = thing.candidates[0] if thing.pose is not None else None
     if posed is not None and posed.vertices is not None and posed.faces is not None:
         return posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3], posed.faces
     try:
         hull = ConvexHull(thing.seen_points)
-    except QhullError:  # all in a plane
+    except QhullError:  # coplanar points
         return None
     row_of = np.full(len(thing.seen_points), -1)
     row_of[hull.vertices] = np.arange(len(hull.vertices))
@@ -38,7 +38,7 @@ def placed_shape(thing: SceneObject) -> Triangles | None:
 
 
 def seen_points(scene: Scene, number: int) -> NDArray[np.float32]:
-    """Points above the plane that a frame shows, (N, 3), world, metres; not all of many.
+    """Sample points of a frame above the plane, (N, 3), world, metres.
 
     Args:
         scene: with the frame.
@@ -50,7 +50,7 @@ def seen_points(scene: Scene, number: int) -> NDArray[np.float32]:
 
 
 def points_of(scene: Scene, thing: SceneObject) -> NDArray[np.float32]:
-    """Points that the frames show of an object, (N, 3), world, metres; not all of many.
+    """Sample points of an object in all frames, (N, 3), world, metres.
 
     Args:
         scene: with the object.
@@ -65,7 +65,7 @@ def points_of(scene: Scene, thing: SceneObject) -> NDArray[np.float32]:
 
 
 def colour_of(thing: SceneObject) -> str:
-    """The colour of an object, the same in all frames: grey for an unknown one."""
+    """Return the colour of an object, the same in all frames; grey for an unknown one."""
     return (
         GREY
         if thing.name == UNKNOWN_NAME
@@ -74,6 +74,6 @@ def colour_of(thing: SceneObject) -> str:
 
 
 def named(thing: SceneObject) -> str:
-    """The name of an object, with a question mark where it is not confident."""
+    """Return the name of an object, with a question mark if it is not confident."""
     doubt = "" if thing.confident or thing.name == UNKNOWN_NAME else "?"
     return thing.name.replace("_", " ") + doubt

@@ -1,4 +1,4 @@
-"""A walk in 3D: the object, the candidate views by value, the path and the camera."""
+"""3D view of a walk: the object, the candidate views by value, the path and the camera."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,16 +18,16 @@ with extras():
     import viser
 
 BALL = 0.09  # radius of a candidate view, object radii
-TABLE_RADIUS = 2.4  # radius of what the object stands on
-# faces of a mesh from which its vertices are shaded, not its faces: scans
+TABLE_RADIUS = 2.4  # radius of the support disc, object radii
+# number of faces above which a mesh is a scan, and is shaded smoothly
 SMOOTH = 10_000
 
 
 class WalkScene:
-    """Draws a walk below one node of the scene; another walk needs another scene.
+    """Draws a walk below one node of the scene graph; every walk needs its own instance.
 
-    ``look`` is called with the candidate view that is clicked; ``drag`` with the place to which the
-    camera is dragged, (3,), object frame, and whether it was let go.
+    ``look`` is called with the index of a clicked candidate view; ``drag`` with the position to
+    which the camera is dragged, (3,), object frame, and whether it was released.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class WalkScene:
 
         Args:
             walk: the walk.
-            hide_unseen: whether to hide the object except for the points that were seen.
+            hide_unseen: whether to show only the observed points of the object.
         """
         if self._object is not None:
             self._object.visible = not hide_unseen
@@ -153,7 +153,7 @@ class WalkScene:
         )
 
     def _colour(self, walk: Walk) -> None:
-        """Colour the candidates by value; visited ones dark and small, the next one large."""
+        """Colour the candidates by value, visited ones dark and small, the next one large."""
         values = (
             np.full(len(walk.sphere), np.nan)
             if walk.values is None
@@ -201,15 +201,15 @@ class WalkScene:
 
 
 def _rings(places: Float) -> Float32:
-    """Return level circles below views, (V, 3), as segments, (S, 2, 3).
+    """Return horizontal circles below the rings of views, (V, 3), as segments, (S, 2, 3).
 
-    There are none for views that lie on no rings.
+    Empty for views that do not lie on rings.
     """
     around = np.linspace(0, 2 * np.pi, 97)
     heights = np.unique(np.round(places[:, 2], 3))
     heights = heights[: 0 if len(heights) > 12 else None]
     radius = np.sqrt(np.maximum((places[0] ** 2).sum() - heights**2, 0))[:, None]
-    # the balls lie on them
+    # the balls rest on the circles
     height = np.broadcast_to(heights[:, None] - BALL, (len(heights), 97))
     circles = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1)
     return (
