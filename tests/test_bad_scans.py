@@ -82,6 +82,8 @@ def test_a_scan_with_faults_is_recognised(thing, fault):
     found = verifier(views_of(shown, YAW)[:2])
     assert found.belief.argmax() == thing
     degrees, millimetres = off_by(found.poses[0], true_pose(shown, YAW), shown.centre)
+    if thing == 1:
+        degrees = min(degrees, 180 - degrees)  # the cup looks the same upside down
     assert degrees < 2
     assert millimetres < 2
 
@@ -116,6 +118,8 @@ def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(thing, share):
             true_pose(things[thing], YAW),
             things[thing].centre,
         )
+        if thing == 1:
+            degrees = min(degrees, 180 - degrees)  # the same upside down
         assert degrees < 3
 
 
