@@ -25,8 +25,6 @@ SEGMENT_POINTS = 400  # points of a segment that are looked at
 FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
 GONE = 0.6  # share of these through which something behind it is seen
 STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
-THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
-FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,70 +186,6 @@ def _divided(
     return {int(row): label == row + 1 for row in rows if (label == row + 1).any()}
 
 
-@dataclass(frozen=True)
-class SegmentAgreement:
-    """How a frame agrees with an object that it may show.
-
-    Attributes:
-        tested: pixels in which the object would show if it stood alone, and a depth was measured.
-        seen: share of them in which it is.
-        through: share of them in which something behind it is seen.
-    """
-
-    tested: int
-    seen: float
-    through: float
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the object cannot be where it was."""
-        return self.tested >= FEWEST_TESTED and self.through >= GONE
-
-    @property
-    def confirms(self) -> bool:
-        """Whether the object is where it was."""
-        return self.tested >= FEWEST_TESTED and self.seen >= THERE
-
-
-def agreement(track: Track, top: TableTop) -> SegmentAgreement:
-    """How a frame, which was not taken in yet, agrees with an object.
-
-    Args:
-        track: the object.
-        top: what the frame shows.
-    """
-    rendered = render_track(track, top, -1, track.posed)
-    if rendered is None:
-        return _agreement_of_points(track, top.frame)
-    tested = rendered.agrees | rendered.hidden | rendered.through
-    inner = tested & ndimage.binary_erosion(np.isfinite(rendered.depth), iterations=2)
-    count = int(np.count_nonzero(inner))
-    if not count:
-        return SegmentAgreement(0, 0.0, 0.0)
-    return SegmentAgreement(
-        count,
-        float((rendered.agrees & inner).sum() / count),
-        float((rendered.through & inner).sum() / count),
-    )
-
-
-def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
-    """The same for an object of unknown shape, by the points of it that were seen last."""
-    last = track.thing.sightings[-1]
-    few = slice(None, None, max(1, len(last.facets.planes) // SEGMENT_POINTS))
-    pose = last.frame.camera_to_world
-    points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
-    _, off = _points_in(points, frame)
-    if not len(off):
-        return SegmentAgreement(0, 0.0, 0.0)
-
-    return SegmentAgreement(
-        len(off),
-        float((np.abs(off) < STEP_BEHIND).mean()),
-        float((off > STEP_BEHIND).mean()),
-    )
-
-
 def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
     """Where points are in the picture of a frame.
 
@@ -290,9 +224,3 @@ def seen_through(points: Float, frame: Frame) -> float:
     if len(off) < FEWEST_TESTED:
         return 0.0
     return float((off > STEP_BEHIND).mean())
-
-
-def contradicted(found: Sequence[SegmentAgreement]) -> bool:
-    """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
-    against = sum(one.contradicts for one in found)
-    return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)

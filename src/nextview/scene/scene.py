@@ -17,12 +17,8 @@ from numpy.typing import ArrayLike
 from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
 from nextview.geometry.axes import upright_axes
-from nextview.scene.following import (
-    SegmentAgreement,
-    agreement,
-    assign,
-    contradicted,
-)
+from nextview.scene.changes import CameraError, Change, changes, wrong_pose
+from nextview.scene.following import SAME_OBJECT_SHARE, assign
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import best, candidates, is_sure, values
 from nextview.scene.objects import SceneObject
@@ -60,6 +56,22 @@ MOVED_OR_POSE = ViewWarning(
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Move:
+    """An object that stands elsewhere than before.
+
+    Attributes:
+        number: of the object.
+        before: pose of its scan file in the world until this frame, (4, 4) float64, metres; None
+            where it was not known.
+        after: the same by this frame.
+    """
+
+    number: int
+    before: Float | None
+    after: Float | None
+
+
 @dataclass(frozen=True)
 class Look:
     """What one frame changed.
@@ -67,7 +79,7 @@ class Look:
     Attributes:
         taken: whether the frame was taken in.
         appeared: numbers of objects that were not known before.
-        moved: numbers of objects that stand elsewhere now.
+        moved: the objects that stand elsewhere now, each with its number and both poses.
         gone: numbers of objects that are no longer there.
         joined: number of each object that turned out to be a part of another one, and the number of
             that one: the first is used no more.
@@ -76,7 +88,7 @@ class Look:
 
     taken: bool
     appeared: tuple[int, ...] = ()
-    moved: tuple[int, ...] = ()
+    moved: tuple[Move, ...] = ()
     gone: tuple[int, ...] = ()
     joined: tuple[tuple[int, int], ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
@@ -287,14 +299,21 @@ class Scene:
         Raises:
             ObservationError: it shows nothing where it was.
         """
-        found = [agreement(track, top) for track in before.tracks]
-        if contradicted(found):
+        found, camera = changes(
+            before.tracks,
+            top,
+            top.segments(),
+            before.tops,
+            before.cameras,
+        )
+        if wrong_pose(found, camera):
             return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
         seen_again = any(one.confirms for one in found)
         if before.tops and not (top.shows_ground or seen_again):
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
+        state = replace(state, cameras=(*before.cameras, camera))
         if look.moved and not seen_again:
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
@@ -303,14 +322,14 @@ class Scene:
         self,
         before: SceneState,
         top: TableTop,
-        found: Sequence[SegmentAgreement],
+        found: Sequence[Change],
     ) -> tuple[SceneState, Look]:
         """The scene after a frame that fits."""
         number = len(before.tops)
         bench = Bench(top, number, self._judged)
         pairs = list(zip(before.tracks, found, strict=True))
         there = [track for track, one in pairs if not one.contradicts]
-        lost = [track for track, one in pairs if one.contradicts]
+        lost = [(track, one.pose) for track, one in pairs if one.contradicts]
 
         own, new = assign(top.segments(), there, top)
         hidden = [track for row, track in enumerate(there) if row not in own]
@@ -393,29 +412,28 @@ def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
 def _numbered(
     state: SceneState,
     tracks: Sequence[Track],
-    lost: Sequence[Track],
+    lost: Sequence[tuple[Track, Float | None]],
 ) -> tuple[SceneState, Look]:
     """Give new objects their numbers: what is lost in one place may be found in another.
 
     Args:
         state: with the last frame, and the objects as they were before it.
         tracks: the objects.
-        lost: those that are not where they were.
+        lost: those that are not where they were, with the poses in which they stand now, (4, 4), as
+            far as these are known.
     """
-    away = {track.result.answer: track for track in lost if track.result is not None}
+    found_again = _found_again(tracks, lost, state.tops[-1])
     number = state.next_number
     appeared = []
     moved = []
     kept = []
     joined = []
-    for track in tracks:
+    for row, track in enumerate(tracks):
         if track.number < 0:
-            assert track.result is not None
-            answer = track.result.answer
-            old = away.pop(answer, None) if answer else None
+            old = found_again.get(row)
             if old is not None:
                 track = replace(track, number=old.number)
-                moved.append(old.number)
+                moved.append(Move(old.number, _pose_of(old), _pose_of(track)))
             else:
                 track = replace(track, number=number)
                 appeared.append(number)
@@ -423,8 +441,10 @@ def _numbered(
         joined += [(ended, track.number) for ended in track.absorbed]
         kept.append(replace(track, absorbed=()))
 
-    gone = tuple(track.number for track in lost if track.number not in moved)
-    changed = {*gone, *moved, *(ended for ended, _ in joined)}
+    elsewhere = {move.number for move in moved}
+    ended = {track.number for track, _ in lost}
+    gone = tuple(sorted(ended - elsewhere))
+    changed = {*ended, *(ended for ended, _ in joined)}
     touching = {pair for pair in state.touching if not set(pair) & changed}
     touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
     after = replace(
@@ -436,6 +456,46 @@ def _numbered(
     look = Look(True, tuple(appeared), tuple(moved), gone, tuple(joined))
     warnings = (*state.tops[-1].warnings, *after.remarks)
     return after, replace(look, warnings=warnings)
+
+
+def _found_again(
+    tracks: Sequence[Track],
+    lost: Sequence[tuple[Track, Float | None]],
+    top: TableTop,
+) -> dict[int, Track]:
+    """Which new objects are lost ones, by their rows: those that stand where these were found, and
+    those that have the same names.
+    """
+    new = {row: track for row, track in enumerate(tracks) if track.number < 0}
+    found: dict[int, Track] = {}
+    for old, pose in lost:
+        if pose is None or old.posed is None:
+            continue
+        rendered = render_track(old, top, -1, replace(old.posed, pose=pose))
+        if rendered is None:
+            continue
+        for row in new.keys() - found.keys():
+            mask = new[row].thing.sightings[-1].mask
+            explained, _ = rendered.fit(mask)
+            if explained >= SAME_OBJECT_SHARE * np.count_nonzero(mask):
+                found[row] = old
+                break
+
+    for old, _ in lost:
+        name = None if old.result is None else old.result.answer
+        if name is None or old in found.values():
+            continue
+        for row in new.keys() - found.keys():
+            result = new[row].result
+            if result is not None and result.answer == name:
+                found[row] = old
+                break
+    return found
+
+
+def _pose_of(track: Track) -> Float | None:
+    """Pose of an object's scan file in the world, (4, 4), metres; None for an unknown one."""
+    return None if track.result is None else track.result.pose
 
 
 def _touching(

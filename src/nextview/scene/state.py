@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from nextview.checks import number_of
+from nextview.scene.changes import CameraError
 from nextview.scene.next_view import FEWEST_HIDDEN, TableGround, is_sure
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
@@ -33,6 +34,7 @@ class SceneState:
         region: where is looked; None: everywhere.
         tops: what each frame shows on the plane.
         tracks: the objects.
+        cameras: by how much the pose of each frame is off, as far as the objects tell.
         touching: numbers of all pairs of objects that touch, the smaller number first.
         next_number: of the next object that is found.
         left_unknown: how many small objects of the last frame were not verified.
@@ -41,6 +43,7 @@ class SceneState:
     region: Box | None = None
     tops: tuple[TableTop, ...] = ()
     tracks: tuple[Track, ...] = ()
+    cameras: tuple[CameraError, ...] = ()
     touching: frozenset[tuple[int, int]] = frozenset()
     next_number: int = 1
     left_unknown: int = 0
