@@ -33,6 +33,7 @@ DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
 RENDERED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
 """Metres by which an object is moved to find out where it fits better, in each step."""
+ROUNDS = 2  # in which objects and the error of the camera's pose tell each other
 PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))
 TILT = RegistrationPrior().tilt
@@ -227,7 +228,7 @@ def _window_of(
     without = without_object(depth, known, sigma)
     window = replace(window, without=without)
     surface = window.rendered(np.zeros((1, 6)))[0][0]
-    count = np.count_nonzero(np.isfinite(surface) & (depth > surface - 4 * sigma))
+    count = np.count_nonzero(np.isfinite(surface))
     return replace(window, weight=min(1.0, PIXELS / max(count, 1)))
 
 
@@ -439,9 +440,12 @@ def changes(
         fits = [_fitted(window, start, mean, free) for start in starts]
         seen.append(replace(told, fit=max(fits, key=lambda fit: fit.gain)))
 
-    visible = [one for one in seen if one.fit.gain > LEAST_ODDS]
-    standing = _standing(visible, expected)
+    standing = _standing(_visible(seen), expected)
     camera = _camera_by(standing, expected)
+    for _ in range(ROUNDS):
+        seen = [_refitted(one, camera, expected, top.up) for one in seen]
+        standing = _standing(_visible(seen), expected)
+        camera = _camera_by(standing, expected)
     found = [Change()] * len(tracks)
     for one in seen:
         rest = [other for other in standing if other.row != one.row]
@@ -455,6 +459,24 @@ def changes(
             if _stands_by_points(track, top, camera) > LEAST_ODDS:
                 found[row] = Change()  # something is there, if not what it was taken for
     return found, camera
+
+
+def _visible(seen: Sequence[_Seen]) -> list[_Seen]:
+    """Those that the frame shows somewhere."""
+    return [one for one in seen if one.fit.gain > LEAST_ODDS]
+
+
+def _refitted(
+    one: _Seen,
+    camera: CameraError,
+    expected: CameraError,
+    up: Float,
+) -> _Seen:
+    """The same object, looked for where an error of the camera would show it, too."""
+    start, _ = one.expected(camera)
+    mean, covariance = one.expected(expected)
+    fit = _fitted(one.window, start, mean, _free(covariance, up), STEPS[1:])
+    return replace(one, fit=max(one.fit, fit, key=lambda each: each.gain))
 
 
 def _change_of(
