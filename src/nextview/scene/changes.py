@@ -244,7 +244,9 @@ def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float, tuple]:
     depth = frame.depth[tuple(at)]
     seen = depth > 0
     row, column = at[0][seen], at[1][seen]
-    rays = np.column_stack([frame.rays[0][column], frame.rays[1][row], np.ones(len(row))])
+    rays = np.column_stack(
+        [frame.rays[0][column], frame.rays[1][row], np.ones(len(row))]
+    )
     return rays.astype(np.float64), depth[seen].astype(np.float64), (row, column)
 
 
@@ -342,7 +344,9 @@ class _Seen:
         for one in self.known:
             before = one.at(place)
             motion = motion - before @ one.motion / len(self.known)
-            covariance = covariance + before @ one.covariance @ before.T / len(self.known)
+            covariance = covariance + before @ one.covariance @ before.T / len(
+                self.known
+            )
         return motion, covariance
 
 
@@ -363,7 +367,9 @@ def _camera_by(seen: Sequence[_Seen], expected: CameraError) -> CameraError:
     for one in seen:
         place = one.window.centre
         matrix = expected.at(place)
-        offset, own = one.expected(replace(expected, motion=np.zeros(6), covariance=np.zeros((6, 6))))
+        offset, own = one.expected(
+            replace(expected, motion=np.zeros(6), covariance=np.zeros((6, 6)))
+        )
         told = _reduced(one.fit.information, own)
         information = information + matrix.T @ told @ matrix
         pull = pull + matrix.T @ told @ (one.fit.motion - offset)
@@ -395,7 +401,11 @@ def _standing(seen: Sequence[_Seen], expected: CameraError) -> list[_Seen]:
         camera = _camera_by(group, expected)
         cost = sum(min(_deviation(one, camera), LEAST_ODDS) for one in seen)
         if expected.covariance.any():
-            cost += 0.5 * camera.motion @ np.linalg.solve(expected.covariance, camera.motion)
+            cost += (
+                0.5
+                * camera.motion
+                @ np.linalg.solve(expected.covariance, camera.motion)
+            )
         if cost < best[0] - 1e-9:
             best = (cost, group)
     return best[1]
@@ -433,7 +443,9 @@ def changes(
             continue
         known = tuple(cameras[number] for number in tracks[row].frames)
         own = _own_covariance(one, window.radius)
-        told = _Seen(row, window, own, known, _MotionFit(np.zeros(6), np.zeros((6, 6)), 0.0))
+        told = _Seen(
+            row, window, own, known, _MotionFit(np.zeros(6), np.zeros((6, 6)), 0.0)
+        )
         mean, covariance = told.expected(expected)
         free = _free(covariance, top.up)
         starts = [mean, mean + np.append(np.zeros(3), shift)] if shift.any() else [mean]
@@ -457,7 +469,9 @@ def changes(
             found[row] = Change(_stands_by_points(track, top, expected))
         elif found[row].stands < -LEAST_ODDS and found[row].pose is None:
             if _stands_by_points(track, top, camera) > LEAST_ODDS:
-                found[row] = Change()  # something is there, if not what it was taken for
+                found[row] = (
+                    Change()
+                )  # something is there, if not what it was taken for
     return found, camera
 
 
@@ -526,9 +540,7 @@ def _told_before(track: Track, pose: Float, tops: Sequence[TableTop]) -> float:
         old[:3, 3] += shift
         new = pose.copy()
         new[:3, 3] += shift
-        window = _window_of(
-            replace(posed, pose=old), top, [], new[:3, 3] - old[:3, 3]
-        )
+        window = _window_of(replace(posed, pose=old), top, [], new[:3, 3] - old[:3, 3])
         if window is None:
             continue
         other = replace(window, posed=replace(posed, pose=new))
@@ -573,7 +585,9 @@ def _stands_by_points(track: Track, top: TableTop, camera: CameraError) -> float
     inside = (points - now[:3, 3]) @ now[:3, :3]
     inside = inside[inside[:, 2] > 0.01]
     column, row = np.floor(frame.camera.project(inside)).astype(np.int64).T
-    shown = (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    shown = (
+        (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    )
     row, column, surface = row[shown], column[shown], inside[shown, 2]
     depth = frame.depth[row, column].astype(np.float64)
     seen = depth > 0
