@@ -2,8 +2,8 @@
 
 Every pixel around the place of an object has a likelihood under each of three rivals: the object
 stands where it stood; it is gone, and the picture shows what else is known to be there; it stands
-elsewhere nearby. Where it stood is known but for the error of the camera's pose, which displaces all
-objects of a frame together: it is estimated by those that have not moved. One of the rivals has to
+elsewhere nearby. Where it stood is known but for the error of the camera's pose, which displaces
+all objects of a frame together: it is estimated by those that have not moved. One of the rivals has to
 be so many times likelier, else nothing is said.
 """
 
@@ -15,8 +15,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nextview.geometry.axes import upright_axes
-from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import Track, caster_of, window_around
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
@@ -213,7 +211,7 @@ def _window_of(
     )
     if part is None:
         return None
-    rays, depth, at = _some_pixels(frame, part)
+    rays, depth = _some_pixels(frame, part)
     if not len(depth):
         return None
 
@@ -232,7 +230,7 @@ def _window_of(
     return replace(window, weight=min(1.0, PIXELS / max(count, 1)))
 
 
-def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float, tuple]:
+def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float]:
     """Rays, (P, 3), and depths, (P,), of the measured pixels of a grid over a part of a frame."""
     rows, columns = (
         np.arange(one.start, one.stop)[
@@ -247,7 +245,7 @@ def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float, tuple]:
     rays = np.column_stack(
         [frame.rays[0][column], frame.rays[1][row], np.ones(len(row))]
     )
-    return rays.astype(np.float64), depth[seen].astype(np.float64), (row, column)
+    return rays.astype(np.float64), depth[seen].astype(np.float64)
 
 
 def _depth_of_plane(top: TableTop, rays: Float) -> Float:
@@ -292,7 +290,7 @@ def _fitted(
     lengths = np.repeat([1 / window.radius, 1.0], 3)
 
     def worth(one: Float) -> float:
-        return window.gain(one) - 0.5 * (one - mean) @ prior @ (one - mean)
+        return window.gain(one) - float(0.5 * (one - mean) @ prior @ (one - mean))
 
     here = worth(motion)
     information = np.zeros((6, 6))
@@ -313,7 +311,7 @@ def _fitted(
                 motion = motion + part * change
                 here = there
                 break
-    return _MotionFit(motion, information, window.gain(motion))
+    return _MotionFit(motion, np.asarray(information), window.gain(motion))
 
 
 def _free(covariance: Float, up: Float) -> Float:
@@ -350,9 +348,12 @@ class _Seen:
         return motion, covariance
 
 
-def _own_covariance(posed: PoseCandidate, radius: float) -> Float:
-    """How far off a pose itself may be: rotation vector and shift, (6, 6)."""
-    error = float(scan_errors(radius))
+def _own_covariance(posed: PoseCandidate, radius: float, pixel: float) -> Float:
+    """How far off a pose itself may be: rotation vector and shift, (6, 6).
+
+    Cameras mix the depths at an outline, which may be off by a ``pixel``, metres.
+    """
+    error = float(np.hypot(scan_errors(radius), pixel))
     turn = np.hypot(np.radians(posed.degrees), error / radius)
     shift = np.hypot(posed.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2 / 3, shift**2 / 3], 3))
@@ -379,7 +380,9 @@ def _camera_by(seen: Sequence[_Seen], expected: CameraError) -> CameraError:
 
 def _reduced(information: Float, covariance: Float) -> Float:
     """Information, (6, 6), on what else errs by a covariance, (6, 6)."""
-    return np.linalg.solve(np.eye(6) + information @ covariance, information)
+    return np.asarray(
+        np.linalg.solve(np.eye(6) + information @ covariance, information), np.float64
+    )
 
 
 def _deviation(one: _Seen, camera: CameraError) -> float:
@@ -401,11 +404,8 @@ def _standing(seen: Sequence[_Seen], expected: CameraError) -> list[_Seen]:
         camera = _camera_by(group, expected)
         cost = sum(min(_deviation(one, camera), LEAST_ODDS) for one in seen)
         if expected.covariance.any():
-            cost += (
-                0.5
-                * camera.motion
-                @ np.linalg.solve(expected.covariance, camera.motion)
-            )
+            known = np.linalg.solve(expected.covariance, camera.motion)
+            cost += 0.5 * float(camera.motion @ known)
         if cost < best[0] - 1e-9:
             best = (cost, group)
     return best[1]
@@ -442,7 +442,9 @@ def changes(
         if window is None:
             continue
         known = tuple(cameras[number] for number in tracks[row].frames)
-        own = _own_covariance(one, window.radius)
+        away = np.linalg.norm(window.centre - top.frame.camera_to_world[:3, 3])
+        pixel = float(away / top.frame.intrinsics[0, 0])
+        own = _own_covariance(one, window.radius, pixel)
         told = _Seen(
             row, window, own, known, _MotionFit(np.zeros(6), np.zeros((6, 6)), 0.0)
         )
@@ -459,19 +461,19 @@ def changes(
         standing = _standing(_visible(seen), expected)
         camera = _camera_by(standing, expected)
     found = [Change()] * len(tracks)
-    for one in seen:
-        rest = [other for other in standing if other.row != one.row]
-        found[one.row] = _change_of(
-            one, _camera_by(rest, expected), top, tracks[one.row], tops, cameras
+    for each in seen:
+        rest = [other for other in standing if other.row != each.row]
+        found[each.row] = _change_of(
+            each, _camera_by(rest, expected), top, tracks[each.row], tops, cameras
         )
     for row, track in enumerate(tracks):
         if row not in scans:
             found[row] = Change(_stands_by_points(track, top, expected))
-        elif found[row].stands < -LEAST_ODDS and found[row].pose is None:
-            if _stands_by_points(track, top, camera) > LEAST_ODDS:
-                found[row] = (
-                    Change()
-                )  # something is there, if not what it was taken for
+        elif found[row].stands < -LEAST_ODDS and (
+            found[row].pose is None
+            and _stands_by_points(track, top, camera) > LEAST_ODDS
+        ):
+            found[row] = Change()  # something stands there, if not what it was called
     return found, camera
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
 from nextview.geometry.axes import upright_axes
-from nextview.scene.changes import CameraError, Change, changes, wrong_pose
+from nextview.scene.changes import Change, changes, wrong_pose
 from nextview.scene.following import SAME_OBJECT_SHARE, assign
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import best, candidates, is_sure, values
