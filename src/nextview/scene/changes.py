@@ -1,10 +1,10 @@
 """What a frame says of each known object: it stands where it stood, it is not seen, or it does not.
 
-Every pixel around the place of an object has a likelihood under each of three rivals: the object
-stands where it stood; it is gone, and the picture shows what else is known to be there; it stands
-elsewhere nearby. Where it stood is known but for the error of the camera's pose, which displaces
-all objects of a frame together: it is estimated by those that have not moved. One of the rivals has to
-be so many times likelier, else nothing is said.
+Every pixel around the place of an object has a likelihood under each of three rivals: the
+object stands where it stood; it is gone, and the picture shows what else is known to be there;
+it stands elsewhere nearby. Where it stood is known but for the error of the camera's pose,
+which displaces all objects of a frame together: it is estimated by those that have not moved.
+One of the rivals has to be so many times likelier, else nothing is said.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ LEAST_ODDS = 12.0
 """Nats by which one rival has to be likelier. Of a hundred thousand looks at an object about one
 finds it changed by chance if objects change that rarely."""
 DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
-RENDERED_SIDE = 48  # rows and columns in which an object is compared
+COMPARED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
 """Metres by which an object is moved to find out where it fits better, in each step."""
-ROUNDS = 2  # in which objects and the error of the camera's pose tell each other
+CAMERA_ROUNDS = 2  # in which objects and the error of the camera's pose tell each other
 PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))
-TILT = RegistrationPrior().tilt
 POINTS = 400
 
 
@@ -156,7 +155,8 @@ class _Window:
         directions = self.rays / np.linalg.norm(self.rays, axis=1, keepdims=True)
         inwards = np.einsum("mpi,mij,pj->mp", normals, turns.swapaxes(1, 2), directions)
         cosine = np.clip(np.abs(inwards), 0.15, 1)
-        return depth, np.sqrt(1 - cosine**2) / cosine
+        slope = np.sqrt(1 - cosine**2) / cosine
+        return np.asarray(depth, np.float64), np.asarray(slope, np.float64)
 
     def gains(self, motions: Float) -> Float:
         """Log-likelihood of each pixel with the object after motions, less that without, (M, P)."""
@@ -226,7 +226,7 @@ def _window_of(
     without = without_object(depth, known, sigma)
     window = replace(window, without=without)
     surface = window.rendered(np.zeros((1, 6)))[0][0]
-    count = np.count_nonzero(np.isfinite(surface))
+    count = int(np.isfinite(surface).sum())
     return replace(window, weight=min(1.0, PIXELS / max(count, 1)))
 
 
@@ -234,7 +234,7 @@ def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float]:
     """Rays, (P, 3), and depths, (P,), of the measured pixels of a grid over a part of a frame."""
     rows, columns = (
         np.arange(one.start, one.stop)[
-            (step := max(1, (one.stop - one.start) // RENDERED_SIDE)) // 2 :: step
+            (step := max(1, (one.stop - one.start) // COMPARED_SIDE)) // 2 :: step
         ]
         for one in part
     )
@@ -456,7 +456,7 @@ def changes(
 
     standing = _standing(_visible(seen), expected)
     camera = _camera_by(standing, expected)
-    for _ in range(ROUNDS):
+    for _ in range(CAMERA_ROUNDS):
         seen = [_refitted(one, camera, expected, top.up) for one in seen]
         standing = _standing(_visible(seen), expected)
         camera = _camera_by(standing, expected)
