@@ -13,16 +13,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from nextview.recognition.poses import PoseCandidate
-from nextview.scene.tracks import Track, caster_of, window_around
+from nextview.recognition.poses import PoseCandidate, uncertainty_of
+from nextview.scene.tracks import Track, caster_of, render_track, window_around
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
 from nextview.sensing.frame import Frame, Part
 from nextview.sensing.tabletop import TableTop
 from nextview.things.registration import RegistrationPrior, scan_errors
 from nextview.things.verification import PixelModel
-from nextview.types import Float, Mask
+from nextview.types import Float, Index, Mask
 
 LEAST_ODDS = 12.0
 """Nats by which one rival has to be likelier. Of a hundred thousand looks at an object about one
@@ -35,6 +36,9 @@ CAMERA_ROUNDS = 2  # in which objects and the error of the camera's pose tell ea
 PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))
 POINTS = 400
+WELL_KNOWN = 0.85
+"""Share of its pixels that the scan of an object explains, from which it is what it is called."""
+SIGNIFICANT = 3.0  # standard deviations by which something lies behind an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +318,12 @@ def _fitted(
     return _MotionFit(motion, np.asarray(information), window.gain(motion))
 
 
+def _worth(fit: _MotionFit, mean: Float, covariance: Float) -> float:
+    """Nats of a motion, given how it was to be expected, (6,), and its covariance, (6, 6)."""
+    off = fit.motion - mean
+    return fit.gain - float(0.5 * off @ np.linalg.solve(covariance, off))
+
+
 def _free(covariance: Float, up: Float) -> Float:
     """A covariance, (6, 6), of what may also have moved along the ground and turned on it."""
     level = np.eye(3) - np.outer(up, up)
@@ -348,14 +358,22 @@ class _Seen:
         return motion, covariance
 
 
-def _own_covariance(posed: PoseCandidate, radius: float, pixel: float) -> Float:
+def _own_covariance(track: Track, radius: float, pixel: float) -> Float:
     """How far off a pose itself may be: rotation vector and shift, (6, 6).
 
-    Cameras mix the depths at an outline, which may be off by a ``pixel``, metres.
+    What may be another thing, or stand in another pose, is off by as much. Cameras mix the depths
+    at an outline, which may be off by a ``pixel``, metres.
     """
+    posed = track.posed
+    assert posed is not None
+    assert track.result is not None
+    every = track.result.pose_candidates
+    off = uncertainty_of(
+        sorted(every, key=lambda one: not np.array_equal(one.pose, posed.pose))
+    )
     error = float(np.hypot(scan_errors(radius), pixel))
-    turn = np.hypot(np.radians(posed.degrees), error / radius)
-    shift = np.hypot(posed.millimetres / 1000, error)
+    turn = np.hypot(np.radians(off.degrees), error / radius)
+    shift = np.hypot(off.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2 / 3, shift**2 / 3], 3))
 
 
@@ -444,7 +462,7 @@ def changes(
         known = tuple(cameras[number] for number in tracks[row].frames)
         away = np.linalg.norm(window.centre - top.frame.camera_to_world[:3, 3])
         pixel = float(away / top.frame.intrinsics[0, 0])
-        own = _own_covariance(one, window.radius, pixel)
+        own = _own_covariance(tracks[row], window.radius, pixel)
         told = _Seen(
             row, window, own, known, _MotionFit(np.zeros(6), np.zeros((6, 6)), 0.0)
         )
@@ -468,12 +486,17 @@ def changes(
         )
     for row, track in enumerate(tracks):
         if row not in scans:
-            found[row] = Change(_stands_by_points(track, top, expected))
-        elif found[row].stands < -LEAST_ODDS and (
-            found[row].pose is None
-            and _stands_by_points(track, top, camera) > LEAST_ODDS
-        ):
-            found[row] = Change()  # something stands there, if not what it was called
+            found[row] = Change(_stands_by_points(track, top))
+        change = found[row]
+        if change.pose is None and change.stands < -LEAST_ODDS:
+            if not _well_known(track, tops):
+                there = not _seen_behind(track, top)
+            else:
+                there = row in scans and _stands_by_points(track, top) > LEAST_ODDS
+            if there:
+                found[row] = (
+                    Change()
+                )  # something stands there, if not what it was called
     return found, camera
 
 
@@ -506,19 +529,24 @@ def _change_of(
     """What a frame says of one object, given the error of its pose by the others."""
     window = one.window
     mean, covariance = one.expected(camera)
-    there = _fitted(window, mean, mean, covariance, STEPS[1:])
-    off = there.motion - mean
-    stands = there.gain - float(0.5 * off @ np.linalg.solve(covariance, off))
+    # where it fits best is often as well a place of one that stands
+    starts = (mean, one.fit.motion)
+    fits = [_fitted(window, start, mean, covariance, STEPS[1:]) for start in starts]
+    worths = [_worth(fit, mean, covariance) for fit in fits]
+    there = fits[int(np.argmax(worths))]
+    stands = max(worths)
 
     free = _free(covariance, top.up)
     away = max(
         (one.fit, _fitted(window, there.motion, mean, free, STEPS[2:])),
         key=lambda fit: fit.gain,
     )
-    off = away.motion - mean
-    elsewhere = away.gain - float(0.5 * off @ np.linalg.solve(free, off))
+    elsewhere = _worth(away, mean, free)
     if elsewhere < LEAST_ODDS or elsewhere - stands < LEAST_ODDS:
         return Change(stands)
+
+    if not _well_known(track, tops):
+        return Change(stands)  # what else it may be explains as much
 
     # where it stands now, but for the error of the camera; did it stand there all the time?
     pose = window.pose(away.motion - mean)
@@ -526,6 +554,21 @@ def _change_of(
     if before < LEAST_ODDS:
         return Change(elsewhere)
     return Change(stands, min(elsewhere - stands, before), window.pose(away.motion))
+
+
+def _well_known(track: Track, tops: Sequence[TableTop]) -> bool:
+    """Whether an object is what it is called: that is confident, or its scan fits what was seen."""
+    if track.confident:
+        return True
+    explained = every = 0
+    for number, sighting in zip(track.frames, track.thing.sightings, strict=True):
+        rendered = render_track(track, tops[number], number, track.posed)
+        if rendered is None:
+            return False
+        one, other = rendered.fit(sighting.mask)
+        explained += one
+        every += other
+    return explained >= WELL_KNOWN * every
 
 
 def _told_before(track: Track, pose: Float, tops: Sequence[TableTop]) -> float:
@@ -576,32 +619,68 @@ def _shift_to_segment(
     return shift - (shift @ top.up) * top.up
 
 
-def _stands_by_points(track: Track, top: TableTop, camera: CameraError) -> float:
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """What was seen of an object last, where another frame measures something.
+
+    Attributes:
+        surface: depth of each point in the frame, (P,), metres.
+        row, column: the pixel of each, (P,).
+        rays: in the camera's frame, z = 1, (P, 3).
+    """
+
+    surface: Float
+    row: Index
+    column: Index
+    rays: Float
+
+    @classmethod
+    def of(cls, track: Track, frame: Frame) -> _Points:
+        """Those of an object in a frame."""
+        last = track.thing.sightings[-1]
+        few = slice(None, None, max(1, len(last.facets.planes) // POINTS))
+        pose = last.frame.camera_to_world
+        points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
+        now = frame.camera_to_world
+        inside = (points - now[:3, 3]) @ now[:3, :3]
+        inside = inside[inside[:, 2] > 0.01]
+        column, row = np.floor(frame.camera.project(inside)).astype(np.int64).T
+        height, width = frame.shape
+        shown = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        shown[shown] = frame.depth[row[shown], column[shown]] > 0
+        surface = inside[shown, 2]
+        rays = inside[shown] / surface[:, None]
+        return cls(surface, row[shown], column[shown], rays)
+
+
+def _stands_by_points(track: Track, top: TableTop) -> float:
     """Nats by which an object of unknown shape stands where it was seen last, against gone."""
-    frame = top.frame
-    last = track.thing.sightings[-1]
-    few = slice(None, None, max(1, len(last.facets.planes) // POINTS))
-    pose = last.frame.camera_to_world
-    points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
-    now = frame.camera_to_world
-    inside = (points - now[:3, 3]) @ now[:3, :3]
-    inside = inside[inside[:, 2] > 0.01]
-    column, row = np.floor(frame.camera.project(inside)).astype(np.int64).T
-    shown = (
-        (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
-    )
-    row, column, surface = row[shown], column[shown], inside[shown, 2]
-    depth = frame.depth[row, column].astype(np.float64)
-    seen = depth > 0
-    if not seen.any():
+    seen = _Points.of(track, top.frame)
+    if not len(seen.surface):
         return 0.0
-    depth, surface = depth[seen], surface[seen]
-    rays = inside[shown][seen] / surface[:, None]
-    error = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * surface)
+    depth = top.frame.depth[seen.row, seen.column].astype(np.float64)
+    error = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * seen.surface)
     sigma = np.hypot(top.noise.at(depth) * depth**2, error)
-    ground = _depth_of_plane(top, rays)
-    gain = with_surface(depth, surface, sigma) - without_object(depth, [ground], sigma)
+    ground = _depth_of_plane(top, seen.rays)
+    gain = with_surface(depth, seen.surface, sigma)
+    gain -= without_object(depth, [ground], sigma)
     return float(gain.sum() * min(1.0, PIXELS / len(gain)))
+
+
+def _seen_behind(track: Track, top: TableTop) -> bool:
+    """Whether a frame shows what is behind an object, wherever the error of its pose puts it."""
+    frame = top.frame
+    seen = _Points.of(track, frame)
+    if not len(seen.surface):
+        return False
+    aside = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * np.median(seen.surface))
+    reach = int(np.ceil(frame.intrinsics[0, 0] * aside / np.median(seen.surface)))
+    depth = np.where(frame.depth > 0, frame.depth, np.inf)
+    nearest = ndimage.minimum_filter(depth, 2 * reach + 1)[seen.row, seen.column]
+    noise = top.noise.at(nearest) * nearest**2
+    sigma = np.hypot(noise, np.sqrt(2) * CAMERA_PLACE)
+    behind = nearest > seen.surface + SIGNIFICANT * sigma
+    return bool(np.count_nonzero(behind) > len(behind) / 2)
 
 
 def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
