@@ -26,8 +26,8 @@ from nextview.things.verification import PixelModel
 from nextview.types import Float, Index, Mask
 
 LEAST_ODDS = 12.0
-"""Nats by which one rival has to be likelier. Of a hundred thousand looks at an object about one
-finds it changed by chance if objects change that rarely."""
+"""Nats by which one rival has to be likelier. It is no rate of errors: neighbouring pixels err
+together, and a name or a pose may be wrong in a way that no rival has."""
 DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
 COMPARED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
@@ -489,14 +489,13 @@ def changes(
             found[row] = Change(_stands_by_points(track, top))
         change = found[row]
         if change.pose is None and change.stands < -LEAST_ODDS:
-            if not _well_known(track, tops):
-                there = not _seen_behind(track, top)
+            if track.confident:
+                there = _stands_by_points(track, top) > LEAST_ODDS
             else:
-                there = row in scans and _stands_by_points(track, top) > LEAST_ODDS
+                there = not _seen_behind(track, top)
             if there:
-                found[row] = (
-                    Change()
-                )  # something stands there, if not what it was called
+                # something stands there, if not what it was called
+                found[row] = Change()
     return found, camera
 
 
