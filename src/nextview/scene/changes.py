@@ -4,7 +4,8 @@ Every pixel around the place of an object has a likelihood under each of three r
 object stands where it stood; it is gone, and the picture shows what else is known to be there;
 it stands elsewhere nearby. Where it stood is known but for the error of the camera's pose,
 which displaces all objects of a frame together: it is estimated by those that have not moved.
-One of the rivals has to be so many times likelier, else nothing is said.
+A rival that leaves the pose open is weighed over all poses (MacKay, "Bayesian interpolation",
+1992), as the likeliest of many poses fits noise, too. Few objects move from one frame to the next.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from nextview.things.verification import PixelModel
 from nextview.types import Float, Index, Mask
 
 LEAST_ODDS = 12.0
-"""Nats by which one rival has to be likelier. It is no rate of errors: neighbouring pixels err
-together, and a name or a pose may be wrong in a way that no rival has."""
+"""Nats by which a frame has to show an object rather than not, or the other way round. It is no
+rate of errors: a name or a pose may be wrong in a way that no rival has."""
+MOVES = 0.01  # share of the objects that are expected to stand elsewhere in the next frame
 DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
 COMPARED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
@@ -39,6 +41,10 @@ POINTS = 400
 WELL_KNOWN = 0.85
 """Share of its pixels that the scan of an object explains, from which it is what it is called."""
 SIGNIFICANT = 3.0  # standard deviations by which something lies behind an object
+MOVE_SCALES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Standard deviations of how far what moves goes along the ground, metres: all as likely, from a
+nudge to the width of a table. What goes farther also turns more."""
+LARGEST_TURN = 2.0  # standard deviation of a turn of which nothing is known, radians
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,19 +96,19 @@ class Change:
 
     Attributes:
         stands: log-likelihood of that it stands where it stood, against that it is gone.
-        moved: that it stands elsewhere, against that it stands where it stood.
+        moved: log-odds of that it stands elsewhere, against that it stands where it stood.
         pose: where it then stands, of its scan file in the world, (4, 4), metres; None where it is
             not seen.
     """
 
     stands: float = 0.0
-    moved: float = 0.0
+    moved: float = -np.inf
     pose: Float | None = field(default=None, repr=False)
 
     @property
     def contradicts(self) -> bool:
         """Whether the object cannot be where it was."""
-        return self.stands < -LEAST_ODDS or self.moved > LEAST_ODDS
+        return self.stands < -LEAST_ODDS or self.moved > 0
 
     @property
     def confirms(self) -> bool:
@@ -297,15 +303,9 @@ def _fitted(
         return window.gain(one) - float(0.5 * (one - mean) @ prior @ (one - mean))
 
     here = worth(motion)
-    information = np.zeros((6, 6))
     for step in steps:
-        moves = np.diag(step * lengths)
-        up = window.gains(motion + moves)
-        down = window.gains(motion - moves)
-        slopes = ((up - down) / (2 * step * lengths)[:, None]).T
-        # a pixel that counts as a part of one tells that part
-        information = slopes.T @ slopes / window.weight
-        pull = slopes.sum(0) - prior @ (motion - mean)
+        slopes, information = _slopes(window, motion, step * lengths)
+        pull = slopes - prior @ (motion - mean)
         change = np.linalg.solve(information + prior, pull)
         longest = np.abs(change / lengths).max()
         change *= min(1.0, 4 * step / max(longest, 1e-12))
@@ -315,21 +315,60 @@ def _fitted(
                 motion = motion + part * change
                 here = there
                 break
-    return _MotionFit(motion, np.asarray(information), window.gain(motion))
+    _, information = _slopes(window, motion, steps[-1] * lengths)
+    return _MotionFit(motion, information, window.gain(motion))
 
 
-def _worth(fit: _MotionFit, mean: Float, covariance: Float) -> float:
-    """Nats of a motion, given how it was to be expected, (6,), and its covariance, (6, 6)."""
+def _slopes(window: _Window, motion: Float, steps: Float) -> tuple[Float, Float]:
+    """Gradient of the gain at a motion, (6,), by steps, (6,), and the information, (6, 6)."""
+    up = window.gains(motion + np.diag(steps))
+    down = window.gains(motion - np.diag(steps))
+    slopes = ((up - down) / (2 * steps)[:, None]).T
+    # a pixel that counts as a part of one tells that part
+    return slopes.sum(0), np.asarray(slopes.T @ slopes / window.weight)
+
+
+def _evidence(fit: _MotionFit, mean: Float, covariance: Float) -> float:
+    """Nats by which an object shows rather than not, over all motions that are to be expected.
+
+    This is Laplace's approximation of the integral. A rival that leaves the motion open has to
+    gain what its freedom costs.
+
+    Args:
+        fit: the likeliest motion.
+        mean: of the motions, (6,).
+        covariance: of them, (6, 6).
+    """
     off = fit.motion - mean
-    return fit.gain - float(0.5 * off @ np.linalg.solve(covariance, off))
+    worth = fit.gain - float(0.5 * off @ np.linalg.solve(covariance, off))
+    _, spread = np.linalg.slogdet(np.eye(6) + covariance @ fit.information)
+    return worth - float(0.5 * spread)
 
 
-def _free(covariance: Float, up: Float) -> Float:
-    """A covariance, (6, 6), of what may also have moved along the ground and turned on it."""
-    level = np.eye(3) - np.outer(up, up)
+def _evidence_moved(
+    fit: _MotionFit, mean: Float, covariance: Float, up: Float, radius: float
+) -> float:
+    """The same of an object that may have moved, by any distance."""
+    each = [
+        _evidence(fit, mean, _free(covariance, up, scale, radius))
+        for scale in MOVE_SCALES
+    ]
+    return float(np.logaddexp.reduce(each) - np.log(len(each)))
+
+
+def _free(covariance: Float, up: Float, scale: float, radius: float) -> Float:
+    """A covariance, (6, 6), of what may also have moved along the ground and turned on it.
+
+    Args:
+        covariance: of what stands still, (6, 6).
+        up: the vertical, (3,).
+        scale: standard deviation of the move, metres.
+        radius: of the object, metres.
+    """
+    vertical = np.outer(up, up)
     free = np.zeros((6, 6))
-    free[:3, :3] = 4.0 * np.outer(up, up)
-    free[3:, 3:] = level
+    free[:3, :3] = min(LARGEST_TURN, scale / radius) ** 2 * vertical
+    free[3:, 3:] = scale**2 * (np.eye(3) - vertical)
     return covariance + free
 
 
@@ -358,11 +397,10 @@ class _Seen:
         return motion, covariance
 
 
-def _own_covariance(track: Track, radius: float, pixel: float) -> Float:
+def _own_covariance(track: Track, radius: float) -> Float:
     """How far off a pose itself may be: rotation vector and shift, (6, 6).
 
-    What may be another thing, or stand in another pose, is off by as much. Cameras mix the depths
-    at an outline, which may be off by a ``pixel``, metres.
+    What may be another thing, or stand in another pose, is off by as much.
     """
     posed = track.posed
     assert posed is not None
@@ -371,7 +409,7 @@ def _own_covariance(track: Track, radius: float, pixel: float) -> Float:
     off = uncertainty_of(
         sorted(every, key=lambda one: not np.array_equal(one.pose, posed.pose))
     )
-    error = float(np.hypot(scan_errors(radius), pixel))
+    error = float(scan_errors(radius))
     turn = np.hypot(np.radians(off.degrees), error / radius)
     shift = np.hypot(off.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2 / 3, shift**2 / 3], 3))
@@ -460,14 +498,12 @@ def changes(
         if window is None:
             continue
         known = tuple(cameras[number] for number in tracks[row].frames)
-        away = np.linalg.norm(window.centre - top.frame.camera_to_world[:3, 3])
-        pixel = float(away / top.frame.intrinsics[0, 0])
-        own = _own_covariance(tracks[row], window.radius, pixel)
+        own = _own_covariance(tracks[row], window.radius)
         told = _Seen(
             row, window, own, known, _MotionFit(np.zeros(6), np.zeros((6, 6)), 0.0)
         )
         mean, covariance = told.expected(expected)
-        free = _free(covariance, top.up)
+        free = _free(covariance, top.up, MOVE_SCALES[-1], window.radius)
         starts = [mean, mean + np.append(np.zeros(3), shift)] if shift.any() else [mean]
         fits = [_fitted(window, start, mean, free) for start in starts]
         seen.append(replace(told, fit=max(fits, key=lambda fit: fit.gain)))
@@ -513,7 +549,8 @@ def _refitted(
     """The same object, looked for where an error of the camera would show it, too."""
     start, _ = one.expected(camera)
     mean, covariance = one.expected(expected)
-    fit = _fitted(one.window, start, mean, _free(covariance, up), STEPS[1:])
+    free = _free(covariance, up, MOVE_SCALES[-1], one.window.radius)
+    fit = _fitted(one.window, start, mean, free, STEPS[1:])
     return replace(one, fit=max(one.fit, fit, key=lambda each: each.gain))
 
 
@@ -531,17 +568,18 @@ def _change_of(
     # where it fits best is often as well a place of one that stands
     starts = (mean, one.fit.motion)
     fits = [_fitted(window, start, mean, covariance, STEPS[1:]) for start in starts]
-    worths = [_worth(fit, mean, covariance) for fit in fits]
-    there = fits[int(np.argmax(worths))]
-    stands = max(worths)
+    there = max(fits, key=lambda fit: _evidence(fit, mean, covariance))
 
-    free = _free(covariance, top.up)
+    free = _free(covariance, top.up, MOVE_SCALES[-1], window.radius)
     away = max(
         (one.fit, _fitted(window, there.motion, mean, free, STEPS[2:])),
         key=lambda fit: fit.gain,
     )
-    elsewhere = _worth(away, mean, free)
-    if elsewhere < LEAST_ODDS or elsewhere - stands < LEAST_ODDS:
+    elsewhere = _evidence_moved(away, mean, covariance, top.up, window.radius)
+    # what is likeliest if it may have moved may also be likeliest if it stands
+    stands = max(_evidence(fit, mean, covariance) for fit in (there, away))
+    odds = elsewhere - stands + float(np.log(MOVES / (1 - MOVES)))
+    if elsewhere < LEAST_ODDS or odds < 0:
         return Change(stands)
 
     if not _well_known(track, tops):
@@ -549,10 +587,9 @@ def _change_of(
 
     # where it stands now, but for the error of the camera; did it stand there all the time?
     pose = window.pose(away.motion - mean)
-    before = _told_before(track, pose, tops)
-    if before < LEAST_ODDS:
+    if _told_before(track, pose, tops) < LEAST_ODDS:
         return Change(elsewhere)
-    return Change(stands, min(elsewhere - stands, before), window.pose(away.motion))
+    return Change(stands, odds, window.pose(away.motion))
 
 
 def _well_known(track: Track, tops: Sequence[TableTop]) -> bool:
