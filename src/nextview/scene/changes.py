@@ -29,7 +29,9 @@ from nextview.types import Float, Index, Mask
 LEAST_ODDS = 12.0
 """Nats by which a frame has to show an object rather than not, or the other way round. It is no
 rate of errors: a name or a pose may be wrong in a way that no rival has."""
-MOVES = 0.01  # share of the objects that are expected to stand elsewhere in the next frame
+MOVES = (
+    0.01  # share of the objects that are expected to stand elsewhere in the next frame
+)
 DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
 COMPARED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
