@@ -29,9 +29,9 @@ from nextview.types import Float, Index, Mask
 LEAST_ODDS = 12.0
 """Nats by which a frame has to show an object rather than not, or the other way round. It is no
 rate of errors: a name or a pose may be wrong in a way that no rival has."""
-MOVES = (
-    0.01  # share of the objects that are expected to stand elsewhere in the next frame
-)
+MOVES = 0.001
+"""Share of the objects that are expected to stand elsewhere in the next frame. As many of those
+that stand are called moved at most, if the likelihoods are right."""
 DEPTH_RANGE = 1.0  # metres within which a depth may be that nothing explains
 COMPARED_SIDE = 48  # rows and columns in which an object is compared
 STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
@@ -459,12 +459,15 @@ def _standing(seen: Sequence[_Seen], expected: CameraError) -> list[_Seen]:
             camera = _camera_by(group, expected)
             off = [_deviation(one, camera) for one in seen]
             group = [one for one, by in zip(seen, off, strict=True) if by < LEAST_ODDS]
-        camera = _camera_by(group, expected)
-        cost = sum(min(_deviation(one, camera), LEAST_ODDS) for one in seen)
+        # this one error of the camera: what is known of it worse would agree with more
+        camera = replace(_camera_by(group, expected), covariance=np.zeros((6, 6)))
+        off = [_deviation(one, camera) for one in seen]
+        cost = sum(min(by, LEAST_ODDS) for by in off)
         if expected.covariance.any():
             known = np.linalg.solve(expected.covariance, camera.motion)
             cost += 0.5 * float(camera.motion @ known)
         if cost < best[0] - 1e-9:
+            group = [one for one, by in zip(seen, off, strict=True) if by < LEAST_ODDS]
             best = (cost, group)
     return best[1]
 
