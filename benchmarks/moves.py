@@ -103,13 +103,12 @@ def draw(
         target = of_kind[int(rng.integers(len(of_kind)))]
         rest = [mesh for mesh in meshes if mesh is not target]
         chosen = [rest[k] for k in rng.choice(len(rest), THINGS - 1, replace=False)]
-        chosen.append(target)
-        order = [chosen[k] for k in rng.permutation(THINGS)]
+        order = [[*chosen, target][k] for k in rng.permutation(THINGS)]
         try:
             table = SimulatedTable.draw(order, rng, GAP)
         except UsageError:
             continue
-        row = order.index(target)
+        row = [thing.name for thing in table.things].index(target.name)
         if millimetres is None:
             rest_of = [thing for k, thing in enumerate(table.things) if k != row]
             return table, row, SimulatedTable(tuple(rest_of))
