@@ -47,7 +47,7 @@ def outwards(table, name):
     return middle / np.linalg.norm(middle)
 
 
-@pytest.mark.parametrize("metres", [0.02, 0.1])
+@pytest.mark.parametrize("metres", [0.008, 0.02, 0.1])
 def test_a_moved_thing_has_both_poses_and_none_between(ycb, meshes, metres):
     camera, scene, numbers = watched(ycb, meshes)
     before = {thing.name: thing for thing in scene.objects}["tuna_fish_can"]

@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from nextview.recognition.poses import PoseCandidate, uncertainty_of
-from nextview.scene.tracks import Track, caster_of, render_track, window_around
+from nextview.scene.tracks import Track, caster_of, window_around
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
 from nextview.sensing.frame import Frame, Part
 from nextview.sensing.tabletop import TableTop
@@ -40,8 +40,6 @@ CAMERA_ROUNDS = 2  # in which objects and the error of the camera's pose tell ea
 PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))
 POINTS = 400
-WELL_KNOWN = 0.85
-"""Share of its pixels that the scan of an object explains, from which it is what it is called."""
 SIGNIFICANT = 3.0  # standard deviations by which something lies behind an object
 MOVE_SCALES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Standard deviations of how far what moves goes along the ground, metres: all as likely, from a
@@ -131,6 +129,7 @@ class _Window:
         depth: measured, (P,), metres, all of them above 0.
         sigma: its standard deviation, (P,), metres.
         without: log-likelihood of each pixel without the object, (P,).
+        others: depth of the other objects, (K, P), metres, infinity where they do not show.
         weight: of each pixel, as neighbours err together.
     """
 
@@ -142,15 +141,12 @@ class _Window:
     depth: Float
     sigma: Float
     without: Float
+    others: Float
     weight: float = 1.0
 
     def pose(self, motion: Float) -> Float:
         """Pose of the scan file after a motion, (6,), in the world, (4, 4)."""
-        turn = Rotation.from_rotvec(motion[:3]).as_matrix()
-        pose = self.posed.pose.copy()
-        pose[:3, :3] = turn @ pose[:3, :3]
-        pose[:3, 3] = turn @ (pose[:3, 3] - self.centre) + self.centre + motion[3:]
-        return pose
+        return _about(self.centre, motion) @ self.posed.pose
 
     def rendered(self, motions: Float) -> tuple[Float, Float]:
         """Depth after each motion, (M, P), infinity where it does not show; and its slope."""
@@ -177,7 +173,7 @@ class _Window:
         depth = np.where(shows, depth, 0)
         aside = depth / self.frame.intrinsics[0, 0] * slope
         sigma = np.hypot(self.sigma, aside)
-        found = with_surface(self.depth, depth, sigma) - self.without
+        found = with_surface(self.depth, depth, sigma, self.others) - self.without
         return self.weight * np.where(shows, found, 0.0)
 
     def gain(self, motion: Float) -> float:
@@ -185,15 +181,31 @@ class _Window:
         return float(self.gains(motion[None]).sum())
 
 
-def with_surface(measured: Float, surface: Float, sigma: Float) -> Float:
+def _about(centre: Float, motion: Float) -> Float:
+    """Matrix, (4, 4), of a motion, (6,): a turn about a place, (3,), and a shift."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
+    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + motion[3:]
+    return matrix
+
+
+def with_surface(
+    measured: Float,
+    surface: Float,
+    sigma: Float,
+    others: Sequence[Float] | Float = (),
+) -> Float:
     """Log-likelihood of depths where a surface is, against an exact match.
 
-    What is nearer hides it, and is as likely as anywhere; what is farther should not be seen.
+    What is nearer hides it: one of the ``others`` that are known, or what is as likely anywhere.
+    What is farther should not be seen.
     """
     anywhere = np.sqrt(2 * np.pi) * sigma / DEPTH_RANGE
     other = anywhere * np.where(measured < surface, 0.5, SEEN_THROUGH)
-    match = np.exp(-0.5 * ((measured - surface) / sigma) ** 2)
-    return np.asarray(np.log(0.5 * match + other))
+    off = np.abs(measured - surface)
+    for one in others:
+        off = np.where(one < surface, np.minimum(off, np.abs(measured - one)), off)
+    return np.asarray(np.log(0.5 * np.exp(-0.5 * (off / sigma) ** 2) + other))
 
 
 def without_object(measured: Float, known: Sequence[Float], sigma: Float) -> Float:
@@ -230,16 +242,25 @@ def _window_of(
     centre = (placed.min(0) + placed.max(0)) / 2
     radius = float(np.linalg.norm(placed - centre, axis=1).max())
     sigma = np.hypot(top.noise.at(depth) * depth**2, scan_errors(radius))
-    known = [_depth_of_plane(top, rays)]
-    window = _Window(frame, posed, centre, radius, rays, depth, sigma, np.zeros(1))
-    for other in others:
-        beside = replace(window, posed=other)
-        known.append(beside.rendered(np.zeros((1, 6)))[0][0])
-    without = without_object(depth, known, sigma)
-    window = replace(window, without=without)
+    nothing = np.zeros((0, len(depth)))
+    window = _Window(
+        frame, posed, centre, radius, rays, depth, sigma, np.zeros(1), nothing
+    )
+    window = _beside(window, top, others)
     surface = window.rendered(np.zeros((1, 6)))[0][0]
     count = int(np.isfinite(surface).sum())
     return replace(window, weight=min(1.0, PIXELS / max(count, 1)))
+
+
+def _beside(window: _Window, top: TableTop, others: Sequence[PoseCandidate]) -> _Window:
+    """The same part of a frame beside other objects in their poses."""
+    shown = np.zeros((0, len(window.depth)))
+    if others:
+        besides = [replace(window, posed=other) for other in others]
+        shown = np.stack([one.rendered(np.zeros((1, 6)))[0][0] for one in besides])
+    known = [_depth_of_plane(top, window.rays), *shown]
+    without = without_object(window.depth, known, window.sigma)
+    return replace(window, others=shown, without=without)
 
 
 def _some_pixels(frame: Frame, part: Part) -> tuple[Float, Float]:
@@ -516,7 +537,23 @@ def changes(
     standing = _standing(_visible(seen), expected)
     camera = _camera_by(standing, expected)
     for _ in range(CAMERA_ROUNDS):
-        seen = [_refitted(one, camera, expected, top.up) for one in seen]
+        # others are known where they stand, but for the error of the camera
+        there = {
+            one.row: replace(
+                one.window.posed, pose=one.window.pose(one.expected(camera)[0])
+            )
+            for one in standing
+        }
+        seen = [
+            _refitted(
+                one,
+                [other for row, other in there.items() if row != one.row],
+                camera,
+                expected,
+                top,
+            )
+            for one in seen
+        ]
         standing = _standing(_visible(seen), expected)
         camera = _camera_by(standing, expected)
     found = [Change()] * len(tracks)
@@ -547,16 +584,20 @@ def _visible(seen: Sequence[_Seen]) -> list[_Seen]:
 
 def _refitted(
     one: _Seen,
+    others: Sequence[PoseCandidate],
     camera: CameraError,
     expected: CameraError,
-    up: Float,
+    top: TableTop,
 ) -> _Seen:
-    """The same object, looked for where an error of the camera would show it, too."""
+    """The same object beside others, looked for where an error of the camera would show it, too."""
+    window = _beside(one.window, top, others)
     start, _ = one.expected(camera)
     mean, covariance = one.expected(expected)
-    free = _free(covariance, up, MOVE_SCALES[-1], one.window.radius)
-    fit = _fitted(one.window, start, mean, free, STEPS[1:])
-    return replace(one, fit=max(one.fit, fit, key=lambda each: each.gain))
+    free = _free(covariance, top.up, MOVE_SCALES[-1], window.radius)
+    fit = _fitted(window, start, mean, free, STEPS[1:])
+    before = replace(one.fit, gain=window.gain(one.fit.motion))
+    best = max(before, fit, key=lambda each: each.gain)
+    return replace(one, window=window, fit=best)
 
 
 def _change_of(
@@ -587,8 +628,12 @@ def _change_of(
     if elsewhere < LEAST_ODDS or odds < 0:
         return Change(stands)
 
-    if not _well_known(track, tops):
-        return Change(stands)  # what else it may be explains as much
+    if not track.confident:
+        # what else it may be shows the same surface
+        by_points = _moved_by_points(one, away.motion - mean, camera, track, top)
+        odds = min(odds, by_points + float(np.log(MOVES / (1 - MOVES))))
+        if odds < 0:
+            return Change(stands)
 
     # where it stands now, but for the error of the camera; did it stand there all the time?
     pose = window.pose(away.motion - mean)
@@ -597,19 +642,30 @@ def _change_of(
     return Change(stands, odds, window.pose(away.motion))
 
 
-def _well_known(track: Track, tops: Sequence[TableTop]) -> bool:
-    """Whether an object is what it is called: that is confident, or its scan fits what was seen."""
-    if track.confident:
-        return True
-    explained = every = 0
-    for number, sighting in zip(track.frames, track.thing.sightings, strict=True):
-        rendered = render_track(track, tops[number], number, track.posed)
-        if rendered is None:
-            return False
-        one, other = rendered.fit(sighting.mask)
-        explained += one
-        every += other
-    return explained >= WELL_KNOWN * every
+def _moved_by_points(
+    one: _Seen,
+    motion: Float,
+    camera: CameraError,
+    track: Track,
+    top: TableTop,
+) -> float:
+    """Nats by which what was seen of an object last, whatever it is, moved rather than stands.
+
+    Args:
+        one: the object.
+        motion: by which it moved, (6,).
+        camera: the error of the frame's pose by the others.
+        track: the object.
+        top: what the frame shows.
+    """
+    place = one.window.centre
+    last = one.known[-1]
+    stands = camera.at(place) @ camera.motion - last.at(place) @ last.motion
+    _, covariance = one.expected(camera)
+    error = float(np.sqrt(np.trace(covariance[3:, 3:]) / 3))
+    ways = [_about(place, each) for each in (stands, stands + motion)]
+    still, moved = (_gain_of_points(track, top, way, error) for way in ways)
+    return moved - still
 
 
 def _told_before(track: Track, pose: Float, tops: Sequence[TableTop]) -> float:
@@ -676,11 +732,11 @@ class _Points:
     rays: Float
 
     @classmethod
-    def of(cls, track: Track, frame: Frame) -> _Points:
-        """Those of an object in a frame."""
+    def of(cls, track: Track, frame: Frame, motion: Float) -> _Points:
+        """Those of an object in a frame, after a motion in the world, (4, 4)."""
         last = track.thing.sightings[-1]
         few = slice(None, None, max(1, len(last.facets.planes) // POINTS))
-        pose = last.frame.camera_to_world
+        pose = motion @ last.frame.camera_to_world
         points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
         now = frame.camera_to_world
         inside = (points - now[:3, 3]) @ now[:3, :3]
@@ -696,11 +752,25 @@ class _Points:
 
 def _stands_by_points(track: Track, top: TableTop) -> float:
     """Nats by which an object of unknown shape stands where it was seen last, against gone."""
-    seen = _Points.of(track, top.frame)
+    last = track.thing.sightings[-1].frame
+    away = np.linalg.norm(track.thing.object_frame.centre - last.camera_to_world[:3, 3])
+    error = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * away)
+    return _gain_of_points(track, top, np.eye(4), float(error))
+
+
+def _gain_of_points(track: Track, top: TableTop, motion: Float, error: float) -> float:
+    """Nats by which what was seen of an object last shows after a motion, against the ground.
+
+    Args:
+        track: the object.
+        top: what the frame shows.
+        motion: in the world, (4, 4).
+        error: standard deviation of the place after it, metres.
+    """
+    seen = _Points.of(track, top.frame, motion)
     if not len(seen.surface):
         return 0.0
     depth = top.frame.depth[seen.row, seen.column].astype(np.float64)
-    error = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * seen.surface)
     sigma = np.hypot(top.noise.at(depth) * depth**2, error)
     ground = _depth_of_plane(top, seen.rays)
     gain = with_surface(depth, seen.surface, sigma)
@@ -711,7 +781,7 @@ def _stands_by_points(track: Track, top: TableTop) -> float:
 def _seen_behind(track: Track, top: TableTop) -> bool:
     """Whether a frame shows what is behind an object, wherever the error of its pose puts it."""
     frame = top.frame
-    seen = _Points.of(track, frame)
+    seen = _Points.of(track, frame, np.eye(4))
     if not len(seen.surface):
         return False
     aside = np.sqrt(2) * np.hypot(CAMERA_PLACE, CAMERA_AIM * np.median(seen.surface))
