@@ -39,8 +39,8 @@ STEPS = (0.006, 0.003, 0.0015, 0.001, 0.001)
 CAMERA_ROUNDS = 2  # in which objects and the error of the camera's pose tell each other
 PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))
-POINTS = 400
-SIGNIFICANT = 3.0  # standard deviations by which something lies behind an object
+POINTS_OF_OBJECT = 400
+DEVIATIONS_BEHIND = 3.0  # standard deviations by which something lies behind an object
 MOVE_SCALES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Standard deviations of how far what moves goes along the ground, metres: all as likely, from a
 nudge to the width of a table. What goes farther also turns more."""
@@ -735,7 +735,7 @@ class _Points:
     def of(cls, track: Track, frame: Frame, motion: Float) -> _Points:
         """Those of an object in a frame, after a motion in the world, (4, 4)."""
         last = track.thing.sightings[-1]
-        few = slice(None, None, max(1, len(last.facets.planes) // POINTS))
+        few = slice(None, None, max(1, len(last.facets.planes) // POINTS_OF_OBJECT))
         pose = motion @ last.frame.camera_to_world
         points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
         now = frame.camera_to_world
@@ -790,7 +790,7 @@ def _seen_behind(track: Track, top: TableTop) -> bool:
     nearest = ndimage.minimum_filter(depth, 2 * reach + 1)[seen.row, seen.column]
     noise = top.noise.at(nearest) * nearest**2
     sigma = np.hypot(noise, np.sqrt(2) * CAMERA_PLACE)
-    behind = nearest > seen.surface + SIGNIFICANT * sigma
+    behind = nearest > seen.surface + DEVIATIONS_BEHIND * sigma
     return bool(np.count_nonzero(behind) > len(behind) / 2)
 
 
