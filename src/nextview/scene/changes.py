@@ -538,7 +538,7 @@ def changes(
     camera = _camera_by(standing, expected)
     for _ in range(CAMERA_ROUNDS):
         # others are known where they stand, but for the error of the camera
-        there = {
+        places = {
             one.row: replace(
                 one.window.posed, pose=one.window.pose(one.expected(camera)[0])
             )
@@ -547,7 +547,7 @@ def changes(
         seen = [
             _refitted(
                 one,
-                [other for row, other in there.items() if row != one.row],
+                [other for row, other in places.items() if row != one.row],
                 camera,
                 expected,
                 top,
