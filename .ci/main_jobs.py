@@ -176,7 +176,7 @@ def stores_and_predictions() -> None:
         "--overwrite",
     )
     assert "DAMAGED" not in run("list", "models")
-    said = run("benchmark", "views.npz", "results", status=2)
+    said = run("benchmark", "classes", "views.npz", "results", status=2)
     assert "pip install 'nextview[benchmark]'" in said
     assert said.count("\n") == 1
     assert run("train", "recogniser", "--help").startswith(

@@ -1,4 +1,4 @@
-"""One table of several runs of ``nextview benchmark-things``, with one correction of all tests.
+"""One table of several runs of ``nextview benchmark things``, with one correction of all tests.
 
     python benchmarks/joined_things.py heavy half clear pairs
 
@@ -20,9 +20,9 @@ import numpy as np
 import pandas as pd
 import tyro
 
-from nextview.benchmark.statistics import holm
-from nextview.benchmark.thing_results import RECORD
-from nextview.benchmark.thing_tables import ALL, FAR_POSE, POSE_AFTER
+from nextview.benchmark.comparison import ALL, corrected
+from nextview.benchmark.results import RECORD, markdown
+from nextview.benchmark.thing_tables import FAR_POSE, POSE_AFTER
 from nextview.errors import UsageError
 
 COLUMNS = (
@@ -41,7 +41,7 @@ SURE = "views until confident"
 
 
 def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Measures and tests of all runs, each with a column "set"; "p_holm" is of all of them.
+    """Measures and tests of all runs, each with a column "run"; "p_holm" is of all of them.
 
     Args:
         runs: folders of results.
@@ -51,18 +51,17 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     for run in runs:
         if not (run / "tests.csv").is_file():
-            raise UsageError(f"{run}: holds no results of nextview benchmark-things")
+            raise UsageError(f"{run}: holds no results of nextview benchmark things")
         if asked_reference_of(run) != asked_reference_of(runs[0]):
             raise UsageError(
                 f"{run}: is compared with {asked_reference_of(run)}, and {runs[0]} with"
                 f" {asked_reference_of(runs[0])}; run one again with --reference"
             )
-    measures = [pd.read_csv(run / "measures.csv").assign(set=run.name) for run in runs]
-    tests = pd.concat(
-        [pd.read_csv(run / "tests.csv").assign(set=run.name) for run in runs]
+    measures, tests = (
+        [pd.read_csv(run / f"{name}.csv").assign(run=run.name) for run in runs]
+        for name in ("measures", "tests")
     )
-    tests["p_holm"] = holm(tests["p"].to_numpy(np.float64))
-    return pd.concat(measures), tests
+    return pd.concat(measures), corrected(tests)
 
 
 def reference_of(run: Path) -> str:
@@ -79,10 +78,12 @@ def asked_reference_of(run: Path) -> str:
 def tested(row: pd.Series, times: float, unit: str) -> str:
     """A difference to the reference with its interval and corrected p, in words."""
     low, high = (times * row[end] for end in ("low", "high"))
-    return f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){corrected(row)}"
+    return (
+        f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){p_of(row)}"
+    )
 
 
-def corrected(row: pd.Series) -> str:
+def p_of(row: pd.Series) -> str:
     """The corrected p of a test, in words; nothing for a ceiling."""
     return "" if np.isnan(row["p_holm"]) else f", p {max(row['p_holm'], 0.0001):.2g}"
 
@@ -107,7 +108,7 @@ def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[
     cells.append(tested(apart.loc["accuracy", 2], 100, "") if has_tests else "")
     cells.append(f"{until:.2f}")
     fewer = f"{of_all:.0f} %, {after_first:.0f} %"
-    cells.append(fewer + corrected(apart.loc[SURE, 0]) if has_tests else "")
+    cells.append(fewer + p_of(apart.loc[SURE, 0]) if has_tests else "")
     cells.append(f"{found['wrong, of the confident', 0]:.3f}")
     pose = [found[f"pose error, {name}", POSE_AFTER] for name in ("median", "95 %")]
     cells.append(", ".join(f"{error:.1f}" for error in pose))
@@ -123,11 +124,12 @@ def main(runs: tyro.conf.Positional[list[Path]], things: str = ALL) -> None:
         things: "all", or "confusable half".
     """
     measures, tests = read_runs(runs)
-    print("| " + " | ".join(COLUMNS) + " |")
-    print("|---" * len(COLUMNS) + "|")
+    rows = []
     for run in runs:
-        own = measures[(measures["set"] == run.name) & (measures["things"] == things)]
-        apart = tests[(tests["set"] == run.name) & (tests["things"] == things)]
+        own, apart = (
+            table[(table["run"] == run.name) & (table["set"] == things)]
+            for table in (measures, tests)
+        )
         reference = own[
             (own["policy"] == reference_of(run)) & (own["measure"] == SURE)
         ]["value"].item()
@@ -137,7 +139,8 @@ def main(runs: tyro.conf.Positional[list[Path]], things: str = ALL) -> None:
                 apart[apart["policy"] == policy],
                 reference,
             )
-            print("| " + " | ".join([run.name, policy, *cells]) + " |")
+            rows.append([run.name, policy, *cells])
+    print(markdown(COLUMNS, rows), end="")
 
 
 if __name__ == "__main__":

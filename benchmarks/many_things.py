@@ -240,7 +240,7 @@ class Outcome:
 
     Attributes:
         views: after how many.
-        by_features: whether features and size alone name it right.
+        by_outline: whether features and size alone name it right.
         right: whether it is named right with its geometry.
         confidence: belief in the answer.
         add_s: mean distance of the surface's points, diameters; None where the name is wrong.
@@ -248,7 +248,7 @@ class Outcome:
     """
 
     views: int
-    by_features: bool
+    by_outline: bool
     right: bool
     confidence: float
     add_s: float | None
@@ -337,7 +337,6 @@ def shown(
 
     elevations = np.arcsin(rng.uniform(0, np.sin(HIGHEST), 2 * max(VIEWS)))
     observations: list[Observation] = []
-    evidence: list[NDArray[np.floating]] = []
     outcomes = []
     for pose in look_at_origin(elevations, rng.uniform(0, 2 * np.pi, len(elevations))):
         observation = camera.observe(pose)
@@ -345,8 +344,7 @@ def shown(
             continue
         observations.append(observation)
         begun = time.process_time()
-        evidence.append(known.log_evidence([observation])[0])
-        found = known.verify(observations, np.stack(evidence))
+        found = known(observations)
         seconds = time.process_time() - begun
         outcomes.append(
             outcome(known, found, thing, true_pose, len(observations), seconds)
@@ -376,7 +374,7 @@ def outcome(
         apart = float(distances.mean()) / surface.diameter
     return Outcome(
         views,
-        int(found.by_features.argmax()) == thing,
+        int(found.by_outline.argmax()) == thing,
         answer == thing,
         float(found.belief.max()),
         apart,
@@ -395,7 +393,7 @@ def table(outcomes: Sequence[Outcome]) -> Iterator[str]:
         wrong = [not one.right and one.confidence >= CONFIDENT for one in some]
         cells = (
             f"{views}",
-            f"{np.mean([one.by_features for one in some]):.3f}",
+            f"{np.mean([one.by_outline for one in some]):.3f}",
             f"{np.mean([one.right for one in some]):.3f}",
             f"{np.mean(wrong):.3f}",
             f"{np.mean(posed):.3f}" if posed else "-",

@@ -63,7 +63,7 @@ class Named:
         frame: name of the frame.
         thing: its label.
         by: how it was given: by a point or by a mask.
-        by_features: the answer by features and size alone.
+        by_outline: the answer by features and size alone.
         answer: the answer with the geometry.
         among_three: whether the thing is among the first three.
         confidence: belief in the answer.
@@ -75,7 +75,7 @@ class Named:
     frame: str
     thing: str
     by: str
-    by_features: str
+    by_outline: str
     answer: str
     among_three: bool
     confidence: float
@@ -179,9 +179,8 @@ def name_one(
         print(f"{given['name']} {name} by {by}: {error}")
         return None
 
-    evidence = things.log_evidence([view])
     begun = time.process_time()
-    found = things.verify([view], evidence)
+    found = things([view])
     seconds = time.process_time() - begun
 
     number = things.names.index(name)
@@ -192,7 +191,7 @@ def name_one(
         frame=str(given["name"]),
         thing=name,
         by=by,
-        by_features=things.names[found.by_features.argmax()],
+        by_outline=things.names[found.by_outline.argmax()],
         answer=things.names[found.belief.argmax()],
         among_three=number in np.argsort(-found.belief)[:3],
         confidence=float(found.belief.max()),
@@ -309,7 +308,7 @@ def taught(
     for path in paths:
         for each in named_in(things, path, names, matrix, learned):
             found.append(each)
-            said = f"{each.by_features} | {each.answer} | {each.confidence:.2f}"
+            said = f"{each.by_outline} | {each.answer} | {each.confidence:.2f}"
             print(
                 f"| {each.frame} | {each.thing} | {each.by} | {said} | {each.residual:.2f} |"
                 f" {each.overlap:.2f} |"
@@ -318,7 +317,7 @@ def taught(
     print()
     for by in ("point", "mask"):
         some = [each for each in found if each.by == by]
-        features = sum(each.by_features == each.thing for each in some)
+        features = sum(each.by_outline == each.thing for each in some)
         right = sum(each.answer == each.thing for each in some)
         three = sum(each.among_three for each in some)
         overlap = np.mean([each.overlap for each in some])

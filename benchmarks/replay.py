@@ -21,9 +21,9 @@ require("benchmark")
 import numpy as np
 import tyro
 
+from nextview.benchmark.class_tables import summarise
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
-from nextview.benchmark.summary import summarise
 from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.geometry.viewsphere import ViewSphere

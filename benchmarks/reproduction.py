@@ -19,11 +19,12 @@ require("benchmark")
 import numpy as np
 import tyro
 
+from nextview.benchmark.class_tables import ClassTables, summarise
+from nextview.benchmark.comparison import ALL, SIGNIFICANT
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.leaderboard import SIGNIFICANT, nothing_differs
+from nextview.benchmark.leaderboard import nothing_differs
 from nextview.benchmark.published import published, published_threshold
 from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
-from nextview.benchmark.summary import Tables, summarise
 from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
@@ -76,8 +77,9 @@ def _p(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
-def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
-    rows = tables.tests[tables.tests["measure"] == measure]
+def tests_of(tables: ClassTables, measure: str) -> dict[tuple[str, float], Compared]:
+    rows = tables.tests[tables.tests["set"] == ALL]
+    rows = rows[rows["measure"] == measure]
     columns = ["policy", "threshold", "difference", "low", "high", "p_holm"]
     return {
         (policy, t): Compared(*rest)
@@ -99,9 +101,11 @@ def page(predictions: Path, samples: int = 2000) -> str:
         name: summarise(grid, name, samples, np.random.default_rng([0, 1]))
         for name in references
     }
+    measures = tables["random"].measures
     rows = (
-        tables["random"]
-        .summary[["policy", "threshold", "measure", "value", "low", "high"]]
+        measures[measures["set"] == ALL][
+            ["policy", "threshold", "measure", "value", "low", "high"]
+        ]
         .to_numpy(object)
         .tolist()
     )
@@ -136,7 +140,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
             " views; the same first views for every policy and threshold. In brackets: 95 %"
             " bootstrap intervals over objects. p-values are by sign flips over objects, after one"
             " Holm correction over all that is compared with the same policy: every other one,"
-            " published, learned or oracle, at every threshold, as in `nextview benchmark`."
+            " published, learned or oracle, at every threshold, as in `nextview benchmark classes`."
             " Differences of accuracy are in percentage points."
         ),
         "",
@@ -184,8 +188,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "## At the published thresholds",
         "",
         (
-            "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`. Published:"
-            " tables 5, 8 and 9."
+            "`nextview benchmark classes predictions.npz results --uncalibrated`; `measures.csv`."
+            " Published: tables 5, 8 and 9."
         ),
         "",
         (
@@ -220,7 +224,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Every policy at threshold {AT}",
         "",
-        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`.",
+        "`nextview benchmark classes predictions.npz results --uncalibrated`; `measures.csv`.",
         "",
         "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
         "|---|---|---|---|---|---|",
@@ -243,8 +247,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
         f"## Accuracy against each baseline at threshold {AT}, points",
         "",
         (
-            "`nextview benchmark predictions.npz results --uncalibrated --reference BASELINE`;"
-            " `tests.csv`."
+            "`nextview benchmark classes predictions.npz results --uncalibrated --reference"
+            " BASELINE`; `tests.csv`."
         ),
         "",
         "| policy | what it knows | "
@@ -281,7 +285,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "## Fixed views",
         "",
         (
-            "`summary.csv`, rows without a threshold. Published: tables 3 and 12, from a network"
+            "`measures.csv`, rows without a threshold. Published: tables 3 and 12, from a network"
             " for 40 classes."
         ),
         "",

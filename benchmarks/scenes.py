@@ -34,10 +34,11 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from nextview.benchmark.class_tables import grid_mean, levels_of
+from nextview.benchmark.comparison import Counted, Key, corrected
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.replay import Grid, make_specs, run_grid
-from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
-from nextview.benchmark.summary import grid_mean, levels_of
+from nextview.benchmark.statistics import interval, resample
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.metrics import calibration_error
@@ -224,30 +225,29 @@ def compared(
     samples: int,
     rng: np.random.Generator,
 ) -> pd.DataFrame:
-    """All with random, and ours with its rivals: points and interval; of the latter p, and p
-    after Holm.
+    """All with random, and ours with its rivals; only the latter are tested, with one Holm
+    correction.
     """
-    rows = []
+    tests = []
     for level, of in scenes.items():
-        weights = resample(len(of[REFERENCE].right), samples, rng) / len(
-            of[REFERENCE].right
+        count = len(of[REFERENCE].right)
+        sums = {
+            Key(name, None, k, "accuracy"): (reached.right[:, k - 1], np.ones(count))
+            for name, reached in of.items()
+            for k in COUNTS
+        }
+        counted = Counted.of(sums, np.arange(count))
+        weights = resample(count, samples, rng)
+        others = counted.tests(
+            level, weights, REFERENCE, lambda key: key.policy != ours
         )
-        pairs = [(name, REFERENCE) for name in of if name not in (REFERENCE, ours)]
-        pairs += [(ours, rival) for rival in rivals if rival in of]
-        for name, other in pairs:
-            against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
-            mean = against.mean(0)
-            drawn = weights @ against
-            p = sign_flip_p(against) if name == ours else np.full(len(COUNTS), np.nan)
-            rows += [
-                (level, name, other, *row)
-                for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)
-            ]
-    table = pd.DataFrame(
-        rows,
-        columns=["level", "policy", "other", "views", "points", "low", "high", "p"],
-    )
-    return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
+        tests.append(others)
+        tests += [
+            counted.tests(level, weights, rival, lambda key: key.policy == ours)
+            for rival in rivals
+            if rival in of
+        ]
+    return corrected(tests, lambda policy: policy != ours)
 
 
 def show(scenes: dict[str, dict[str, Reached]], table: pd.DataFrame, ours: str) -> None:
@@ -267,13 +267,14 @@ def show(scenes: dict[str, dict[str, Reached]], table: pd.DataFrame, ours: str) 
             + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS)
             + " |"
         )
-        for (name, other), rows in table[table["level"] == level].groupby(
-            ["policy", "other"],
+        for (name, other), rows in table[table["set"] == level].groupby(
+            ["policy", "reference"],
             sort=False,
         ):
             cells = []
             for row in rows.itertuples():
-                points = f"{100 * row.points:+.1f} ({100 * row.low:+.1f} to {100 * row.high:+.1f})"
+                lead, low, high = 100 * row.difference, 100 * row.low, 100 * row.high
+                points = f"{lead:+.1f} ({low:+.1f} to {high:+.1f})"
                 cells += [
                     known[name][row.views],
                     points + ("" if np.isnan(row.p_holm) else f", {row.p_holm:.2g}"),

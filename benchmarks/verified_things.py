@@ -145,7 +145,7 @@ class Outcome:
     Attributes:
         thing: number of the thing.
         views: after how many.
-        by_features: whether the features alone name it right.
+        by_outline: whether the features alone name it right.
         answer: the thing believed most.
         confidence: belief in it.
         seconds: of CPU from the last frame to the decision.
@@ -163,7 +163,7 @@ class Outcome:
 
     thing: int
     views: int
-    by_features: bool
+    by_outline: bool
     answer: int
     confidence: float
     seconds: float
@@ -392,7 +392,7 @@ def judged(
 ) -> Outcome:
     """Recognise the thing of an episode after some views, among some things."""
     begun = time.process_time()
-    found = things.verify(episode.observations[:views], episode.log_evidence[:views])
+    found = things(episode.observations[:views])
     seconds = episode.seconds + time.process_time() - begun
 
     answer = int(some[found.belief.argmax()])
@@ -404,7 +404,7 @@ def judged(
     return Outcome(
         thing=episode.thing,
         views=views,
-        by_features=int(some[found.by_features.argmax()]) == episode.thing,
+        by_outline=int(some[found.by_outline.argmax()]) == episode.thing,
         answer=answer,
         confidence=float(found.belief.max()),
         seconds=seconds,
@@ -550,7 +550,7 @@ def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
     wrong = np.mean([not o.right and o.confidence >= CONFIDENT for o in some])
     return (
         f"{views}",
-        f"{np.mean([o.by_features for o in some]):.3f}",
+        f"{np.mean([o.by_outline for o in some]):.3f}",
         f"{len(right) / len(some):.3f}",
         f"{calibration_error(some):.3f}",
         f"{wrong:.3f}",

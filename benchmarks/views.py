@@ -1,12 +1,11 @@
-"""``nextview benchmark --views`` with a choice of policies and references of its own, and its
-figure.
+"""``nextview benchmark classes --views`` with policies and references of its own, and its figure.
 
     python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5]
         [--against lem ...]
 
-Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy
-against travel) into the folder, and prints the table. The gap is that between random and
-oracle-gain, which sees what every view of the window would say.
+Writes views.md (the table), measures.csv and tests.csv (every number in a row of its own) and
+front.png (accuracy against travel) into the folder, and prints the table. The gap is that between
+random and oracle-gain, which sees what every view of the window would say.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ require("benchmark")
 
 import matplotlib
 import numpy as np
-import pandas as pd
 import tyro
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -31,10 +29,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
+from nextview.benchmark.class_tables import ONE_STEP, after_views
+from nextview.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
 from nextview.benchmark.figures import OWN, POLICY_COLOURS
+from nextview.benchmark.leaderboard import after_views_rows
 from nextview.benchmark.replay import Grid, make_specs, run_grid
-from nextview.benchmark.views import CEILING, as_rows, by_key, markdown, measured
+from nextview.benchmark.results import markdown
+from nextview.benchmark.statistics import resample_families, target_families
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
@@ -84,7 +86,7 @@ def families(
 
 
 def front(
-    table: pd.DataFrame,
+    tables: Tables,
     travel_weights: dict[str, list[tuple[float, str]]],
 ) -> Figure:
     """Accuracy against travel, a panel for each number of views; what takes the truth is only named
@@ -93,8 +95,12 @@ def front(
     A line joins the travel weights of one policy. Dots are filled where p against random,
     corrected, is under 0.05.
     """
-    found = by_key(table)
-    n_views = table["n_views"].unique().tolist()
+    found = values_of(tables, ALL)
+    table = tables.measures
+    n_views = [int(k) for k in table["views"].unique()]
+    tests = tables.tests[tables.tests["reference"] == REFERENCES[0]]
+    sure = tests[tests["p_holm"] < SIGNIFICANT]
+    differs = set(zip(sure["policy"], sure["views"], strict=True))
     at_prices = {name for members in travel_weights.values() for _, name in members}
     drawn = [name for name in table["policy"].unique() if not knows_truth(name)]
     names = [
@@ -123,7 +129,7 @@ def front(
         lines = []
         for axes, k in zip(panels, n_views, strict=True):
             place = {
-                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0])
+                name: (found[name, "travel", k][0], found[name, "accuracy", k][0])
                 for name in names
             }
             for members in travel_weights.values():
@@ -136,7 +142,7 @@ def front(
                 )
                 lines.append((axes, line))
             for name, (x, y) in place.items():
-                clear = found[name, k, "to_random"][4] < 0.05
+                clear = (name, k) in differs
                 axes.plot(
                     x,
                     y,
@@ -151,8 +157,8 @@ def front(
             axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=1))
             axes.set_xlabel("mean travel, grid cells")
             above = [
-                f"{name}: {100 * found[name, k, 'accuracy'][0]:.1f} % for"
-                f" {found[name, k, 'travel'][0]:.1f} cells"
+                f"{name}: {100 * found[name, 'accuracy', k][0]:.1f} % for"
+                f" {found[name, 'travel', k][0]:.1f} cells"
                 for name in table["policy"].unique()
                 if knows_truth(name)
             ]
@@ -183,7 +189,7 @@ def front(
         figure.set_layout_engine("none")
         for axes, k in zip(panels, n_views, strict=True):
             points = {
-                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0])
+                name: (found[name, "travel", k][0], found[name, "accuracy", k][0])
                 for name in names
             }
             label(
@@ -293,7 +299,7 @@ def main(
 
     Args:
         predictions: made by nextview predict.
-        out: folder for views.md, views.csv and front.png.
+        out: folder for views.md, measures.csv, tests.csv and front.png.
         policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by
             default a choice of those that the predictions allow.
         views: after how many the policies are compared.
@@ -318,7 +324,7 @@ def main(
     specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
     names = list(
-        dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING])
+        dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), ONE_STEP])
     )
     grid = Grid(specs, runs, (), max(views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
@@ -332,11 +338,19 @@ def main(
     compared = [
         name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths
     ]
-    found = measured(grid, sorted(set(views)), samples, compared)
-    text = markdown(as_rows(found), list(grid.failures.values()))
+    drawn_together = target_families(table.names)
+    weights = resample_families(
+        drawn_together, samples, np.random.default_rng([seed, 1])
+    )
+    both = after_views(grid, sorted(set(views)), weights, compared)
+    found = Tables(*both, compared[0])
+    rows = after_views_rows(found)
+    left_out = [f"\nLeft out: {sentence}\n" for sentence in grid.failures.values()]
+    text = "".join([markdown(rows.columns, rows.itertuples(index=False)), *left_out])
     out.mkdir(parents=True, exist_ok=True)
     (out / "views.md").write_text(text, encoding="utf-8")
-    found.to_csv(out / "views.csv", index=False)
+    for name, frame in found.frames().items():
+        frame.to_csv(out / f"{name}.csv", index=False)
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
     to_png(front(found, families(choosing, specs)), out / "front.png")
     print(text, end="")

@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from nextview.benchmark.classes import chosen_split
 from nextview.benchmark.evaluation import judged_objects
 from nextview.benchmark.page import words
-from nextview.benchmark.run import chosen_split
 from nextview.benchmark.true_maps import known_maps, true_map
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console

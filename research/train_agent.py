@@ -5,9 +5,9 @@ ONNX beside it.
     python -m research.train_agent mvselect validation.npz agents/mvselect.json
 
 The card is one of a gain policy: the network takes and gives what that of ``Gain`` does, so it is
-read and run in the same way (``nextview benchmark test.npz --policies agents/ppo.json``). But its
-scores are the action values of Q-learning, or the logits of a policy gradient's actor, and the
-highest free view wins.
+read and run in the same way (``nextview benchmark classes test.npz --policies agents/ppo.json``).
+But its scores are the action values of Q-learning, or the logits of a policy gradient's actor, and
+the highest free view wins.
 """
 
 from __future__ import annotations

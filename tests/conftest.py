@@ -23,6 +23,7 @@ from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.teaching.learn import learn
+from nextview.things.memory import open_memory
 
 LONG = (
     "test_workflow.py",
@@ -141,6 +142,21 @@ def ycb():
 def ycb_meshes():
     """Some of these things, by name."""
     return meshes_of(("cracker_box", "mug", "banana", "tomato_soup_can"))
+
+
+@pytest.fixture(scope="session")
+def household(shared) -> Path:
+    """Scans of ten things that the bundled memory knows, metres."""
+
+    def make(folder: Path) -> None:
+        names = [thing.name for thing in open_memory("ycb")[0].memory.things][:10]
+        for name, mesh in meshes_of(names).items():
+            placed = mesh.vertices * mesh.metres + mesh.centre
+            trimesh.Trimesh(placed, mesh.faces, process=False).export(
+                folder / f"{name}.ply"
+            )
+
+    return shared("household", make)
 
 
 @pytest.fixture(scope="session")

@@ -304,9 +304,12 @@ def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
 
 
 def benchmark(predictions: Path, out: Path, **settings):
-    from nextview.benchmark.run import BenchmarkSettings, run_benchmark  # takes pandas
+    from nextview.benchmark.classes import (  # takes pandas
+        ClassSettings,
+        benchmark_classes,
+    )
 
-    return run_benchmark(predictions, out, BenchmarkSettings(**settings))
+    return benchmark_classes(predictions, out, ClassSettings(**settings))
 
 
 def store_of(

@@ -14,11 +14,11 @@ import pytest
 from pipeline import benchmark, refused
 
 from nextview.benchmark import leaderboard
+from nextview.benchmark.classes import load
 from nextview.benchmark.leaderboard import promised_risks
 from nextview.benchmark.published import ACCURACY, published, read_table
 from nextview.benchmark.replay import make_specs, replay, truncate
 from nextview.benchmark.report import report
-from nextview.benchmark.run import load
 from nextview.cli.main import main
 from nextview.data.metrics import calibration_error
 from nextview.data.predictions import Predictions
@@ -73,9 +73,8 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
     rows["clean"] = ~rows["object"].isin(
         np.array(predictions.names)[predictions.conflicting]
     )
-    summary = pd.read_csv(results / "out" / "summary.csv").set_index(
-        ["policy", "threshold", "measure"]
-    )["value"]
+    measures = pd.read_csv(results / "out" / "measures.csv").query("set == 'all'")
+    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
     for (policy, threshold), cell in rows.groupby(
         ["policy", "threshold"],
         observed=True,
@@ -120,6 +119,7 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
     main(
         [
             "benchmark",
+            "classes",
             str(tmp_path / "p.npz"),
             str(tmp_path / "out"),
             "--policies",
@@ -161,6 +161,7 @@ def test_a_stopping_rule_of_ones_own_decides_in_the_command(
     main(
         [
             "benchmark",
+            "classes",
             str(tmp_path / "p.npz"),
             str(tmp_path / "out"),
             "--policies",
@@ -187,6 +188,7 @@ def test_a_stopping_rule_of_ones_own_decides_in_the_command(
     assert len(set(ends.n_views)) > 1
     wrong = (
         "benchmark",
+        "classes",
         tmp_path / "p.npz",
         tmp_path / "no",
         "--stopping",
@@ -204,6 +206,7 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
     sentences = refused(
         capsys,
         "benchmark",
+        "classes",
         results / "p.npz",
         tmp_path / "own",
         "--policies",
@@ -213,7 +216,7 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
     )
     assert all(part in sentences for part in ("Raises", "thing_11", "lcm", "best-99"))
     found = load(tmp_path / "own")
-    assert set(found.tables.summary.policy) == {"random", "test_replay:Asked"}
+    assert set(found.tables.measures.policy) == {"random", "test_replay:Asked"}
     assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
 
 
@@ -269,9 +272,8 @@ def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path
     )["page"]
     text = page(results / "p.npz", samples=200)
     benchmark(results / "p.npz", tmp_path / "full", samples=200)
-    summary = pd.read_csv(tmp_path / "full" / "summary.csv").set_index(
-        ["policy", "threshold", "measure"]
-    )["value"]
+    measures = pd.read_csv(tmp_path / "full" / "measures.csv").query("set == 'all'")
+    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
     tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(
         ["policy", "threshold", "measure"]
     )
@@ -324,13 +326,15 @@ def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where
     capsys,
 ):
     run = ["--policies", "lem", "oracle-gain", "--runs", "3", "--samples", "200"]
-    main(["benchmark", str(results / "p.npz"), str(tmp_path / "board"), *run])
+    main(
+        ["benchmark", "classes", str(results / "p.npz"), str(tmp_path / "board"), *run]
+    )
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     shown = " ".join(" ".join(lines).split())
     of = (
         load(tmp_path / "board")
-        .tables.summary.query("threshold == 0.97")
+        .tables.measures.query("set == 'all' and threshold == 0.97")
         .set_index(["policy", "measure"])
     )
     lem = of.loc["lem", "accuracy"]
@@ -361,13 +365,13 @@ def test_measured_error_rates_stand_beside_the_promised_ones(
         samples=50,
     )
     rows = pd.read_parquet(rates / "episodes.parquet")
-    risks = found.tables.risks
-    assert set(zip(risks.policy, risks.risk, risks.threshold, strict=True)) == {
+    risks = promised_risks(found.tables, found.settings["risks"])
+    assert {(row.policy, row.risk, row.threshold) for row in risks} == {
         (name, *promise)
         for name in ("random", "lem")
         for promise in ((0.1, 0.8), (0.2, 0.7))
     }
-    for row in risks.itertuples():
+    for row in risks:
         cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
         stopped = cell[cell.confidence >= row.threshold]
         assert row.error == pytest.approx(
@@ -375,20 +379,21 @@ def test_measured_error_rates_stand_beside_the_promised_ones(
         )
         assert row.confident == pytest.approx(len(stopped) / len(cell))
         assert row.low <= row.error <= row.high
-    assert any(
-        promise.broken for promise in promised_risks(found.tables)
-    )  # the logits are noise
+    assert any(promise.broken for promise in risks)  # the logits are noise
     assert capsys.readouterr().out == ""  # the library prints nothing
     report(rates)
     assert "Promised error rates" in (rates / "report.html").read_text()
 
 
 def test_so_few_objects_that_nothing_can_be_significant_are_warned_of():
-    tests = pd.DataFrame({"policy": ["spread"] * 4, "measure": ["accuracy"] * 4})
-    few = SimpleNamespace(tests=tests.assign(threshold=0.9, low=-0.1, high=0.1))
-    # Of six objects no choice of signs is rarer than 2 of 64, and four tests are corrected.
-    said = leaderboard.too_few(few, 0.9, [f"t{k}" for k in range(6)])
-    assert "no p-value of 6 is below 0.031, and 4 tests" in said
-    assert "Too few objects" in leaderboard.too_few(
-        few, 0.9, [f"t{k}" for k in range(16)]
+    tests = pd.DataFrame(
+        {"set": ["all"] * 4, "policy": ["spread"] * 4, "views": [0] * 4}
     )
+    ends = {"threshold": 0.9, "p": 0.5, "low": -0.1, "high": 0.1}
+    tests = tests.assign(measure="accuracy", **ends)
+    # Of six objects no choice of signs is rarer than 2 of 64, and four tests are corrected.
+    few = SimpleNamespace(tests=tests.assign(families=6))
+    said = leaderboard.too_few_objects(few, 0.9, 6)
+    assert "no p-value of 6 is below 0.031, and 4 tests" in said
+    more = SimpleNamespace(tests=tests.assign(families=16))
+    assert "Too few objects" in leaderboard.too_few_objects(more, 0.9, 16)

@@ -234,7 +234,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
     ("package", "arguments", "extra"),
     [
         ("torch", ["train", "recogniser", "s", "run"], "train"),
-        ("pandas", ["benchmark", "p.npz"], "benchmark"),
+        ("pandas", ["benchmark", "classes", "p.npz"], "benchmark"),
     ],
 )
 def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
@@ -261,7 +261,7 @@ PathFinder.find_spec = staticmethod(find)
 NEED_EXTRAS = {
     "from nextview.viewers.recording import Recorder": "record",
     "import nextview.benchmark.environments": "envs",
-    "from nextview.benchmark.run import run_benchmark": "benchmark",
+    "from nextview.benchmark.classes import benchmark_classes": "benchmark",
     "from nextview.benchmark.report import report": "benchmark",
     "from nextview.benchmark.evaluation_page import write_evaluation": "benchmark",
     "from nextview.viewers.page import Page": "explore",
@@ -312,7 +312,7 @@ HELPS = [
     "train gain",
     "export map",
     "evaluate",
-    "benchmark",
+    "benchmark classes",
     "report",
 ]
 ALL_HELPS = f"""

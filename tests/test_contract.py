@@ -278,6 +278,7 @@ def table(folder):
     main(
         [
             "benchmark",
+            "classes",
             str(folder / "p.npz"),
             str(folder / "out"),
             "--policies",
@@ -285,7 +286,7 @@ def table(folder):
             *how,
         ]
     )
-    rows = pd.read_csv(folder / "out" / "summary.csv")
+    rows = pd.read_csv(folder / "out" / "measures.csv").query("set == 'all'")
     rows = rows[rows.measure.isin(MEASURES) & rows.threshold.isin([0.8, 0.97])]
     return {
         f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high]

@@ -196,7 +196,7 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     view = depth_view(replace(found, scene=scene), 40)
 
     caster = surfaces_of(*meshes)
-    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1)
     centre = mesh.centre
     placed = replace(placed, centres=caster.centres.astype(float) - centre)
     said = likelihood(view, render(caster, placed, view, 0)).mean
@@ -240,7 +240,7 @@ def outlook_of(belief, taken=1) -> Outlook:
         weights=EvidenceWeights(),
         pixels=PixelModel(),
         prior=RegistrationPrior(),
-        likeliest=start(np.array([0]), np.eye(3)[None], 0),
+        likeliest=start(np.array([0]), np.eye(3)[None], np.zeros((1, 3)), 0),
         views=(),
     )
 
@@ -322,11 +322,7 @@ def test_a_policy_without_known_geometry_says_so():
 
 def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
-    verifier = Verifier(
-        [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)],
-        [0, 1],
-        [np.eye(3)] * 2,
-    )
+    verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)])
     sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
     block = trimesh.creation.box((0.2, 1.0, 1.5))
     block.apply_translation((1.8, 0.0, 0.0))  # object radii
@@ -338,7 +334,7 @@ def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     )
     camera = SensedCamera(meshes[1], sensor, np.random.default_rng(0), around=obstacle)
     observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
-    found = verifier(observations, np.full((2, 16), 1 / 32))
+    found = verifier(observations)
     outlook = Outlook.of(verifier, found, observations)
     assert outlook.taken == 2
     assert outlook.distance == pytest.approx(AWAY, rel=1e-3)

@@ -20,7 +20,7 @@ from test_policies import SPHERE, state_of
 torch = pytest.importorskip("torch")
 
 import nextview
-from nextview.benchmark.run import load as load_results
+from nextview.benchmark.classes import load as load_results
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
@@ -696,7 +696,15 @@ def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_show
         "0.999",
     ]
     main(
-        ["benchmark", str(fresh), str(tmp_path / "out"), *run, "--policies", str(card)]
+        [
+            "benchmark",
+            "classes",
+            str(fresh),
+            str(tmp_path / "out"),
+            *run,
+            "--policies",
+            str(card),
+        ]
     )
     episodes = load_results(tmp_path / "out").episodes(str(card), 0.999)
     rows = [p.names.index(name) for name in episodes["object"].astype(str)]
@@ -712,6 +720,7 @@ def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_show
     said = refused(
         capsys,
         "benchmark",
+        "classes",
         fresh,
         tmp_path / "none",
         *run,

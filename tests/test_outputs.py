@@ -51,15 +51,20 @@ WRITES = {
     ),
     "learn": ("learn {scan}", "folder", "--upright --workers 0"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
-    "benchmark": (
-        "benchmark {predictions}",
+    "benchmark classes": (
+        "benchmark classes {predictions}",
         "folder",
         "--split test --runs 1 --samples 10 --policies random",
     ),
-    "benchmark-things": (
-        "benchmark-things {knobs}",
+    "benchmark things": (
+        "benchmark things {knobs}",
         "folder",
         "--models {knobs_memory} --policies random --repeats 1 --views 1 2 --workers 0",
+    ),
+    "benchmark tables": (
+        "benchmark tables {household} {scan}",
+        "folder",
+        "--tables 1 --seed 11 --views 1 --policies random --samples 100 --workers 0",
     ),
     "report": ("report {results}/out", "r.html"),
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
@@ -73,7 +78,8 @@ WRITES = {
 }
 """Arguments before the output, the name of the output, and arguments after it."""
 OWN_ONLY = {
-    "benchmark-things",
+    "benchmark tables",
+    "benchmark things",
     "render",
     "scenes",
     "train map",
@@ -92,6 +98,7 @@ def made(
     results,
     knobs,
     knobs_memory,
+    household,
     tmp_path_factory,
 ):
     """What the commands work on; the store is a copy."""
@@ -116,6 +123,7 @@ def made(
         "training": training,
         "knobs": knobs,
         "knobs_memory": knobs_memory,
+        "household": household,
     }
 
 

@@ -233,7 +233,7 @@ SMALL = {
     "predict": "--workers 0",
     "fit calibration": "--delta 0.2",
     "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
-    "benchmark": "--runs 2 --samples 100",
+    "benchmark classes": "--runs 2 --samples 100",
 }
 """What makes a command of the page quick."""
 
@@ -265,7 +265,7 @@ def test_making_it_ones_own_works_from_the_first_line_to_the_last(
         if line.startswith("nextview recognise "):
             assert "It is a" in capsys.readouterr().out
     assert (there / "benchmark/leaderboard.md").exists() or (
-        there / "benchmark/summary.csv"
+        there / "benchmark/measures.csv"
     ).exists()
     assert list(there.rglob("*.html"))
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pipeline import benchmark, scene_predictions, some_predictions, store_of
 
+from nextview.benchmark.classes import load
 from nextview.benchmark.leaderboard import level_differences
 from nextview.benchmark.published import ACCURACY, read_table
 from nextview.benchmark.report import pictures_of, report
-from nextview.benchmark.run import load
-from nextview.cli.leaderboard_table import print_leaderboard
+from nextview.cli.benchmark_tables import print_leaderboard
 from nextview.errors import ResultsError
 
 
@@ -73,7 +73,7 @@ def test_the_page_is_whole_and_needs_nothing_from_outside(made):
 
 def test_the_tables_show_the_numbers_of_the_results(made):
     text = (made / "out" / "report.html").read_text()
-    summary = load(made / "out").tables.summary
+    summary = load(made / "out").tables.measures.query("set == 'all'")
     for policy in ("random", "lem", "oracle-gain"):
         row = re.search(rf'<tr><th scope="row">{policy}\b.*?</tr>', text)[0]
         cells = re.findall(r"<td>([\d.]+)", row)
@@ -131,15 +131,11 @@ def scenes(cluttered_views, tmp_path_factory):
 
 def test_the_page_of_scenes_compares_by_clutter_and_prints_nothing_published(scenes):
     text = (scenes.folder / "report.html").read_text()
-    levels = scenes.tables.levels["level"].unique()
-    for level in levels:
-        # and label
-        assert (
-            text.count(
-                f"{level.capitalize()} clutter, 2 scenes: accuracy after a fixed number"
-            )
-            == 2
-        )
+    after = scenes.tables.measures.query("views > 0")
+    assert len(after["set"].unique()) == 3
+    for level in after["set"].unique():
+        shown = f"{level.capitalize()}, 2 scenes: accuracy after a fixed number"
+        assert text.count(shown) == 2  # and label
     for wrong in (
         ">published ",
         "as published",
@@ -148,7 +144,7 @@ def test_the_page_of_scenes_compares_by_clutter_and_prints_nothing_published(sce
         "oracle-valley",
     ):
         assert wrong not in text
-    assert scenes.tables.summary["published"].isna().all()
+    assert scenes.tables.measures["published"].isna().all()
     assert not re.search(r"[>(: ]-0\.0[ <)]", text)
     assert text.count("data:image/webp") > 3
 
@@ -160,8 +156,11 @@ def test_the_page_shows_levels_and_the_terminal_says_what_differs(scenes, capsys
         r"<td>([\d.]+)",
         re.search(r'<tr><th scope="row">visibility.*?</tr>', heavy)[0],
     )
-    of = scenes.tables.levels.query("level == 'heavy' and policy == 'visibility'")
-    assert {f"{accuracy:.3f}" for accuracy in of["accuracy"]} <= {*cells}
+    of = scenes.tables.measures.query(
+        "set == 'heavy clutter' and policy == 'visibility' and measure == 'accuracy'"
+    )
+    assert len(of)
+    assert {f"{accuracy:.3f}" for accuracy in of["value"]} <= {*cells}
     print_leaderboard(scenes)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
@@ -169,9 +168,10 @@ def test_the_page_shows_levels_and_the_terminal_says_what_differs(scenes, capsys
 
 
 def test_the_terminal_says_which_policies_differ_by_clutter(scenes, capsys):
-    levels = scenes.tables.levels.copy()
-    levels.loc[levels["policy"] == "visibility", "p_holm"] = 0.001
-    found = replace(scenes, tables=replace(scenes.tables, levels=levels))
+    tests = scenes.tables.tests.copy()
+    at_levels = (tests["policy"] == "visibility") & (tests["set"] != "all")
+    tests.loc[at_levels, "p_holm"] = 0.001
+    found = replace(scenes, tables=replace(scenes.tables, tests=tests))
     print_leaderboard(found)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80

@@ -177,7 +177,7 @@ def test_where_to_look_next_shows_what_was_hidden(ycb, ycb_meshes):
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     hidden = set(ycb_meshes) - set(by_name(scene))
-    assert hidden == {"mug"}
+    assert "mug" in hidden
     assert not scene.done
 
     scene.update(camera.frame(scene.target))

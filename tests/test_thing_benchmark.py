@@ -13,9 +13,9 @@ import pytest
 import trimesh
 from msgspec.structs import replace as replace_record
 
-from nextview.benchmark import thing_benchmark as stage
+from nextview.benchmark import things as stage
 from nextview.benchmark.confusable import Alikeness, how_alike
-from nextview.benchmark.thing_benchmark import ThingSettings, benchmark_things
+from nextview.benchmark.results import compared_markdown, latex
 from nextview.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     VISIBLE_SHARES,
@@ -24,11 +24,10 @@ from nextview.benchmark.thing_episodes import (
     ThingEpisode,
     hiding_boxes,
 )
-from nextview.benchmark.thing_jobs import opened
 from nextview.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
-from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
-from nextview.benchmark.thing_results import latex, markdown
-from nextview.benchmark.thing_tables import Compared, summarise_things
+from nextview.benchmark.thing_runs import EpisodeRuns, ThingRun, opened
+from nextview.benchmark.thing_tables import summarise_things
+from nextview.benchmark.things import ThingSettings, benchmark_things
 from nextview.cli.main import main
 from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
 from nextview.files import read_record
@@ -110,7 +109,8 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
         stage, "work", lambda job: pytest.fail("nothing was left to do")
     )
     line = [
-        "benchmark-things",
+        "benchmark",
+        "things",
         knobs,
         results,
         "--models",
@@ -322,9 +322,9 @@ def test_some_of_the_things_are_shown_and_all_may_be_believed(
     few = replace(settings, policies=("random",))
     tables = benchmark_things(tmp_path / "scans", tmp_path / "out", few, workers=0)
     assert tables.episodes == 1
-    assert tables.alike["thing"].tolist() == ["plain"]
-    assert tables.alike["most_alike"].tolist() == ["knob"]
-    assert set(tables.measures["things"]) == {"all"}
+    assert tables.things["thing"].tolist() == ["plain"]
+    assert tables.things["most_alike"].tolist() == ["knob"]
+    assert set(tables.measures["set"]) == {"all"}
 
 
 def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
@@ -459,7 +459,7 @@ def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
     capsys,
 ):
     out = tmp_path / "out"
-    line = ["benchmark-things", knobs, out, "--recogniser", f"{__name__}:AlwaysCan"]
+    line = ["benchmark", "things", knobs, out, "--recogniser", f"{__name__}:AlwaysCan"]
     line += ["--views", 1, 2, "--policies", "random", "fixed", "--workers", 0]
     main([str(word) for word in line])
     assert "fixed" in capsys.readouterr().out
@@ -585,7 +585,7 @@ def test_what_is_explained_badly_is_not_sure_as_in_a_session():
         p_value=[0.05, 0.3, 0.01],
     )
     alike = Alikeness(("a_x",), ("a_x",), np.array([np.inf]))
-    how = Compared(("random",), (1, 2, 3), 0.97, False, 100)
+    how = ThingSettings(views=(1, 2, 3), threshold=0.97, families=False, samples=100)
     measures = summarise_things([episode], alike, how).measures
     values = measures.set_index("measure")["value"]
     assert values["views until confident"] == 2
@@ -606,9 +606,9 @@ def test_measures_are_those_of_a_hand_count():
         ("a_y", "a_x", "a_x"),
         np.array([0.1, 0.2, 0.3]),
     )
-    how = Compared(("random", "spread"), (1, 2, 3), 0.97, True, 2000)
+    how = ThingSettings(views=(1, 2, 3), threshold=0.97, families=True, samples=2000)
     tables = summarise_things(episodes, alike, how)
-    rows = tables.measures.set_index(["things", "policy", "measure", "views"])["value"]
+    rows = tables.measures.set_index(["set", "policy", "measure", "views"])["value"]
     random = rows["all", "random"]
     assert random["accuracy", 2] == pytest.approx(1 / 3)
     assert random["accuracy", 3] == 1
@@ -623,7 +623,7 @@ def test_measures_are_those_of_a_hand_count():
     )
     assert steps > 0
     difference = tables.tests.query(
-        "things == 'all' and measure == 'accuracy' and views == 2"
+        "set == 'all' and measure == 'accuracy' and views == 2"
     )
     assert difference["difference"].iloc[0] == pytest.approx(2 / 3)
     # Two families: in a quarter of the samples both draws are the family b, and so on.
@@ -648,7 +648,7 @@ def test_p_values_of_families_are_those_of_a_brute_force():
     rng = np.random.default_rng(4)
     names = tuple(f"{letter}_{k}" for letter in "abcdefgh" for k in range(2))
     alike = Alikeness(names, names, np.arange(16.0))
-    how = Compared(("random", "spread"), (1, 2), 0.97, True, 100)
+    how = ThingSettings(views=(1, 2), threshold=0.97, families=True, samples=100)
     right = rng.random((16, 2)) < (0.3, 0.9)
     episodes = [
         both(
@@ -659,7 +659,7 @@ def test_p_values_of_families_are_those_of_a_brute_force():
         for name, (a, b) in zip(names, right, strict=True)
     ]
     tests = summarise_things(episodes, alike, how).tests
-    row = tests.query("things == 'all' and measure == 'accuracy'").iloc[0]
+    row = tests.query("set == 'all' and measure == 'accuracy'").iloc[0]
     lead = (right[:, 1].astype(float) - right[:, 0]).reshape(8, 2).sum(1)
     sums = [abs(np.dot(signs, lead)) for signs in product((1, -1), repeat=8)]
     assert row["p"] == pytest.approx(np.mean(np.array(sums) >= abs(lead.sum())))
@@ -667,7 +667,7 @@ def test_p_values_of_families_are_those_of_a_brute_force():
 
     pose = rng.gamma(2, 2, (16, 2)) * (2, 1)
     tests = summarise_things(paired(names, pose), alike, how).tests
-    row = tests.query("things == 'all' and measure == 'pose error, 95 %'").iloc[0]
+    row = tests.query("set == 'all' and measure == 'pose error, 95 %'").iloc[0]
 
     def far(errors):
         ordered = np.sort(errors)
@@ -688,21 +688,21 @@ def test_so_few_things_that_nothing_can_be_significant_are_warned_of(tmp_path):
         alike = Alikeness(names, names, np.arange(float(count)))
         lost = ([False, False], [0.5, 0.6], [0, 1])
         won = ([False, True], [0.5, 0.99], [0, 1])
-        how = Compared(("random", "spread"), (1, 2), 0.97, False, 100)
+        how = ThingSettings(views=(1, 2), threshold=0.97, families=False, samples=100)
         return summarise_things([both(name, lost, won) for name in names], alike, how)
 
     few = of(6)
-    accuracy = few.tests.query("things == 'all' and measure == 'accuracy'").iloc[0]
+    accuracy = few.tests.query("set == 'all' and measure == 'accuracy'").iloc[0]
     # All six are better, and 2 of 64 choices of signs are as clear.
     assert accuracy["p"] == pytest.approx(2 / 64)
     assert accuracy["p_holm"] > 0.05
-    said = markdown(few)
+    said = compared_markdown(few)
     assert "all: Too few to tell: no p-value of 6 is below 0.031, and " in said
     assert "confusable half: Too few to tell: no p-value of 3 is below 0.25" in said
 
     many = of(24)
     assert (many.tests["p_holm"].dropna() < 0.05).any()
-    assert "Too few" not in markdown(many)
+    assert "Too few" not in compared_markdown(many)
 
 
 def test_the_policies_are_compared_with_the_one_that_was_asked_for(
@@ -711,7 +711,7 @@ def test_the_policies_are_compared_with_the_one_that_was_asked_for(
     settings,
     capsys,
 ):
-    line = ["benchmark-things", knobs, results, "--models", settings.models]
+    line = ["benchmark", "things", knobs, results, "--models", settings.models]
     line += ["--views", 1, 2, "--policies", "random", "--reference", "geometry"]
     main([str(word) for word in [*line, "--repeats", 1, "--workers", 0]])
     assert "* differs from geometry" in capsys.readouterr().out
@@ -735,7 +735,7 @@ def test_no_difference_is_no_discovery_and_a_sure_one_is():
     rng = np.random.default_rng(1)
     names = tuple(f"t{k}" for k in range(60))
     alike = Alikeness(names, names, np.arange(60.0))
-    how = Compared(("random", "spread"), (1, 2), 0.97, False, 2000)
+    how = ThingSettings(views=(1, 2), threshold=0.97, families=False, samples=2000)
     found = []
     for lead in (0.0, 0.5):
         episodes = []
@@ -749,7 +749,7 @@ def test_no_difference_is_no_discovery_and_a_sure_one_is():
                 )
             )
         tests = summarise_things(episodes, alike, how).tests
-        accuracy = tests[(tests["measure"] == "accuracy") & (tests["things"] == "all")]
+        accuracy = tests[(tests["measure"] == "accuracy") & (tests["set"] == "all")]
         found.append(float(accuracy["p_holm"].iloc[0]))
     assert found[0] > 0.05
     assert found[1] < 1e-3
@@ -770,22 +770,21 @@ def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings
     text = latex(tables)
     assert r"Best\_50\%" in text
     assert text.count("{") == text.count("}")
-    columns = re.search(r"tabular\}\{@\{\}(\w+)@", text).group(1)
+    columns = [len(found) for found in re.findall(r"tabular\}\{(\w+)\}", text)]
+    assert len(columns) == 2
     bodies = [
         line for line in text.splitlines() if line.endswith(r"\\") and "&" in line
     ]
-    assert len(bodies) == 1 + 2 * 3
-    assert all(
-        len(re.findall(r"(?<!\\)&", line)) == len(columns) - 1 for line in bodies
-    )
-    assert "| my_module:Best_50% |" in markdown(tables)
+    assert len(bodies) == 2 * (1 + 3)
+    assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in bodies} == {*columns}
+    assert "| my_module:Best_50% |" in compared_markdown(tables)
 
 
 def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsys):
     again = shutil.copytree(results, tmp_path / "again")
     _, alone = JOINED["read_runs"]([results])
     measures, both = JOINED["read_runs"]([results, again])
-    assert set(measures["set"]) == {results.name, "again"}
+    assert set(measures["run"]) == {results.name, "again"}
     # Twice as many tests: the least p-value is multiplied by twice as much, up to 1.
     least = alone["p"].min()
     count = alone["p"].notna().sum()

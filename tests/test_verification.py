@@ -29,13 +29,11 @@ from nextview.things.depth_view import (
 from nextview.things.fusion import fuse
 from nextview.things.ground import levelling
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.proposals import propose
 from nextview.things.registration import (
     COARSE_LEVELS,
     FINE,
     FIRST,
     align,
-    centred,
     different_poses,
     inverses,
     render,
@@ -139,10 +137,16 @@ def aligned(
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
-    found = start(np.zeros(len(yaws), int), rotation_z(yaws), len(observations))
+    seen = np.mean([np.median(view.thing_points, axis=0) for view in coarse], axis=0)
+    found = start(
+        np.zeros(len(yaws), int),
+        rotation_z(yaws),
+        np.tile(seen, (len(yaws), 1)),
+        len(observations),
+    )
     found = align(
         caster,
-        centred(caster, found, coarse),
+        found,
         coarse,
         (*FIRST, *COARSE_LEVELS),
     )
@@ -215,10 +219,12 @@ def test_a_missing_handle_lowers_the_likelihood():
     for handle in (True, False):
         observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
         view = depth_view(observation, SIDE)
-        found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+        found = start(
+            np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1
+        )
         found = align(
             caster,
-            centred(caster, found, [view]),
+            found,
             [view],
             (*FIRST, *COARSE_LEVELS, *FINE),
         )
@@ -277,10 +283,10 @@ def test_the_ground_tells_the_vertical_and_the_noise():
 
 
 def test_a_thing_is_found_upright_on_a_table_that_leans():
-    mesh = cup(True)
+    mesh = mesh_of(((0.1, 0.08, 0.1), (0, 0, 0)), ((0.05, 0.02, 0.04), (0.07, 0, 0.02)))
     lean = Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_z(0.7)
     observation = standing_view(mesh, lean, noise=0.003)
-    found = verifier_of(mesh, l_block())([observation], even_belief(2))
+    found = verifier_of(mesh, l_block())([observation])
     true = np.eye(4)
     true[:3, :3] = lean
     true[:3, 3] = -(lean @ mesh.centre + rotated(mesh, lean).centre)
@@ -296,7 +302,7 @@ def test_nothing_reaches_below_the_ground():
     high = mesh_of(((0.08, 0.06, 0.09), (0, 0, 0)))
     observation = standing_view(low, np.eye(3), noise=0.002)
     caster = SurfaceCaster([Surface.from_mesh(mesh, "block") for mesh in (low, high)])
-    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1)
     lowered = replace(placed, centres=np.array([[0, 0, 0], [0, 0, -0.025]]))
     view = depth_view(observation, SIDE)
     fits, sunk = likelihood(view, render(caster, lowered, view, 0)).mean
@@ -311,7 +317,7 @@ def test_hypotheses_that_come_to_one_pose_are_one():
         [Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))]
     )
     turns = rotation_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
-    placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
+    placed = start(np.array([0, 0, 1, 0, 0]), turns, np.zeros((5, 3)), 1)
     placed.centres[4, 0] += 0.01
     assert different_poses(caster, placed).tolist() == [0, 2, 3, 4]
 
@@ -350,7 +356,11 @@ def block_view():
     mesh = l_block()
     observation = views_of(mesh, directions=VIEWS[:1])[0]
     caster = SurfaceCaster([Surface.from_mesh(mesh, "block")])
-    return observation, caster, start(np.zeros(1, int), np.eye(3)[None], 1)
+    return (
+        observation,
+        caster,
+        start(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), 1),
+    )
 
 
 def mean_likelihood(observation, caster, placed) -> float:
@@ -522,41 +532,16 @@ def test_a_small_part_is_not_simplified_away_and_does_not_spoil_the_rest(body, p
         assert np.mean(off[exact > 0] > 0.003) < 0.01
 
 
-def test_few_are_proposed_where_it_is_clear_and_a_ball_does_not_crowd_out_the_rest():
-    clear = np.full((50, 16), 1e-12)
-    clear[7, 3] = 1
-    found = propose(clear / clear.sum())
-    assert len(found) == 24
-    assert found.hypotheses[0] == 7
-    assert -2 * np.pi * 3 / 16 in found.azimuths[found.hypotheses == 7].tolist()
-
-    rng = np.random.default_rng(0)
-    unclear = rng.uniform(0.9, 1, (50, 16))
-    unclear[4] = 20  # every azimuth suits it
-    found = propose(unclear / unclear.sum())
-    assert 90 < len(found) <= 96
-    assert np.bincount(found.hypotheses).max() == (found.hypotheses == 4).sum() == 8
-    assert len(set(found.hypotheses.tolist())) > 20
-
-
-def even_belief(hypotheses: int) -> np.ndarray:
-    return np.full((hypotheses, 16), 1 / 16 / hypotheses)
-
-
 def verifier_of(*meshes: Mesh) -> Verifier:
     surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
-    return Verifier(
-        surfaces,
-        np.arange(len(meshes)),
-        np.tile(np.eye(3), (len(meshes), 1, 1)),
-    )
+    return Verifier(surfaces)
 
 
 @pytest.mark.parametrize("shown", [0, 1, 2])
 def test_a_thing_is_named_by_its_geometry_alone(shown):
     meshes = [l_block(), cup(True), cup(False)]
     verifier = verifier_of(*meshes)
-    found = verifier(views_of(meshes[shown], 0.8)[:2], even_belief(3))
+    found = verifier(views_of(meshes[shown], 0.8)[:2])
     assert found.belief.argmax() == shown
     assert found.belief[shown] > 0.9
     np.testing.assert_allclose([found.belief.sum(), found.probabilities.sum()], 1)
@@ -569,7 +554,8 @@ def test_a_thing_is_named_by_its_geometry_alone(shown):
         meshes[shown].centre,
     )
     assert moved < 1.5
-    assert turn < 1 or shown == 2  # the cup without a handle has four azimuths
+    # The cups look the same upside down, and the one without a handle at four azimuths.
+    assert turn < 1 or shown == 2 or (shown == 1 and turn > 179)
 
 
 def test_a_pose_that_a_near_symmetry_leads_to_is_looked_at():
@@ -587,7 +573,7 @@ def test_a_pose_that_a_near_symmetry_leads_to_is_looked_at():
     near = find_near_symmetries(Surface.from_mesh(mesh, "box"))
     assert {one.order for one in near} == {2}
     verifier.rivals = (rival_turns(near),)
-    found = verifier(views, even_belief(1))
+    found = verifier(views)
     assert (np.trace(found.poses[0][:3, :3].T @ over) - 1) / 2 > np.cos(np.radians(2))
     assert found.probabilities[0] > 0.9
 
@@ -603,26 +589,20 @@ def test_the_turns_of_near_symmetries_are_those_of_their_orders():
 
 def test_two_things_of_the_same_geometry_share_the_belief():
     verifier = verifier_of(cup(True), cup(True), l_block())
-    found = verifier(views_of(cup(True), 0.3), even_belief(3))
+    found = verifier(views_of(cup(True), 0.3))
     np.testing.assert_allclose(found.belief[:2], 0.5, atol=0.1)
 
 
-def test_what_does_not_fit_together_is_refused():
-    verifier = verifier_of(cup(True), l_block())
-    with pytest.raises(ModelError, match="a belief in 5 hypotheses, and there are 2"):
-        verifier(views_of(cup(True)), even_belief(5))
-    surfaces = [Surface.from_mesh(cup(True), "cup")]
-    with pytest.raises(ModelError, match="1 surfaces do not fit 2 resting poses"):
-        Verifier(surfaces, np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)))
+def test_views_that_do_not_show_the_thing_are_refused():
     nothing = [
         replace(each, depth=np.zeros_like(each.depth)) for each in views_of(cup(True))
     ]
     with pytest.raises(ObservationError, match="no view shows the thing"):
-        verifier(nothing, even_belief(2))
+        verifier_of(cup(True))(nothing)
 
 
 def residual_of(verifier: Verifier, mesh: Mesh) -> Verified:
-    return verifier(views_of(mesh, 0.3)[:2], even_belief(len(verifier.owners)))
+    return verifier(views_of(mesh, 0.3)[:2])
 
 
 def test_what_no_hypothesis_explains_has_a_small_p_value():
@@ -684,29 +664,29 @@ def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
 
 def episode(
     geometry: float,
-    features: float,
+    outlines: float,
     truth: int = 0,
     views: int = 1,
 ) -> JudgedEpisode:
-    """Two things; by how much geometry, in each view, and features speak for the first one."""
+    """Two things; by how much geometry, in each view, and outlines speak for the first one."""
     mean = np.tile([[geometry], [0.0]], (1, views))
-    by_features = np.exp([features, 0.0])
-    by_features /= by_features.sum()
+    by_outline = np.exp([outlines, 0.0])
+    by_outline /= by_outline.sum()
     costs = np.zeros((2, views))
     return JudgedEpisode(
         truth,
         np.array([0, 1]),
         mean,
         costs,
-        np.log(by_features),
-        by_features,
+        np.log(by_outline),
+        by_outline,
     )
 
 
 def test_the_belief_follows_from_the_sum_of_what_is_weighed():
     weights = EvidenceWeights(
         geometry=10,
-        features=0.5,
+        outlines=0.5,
         cameras=0.2,
         correlation=0.5,
         doubt=0.0,
@@ -715,21 +695,21 @@ def test_the_belief_follows_from_the_sum_of_what_is_weighed():
     belief = episode(0.3, -1.0, views=2).belief(weights)
     np.testing.assert_allclose(belief[0] / belief[1], np.exp(log_odds))
     doubting = replace(weights, doubt=0.1)
-    by_features = 1 / (1 + np.exp(1.0))
-    mixed = 0.9 * belief[0] + 0.1 * by_features
+    by_outline = 1 / (1 + np.exp(1.0))
+    mixed = 0.9 * belief[0] + 0.1 * by_outline
     np.testing.assert_allclose(episode(0.3, -1.0, views=2).belief(doubting)[0], mixed)
 
 
 @pytest.mark.parametrize(
-    ("trusted", "geometry", "features"),
-    [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)],
+    ("trusted", "geometry", "outlines"),
+    [("geometry", 0.1, -1.0), ("outlines", -0.1, 1.0)],
 )
-def test_what_misleads_is_given_the_least_weight(trusted, geometry, features):
+def test_what_misleads_is_given_the_least_weight(trusted, geometry, outlines):
     fitted = fit_weights(
-        [episode(geometry, features), episode(-geometry, -features, truth=1)]
+        [episode(geometry, outlines), episode(-geometry, -outlines, truth=1)]
     )
     assert fitted.geometry == (60 if trusted == "geometry" else 5)
-    assert fitted.features == (0.2 if trusted == "geometry" else 1)
+    assert fitted.outlines == (0.2 if trusted == "geometry" else 1)
 
 
 def test_views_that_err_together_are_not_trusted_as_many():
@@ -935,8 +915,12 @@ def can(knob: bool) -> Mesh:
 @pytest.mark.parametrize("yaw", [10, 40, 55])
 def test_a_small_part_of_a_round_thing_is_found(yaw):
     verifier = verifier_of(can(True), can(False))
+    verifier.rivals = tuple(
+        rival_turns(find_near_symmetries(surface))
+        for surface in verifier.caster.surfaces
+    )
     observation = views_of(can(True), np.radians(yaw), [(25.0, 30.0)])
-    found = verifier(observation, even_belief(2))
+    found = verifier(observation)
     assert found.belief.argmax() == 0
     turned = np.degrees(np.arctan2(found.poses[0, 1, 0], found.poses[0, 0, 0]))
     assert turned == pytest.approx(yaw, abs=3)

@@ -30,7 +30,7 @@ DEFAULTS = EvidenceWeights()
 
 def shown(thing, views, rng, things, gap=0.3, lie=0.0):
     """An episode in which the truth is explained better by a gap, but for a share of lies, and
-    features say nothing.
+    outlines say nothing.
     """
     mean = (
         -0.1
@@ -92,11 +92,11 @@ def test_the_accuracy_is_that_of_weights_that_were_fitted_to_other_things():
     things = 10
     fit = fit_verification(episodes(things, gap=0.0), np.arange(things))
     assert fit.accuracy[0] < 0.5
-    assert fit.by_features == (
+    assert fit.by_outline == (
         0.1,
         0.1,
         0.1,
-    )  # features say nothing: the first thing is named
+    )  # outlines say nothing: the first thing is named
     a, b, share = fit.confused[0]
     assert 0 <= a < b < things
     assert 0 < share <= 1
@@ -202,9 +202,9 @@ def blocks(tmp_path_factory):
 def test_learn_says_how_often_things_are_named_right_by_their_geometry(blocks):
     folder, learned = blocks
     assert learned.judged == 4
-    assert len(learned.accuracy) == len(learned.by_features) == 3
+    assert len(learned.accuracy) == len(learned.by_outline) == 3
     assert learned.accuracy[2] >= 0.8
-    assert "by features and size alone" in str(learned)
+    assert "by outline and size alone" in str(learned)
     card = read_card(folder / "mine/memory.json")
     assert card.scores["verified by geometry"]["3"] == pytest.approx(
         learned.accuracy[2],

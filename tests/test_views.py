@@ -36,15 +36,12 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
         "samples": 200,
     }
     tables = benchmark(made / "p.npz", out, **settings).tables
-    found = (
-        pd.read_csv(made / "out" / "views.csv")
-        .set_index(["policy", "n_views", "measure"])
-        .sort_index()
-    )
+    keys = ["policy", "views", "measure"]
+    found = pd.read_csv(made / "out" / "measures.csv").set_index(keys).sort_index()
+    apart = pd.read_csv(made / "out" / "tests.csv").query("reference == 'random'")
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
-        summary = tables.summary[tables.summary["measure"] == theirs].set_index(
-            "policy"
-        )
+        of_all = tables.measures.query("set == 'all'").set_index(["measure", "policy"])
+        summary = of_all.loc[theirs]
         for name in names:
             for column in ("value", "low", "high"):
                 assert found.loc[name, n_views, ours][column] == pytest.approx(
@@ -52,25 +49,23 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
                     abs=1e-9,
                 )
     tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
+    after = apart[apart["views"] == n_views].set_index("policy")
     for name in names[1:]:
-        for ours, theirs in (
-            ("value", "difference"),
-            ("low", "low"),
-            ("high", "high"),
-            ("p", "p"),
-        ):
-            assert found.loc[name, n_views, "to_random"][ours] == pytest.approx(
-                tests.loc[name, theirs],
+        for column in ("difference", "low", "high"):
+            assert after.loc[name, column] == pytest.approx(
+                tests.loc[name, column],
                 abs=1e-9,
             )
+        if name == "oracle-gain":  # it is no rival
+            assert np.isnan(after.loc[name, "p"])
+        else:
+            assert after.loc[name, "p"] == pytest.approx(tests.loc[name, "p"], abs=1e-9)
 
 
 def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
-    found = (
-        pd.read_csv(made / "out" / "views.csv")
-        .set_index(["measure", "n_views", "policy"])["value"]
-        .sort_index()
-    )
+    keys = ["measure", "views", "policy"]
+    measures = pd.read_csv(made / "out" / "measures.csv")
+    found = measures.set_index(keys)["value"].sort_index()
     for n_views in (2, 4):
         accuracy, share = found["accuracy", n_views], found["share_of_gap", n_views]
         assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
@@ -81,13 +76,14 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
 
 
 def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
-    """``nextview benchmark --views``, from the same first views; then figures and tables for
-    papers.
+    """``nextview benchmark classes --views``, from the same first views; then figures
+    and tables for papers.
     """
     out = made / "command"
     main(
         [
             "benchmark",
+            "classes",
             str(made / "p.npz"),
             str(out),
             "--policies",
@@ -106,16 +102,23 @@ def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
         ]
     )
     assert "| policy | 2 views | 4 views |" in capsys.readouterr().out
-    keys = ["policy", "n_views", "measure"]
-    ours, script = (
-        pd.read_csv(f / "views.csv").set_index(keys).sort_index()
-        for f in (out, made / "out")
-    )
-    shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
-    for column in ("value", "low", "high", "p"):
+    keys = ["policy", "views", "measure"]
+    for name, columns in (
+        ("measures", ["value", "low", "high"]),
+        ("tests", ["difference", "low", "high", "p"]),
+    ):
+        ours, script = (
+            pd.read_csv(folder / f"{name}.csv").query("set == 'all' and views > 0")
+            for folder in (out, made / "out")
+        )
+        if name == "tests":
+            script = script[script["reference"] == "random"]
+        ours, script = (each.set_index(keys).sort_index() for each in (ours, script))
+        shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
+        assert len(shared) > 3
         np.testing.assert_allclose(
-            ours.loc[shared, column],
-            script.loc[shared, column],
+            ours.loc[shared, columns],
+            script.loc[shared, columns],
             atol=1e-9,
         )
     assert (out / "views.md").read_text().startswith("| policy | 2 views")
@@ -133,6 +136,7 @@ def test_more_views_than_are_taken_are_refused(made, capsys):
     words = refused(
         capsys,
         "benchmark",
+        "classes",
         made / "p.npz",
         made / "no",
         "--views",

@@ -29,8 +29,8 @@ EXAMPLES = {
         "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'"
     ),
     "benchmark": (
-        "from nextview.benchmark.run import run_benchmark; from nextview.benchmark.report import"
-        " report"
+        "from nextview.benchmark.classes import benchmark_classes;"
+        " from nextview.benchmark.report import report"
     ),
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
     "bags": "import rosbags; from nextview.captured.bag import Bag",

@@ -138,7 +138,7 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
         "fit valleys",
         "train gain",
         "evaluate",
-        "benchmark",
+        "benchmark classes",
         "report",
     ):
         assert f"nextview {command} " in planned

@@ -64,7 +64,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
     r"benchmarks/(real_frames|segmentation)\.py": "needs real frames, which are not part of this",
-    r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
+    r"^nextview benchmark tables": "needs scans of all things that the bundled memory knows",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
     r"^nextview download": (
@@ -89,7 +89,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
-    r"look_alikes|benchmark-things (YCB|HALF_SCANS)|joined_things": (
+    r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
         "needs the YCB scans, and minutes"
     ),
     r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
@@ -114,7 +114,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
-    r"nextview (benchmark|benchmark-things|evaluate|report) ": "nextview[benchmark]",
+    r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
     r"benchmarks/(ablations|views)\.py|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
@@ -136,8 +136,8 @@ SMALL = {  # options that make a command quick
     "nextview train segmentation": "--frames 8 --epochs 1 --batch 4 --width 4 --workers 1",
     "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
     "nextview fit calibration": "--delta 0.2",
-    "nextview benchmark": "--runs 2 --samples 100",
-    "nextview benchmark-things": (
+    "nextview benchmark classes": "--runs 2 --samples 100",
+    "nextview benchmark things": (
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
     "python -m research.train_agent": "--steps 2000",

@@ -21,7 +21,8 @@ require("benchmark")
 
 import pandas as pd
 
-from nextview.benchmark.leaderboard import SIGNIFICANT, is_oracle
+from nextview.benchmark.comparison import ALL, SIGNIFICANT
+from nextview.benchmark.entries import is_oracle
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 
@@ -78,6 +79,12 @@ def shown(cell: Cell | None, digits: int = 3, interval: bool = True) -> str:
 def published(cell: Cell | None, digits: int = 3) -> str:
     """The published number, if there is one."""
     return "" if cell is None or not isfinite(cell[3]) else f"{cell[3]:.{digits}f}"
+
+
+def whole_episodes(file: Path) -> pd.DataFrame:
+    """The rows of a table of results that are of whole episodes of all objects."""
+    table = pd.read_csv(file)
+    return table[(table["set"] == ALL) & (table["views"] == 0)]
 
 
 def objects(predictions: str) -> int:
@@ -246,15 +253,15 @@ def maps(stage: Path) -> Iterator[str]:
 def comparison(stage: Path) -> Iterator[str]:
     """All policies at one threshold."""
     settings = json.loads((stage / "benchmark.json").read_text())
-    summary = pd.read_csv(stage / "summary.csv")
-    tests = pd.read_csv(stage / "tests.csv")
+    summary = whole_episodes(stage / "measures.csv")
+    tests = whole_episodes(stage / "tests.csv")
     decay = settings["threshold_decay"]
     yield from wrap(
         f"{settings['runs']} first views per object, the same for every policy. The threshold is"
         f" {THRESHOLD} at the first view and decreases with every view (decay {decay:g}); at most"
         f" {settings['max_views']} views. Travel is the mean over all episodes, including those"
         f" that never moved. p: sign-flip test of the accuracy against `{settings['reference']}`,"
-        " with Holm's correction over all policies and thresholds. `summary.csv`, `tests.csv`.",
+        " with Holm's correction over all policies and thresholds. `measures.csv`, `tests.csv`.",
         WIDTH,
     )
     yield ""
@@ -341,7 +348,9 @@ def measures(stage: Path) -> Iterator[str]:
 def risk(stage: Path) -> Iterator[str]:
     """What became of the promised error rates."""
     settings = json.loads((stage / "benchmark.json").read_text())
-    found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
+    found = cells(
+        whole_episodes(stage / "measures.csv"), "policy", "threshold", "measure"
+    )
     yield from wrap(
         "With `--risk` an episode stops at the lowest threshold at which at most that share of"
         " the early stops is wrong on the validation objects. Test split:",

@@ -158,6 +158,7 @@ def test_the_benchmark_takes_agents_beside_the_others(trained, tmp_path):
     main(
         [
             "benchmark",
+            "classes",
             str(tmp_path / "test.npz"),
             str(out),
             "--policies",

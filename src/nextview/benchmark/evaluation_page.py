@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from msgspec.structs import replace
 
 from nextview.benchmark import figures as draw
+from nextview.benchmark.classes import chosen_split
 from nextview.benchmark.evaluation import Evaluation, evaluate, scores_for_card
 from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import comparable_classes, published_recognisers
-from nextview.benchmark.run import chosen_split
 from nextview.data.predictions import Predictions
 from nextview.errors import ModelError
 from nextview.files import check_new, new_folder, only_one, sha256_of

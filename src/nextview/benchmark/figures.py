@@ -7,11 +7,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from nextview.benchmark.class_tables import ONE_STEP, ClassResults
+from nextview.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
-from nextview.benchmark.leaderboard import SIGNIFICANT, headline_threshold
+from nextview.benchmark.leaderboard import headline_threshold
 from nextview.benchmark.page import words
-from nextview.benchmark.run import Results
 from nextview.checks import extras
 from nextview.recognition.map_names import LCM, LEM
 from nextview.session.style import (
@@ -33,6 +34,7 @@ POLICY_COLOURS = {
     "gain": "#b5179e",
     "random-all": "#4a5560",
     "furthest": "#d99000",
+    "spread": "#7b2d00",
     "unidirectional": LIGHT_BLUE,
     LEM: BLUE,
     f"{LEM}-peak": "#7a6fd0",
@@ -45,10 +47,16 @@ POLICY_COLOURS = {
     f"true-{LCM}": "#00805a",
     "oracle-gain": "#111111",
     "oracle-gain-all": "#777777",
+    "fixed": "#7a6fd0",
+    "ring": "#b3a000",
+    "picture": "#5bb98c",
+    "geometry": ACCENT,
+    "pose": BLUE,
+    "ceiling": "#111111",
+    "target": ACCENT,
 }
 # all others, in turn
 OWN = (
-    "#7b2d00",
     "#3a7d00",
     "#7209b7",
     "#00a3a3",
@@ -57,64 +65,91 @@ OWN = (
     "#ff7043",
     "#5c6bc0",
 )
+FORESEES = (
+    "ceiling",
+    ONE_STEP,
+    f"{ONE_STEP}-all",
+)  # what comes of a view: drawn dotted
+LOWEST_AXIS = 0.9  # share that the axis reaches down to, at least
 MOST_CURVES = 8  # curves of policies that a robot could follow, at most
 
 
-def ceiling(results: Results) -> list[str]:
+def ceiling(results: ClassResults) -> list[str]:
     """Return the oracle of one step ahead, in the window or over all views.
 
     It is empty if neither was run.
     """
     ran = set(results.tables.sweep["policy"])
-    return [name for name in ("oracle-gain", "oracle-gain-all") if name in ran][:1]
+    return [name for name in FORESEES if name in ran][:1]
 
 
-def compared(results: Results) -> list[str]:
+def compared(results: ClassResults) -> list[str]:
     """Return the policies of the curves.
 
     They are the reference, the most accurate others, the published oracle and the upper bound.
     """
     names = list(results.tables.sweep["policy"].unique())
     reference = results.settings["reference"]
-    summary = results.tables.summary
     headline = headline_threshold(results.settings["thresholds"])
-    at = (summary["measure"] == "accuracy") & (summary["threshold"] == headline)
-    accuracy = summary[at].set_index("policy")["value"]
+    values = values_of(results.tables, ALL, headline)
     robots = sorted(
         (n for n in names if not is_oracle(n)),
-        key=lambda n: (n != reference, -accuracy[n]),
+        key=lambda n: (n != reference, -values[n, "accuracy", 0][0]),
     )[:MOST_CURVES]
     return [n for n in names if n in robots] + [
         n for n in ("oracle-valley", *ceiling(results)) if n in names
     ]
 
 
-def look_of(policy: str, results: Results) -> dict:
+def look_of(policy: str, tables: Tables) -> dict[str, Any]:
     """Return the colour and the line style of a policy, the same in all figures.
 
     Args:
         policy: its name.
-        results: of the benchmark.
+        tables: that name all policies.
 
     Returns:
-        Keyword arguments of ``plot``; no two compared policies have the same.
+        Keyword arguments of ``plot``; no two of eight policies without a colour have the same.
     """
-    own = [
-        name
-        for name in (*compared(results), *results.tables.sweep["policy"].unique())
-        if name not in POLICY_COLOURS
-    ]
-    colour = (
-        POLICY_COLOURS.get(policy)
-        or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
-    )
-    line = (
-        ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
-    )
+    own = [name for name in tables.policies() if name not in POLICY_COLOURS]
+    colour = POLICY_COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
+    line = ":" if policy in FORESEES else "--" if is_oracle(policy) else "-"
     return {"color": colour, "linestyle": line}
 
 
-def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:
+def views_curve(tables: Tables, measure: str, what: str) -> Figure:
+    """Draw a share against the number of views, with 95 % intervals.
+
+    Args:
+        tables: of the benchmark.
+        measure: name of the share.
+        what: the same in words.
+    """
+    figure, axes = new_figure(4.6, 3.5)
+    values = values_of(tables, ALL)
+    views = sorted({k for _, name, k in values if name == measure})
+    policies = tables.policies()
+    for row, policy in enumerate(policies):
+        shares = np.array([values[policy, measure, k] for k in views])
+        # side by side, so that the bars can be told apart
+        x = np.array(views) + (row - len(policies) / 2) * 0.05
+        _curve(axes, x, shares, policy, look_of(policy, tables))
+    axes.set_xticks(views)
+    axes.set(xlabel="views", ylabel=what)
+    axes.set_ylim(min(axes.get_ylim()[0], LOWEST_AXIS), 1 + (1 - LOWEST_AXIS) / 10)
+    percent_axis(axes.yaxis)
+    legend(axes)
+    return figure
+
+
+def _curve(axes: Any, x: NDArray, shares: NDArray, label: str, look: dict) -> None:
+    """Draw a line through shares, (K, 3): value, low and high, with bars at its points."""
+    axes.plot(x, shares[:, 0], marker="o", markersize=3.5, label=label, **look)
+    bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
+    axes.vlines(x, shares[:, 1], shares[:, 2], **bars)
+
+
+def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> Figure:
     """Draw accuracy against threshold, with 95 % intervals (figures 15 and 18).
 
     Args:
@@ -125,26 +160,17 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
         The figure.
     """
     figure, axes = new_figure(4.6, 3.5)
-    table = results.tables.summary.query(
-        "measure == @measure and threshold == threshold"
+    table = results.tables.measures.query(
+        "set == @ALL and measure == @measure and threshold == threshold"
     )
     ticks = sorted(table["threshold"].unique())
-    for k, name in enumerate(
-        names := [n for n in compared(results) if n in set(table["policy"])]
-    ):
+    names = [n for n in compared(results) if n in set(table["policy"])]
+    for k, name in enumerate(names):
         rows = table[table["policy"] == name].sort_values("threshold")
+        shares = rows[["value", "low", "high"]].to_numpy(np.float64)
         # side by side, so that the bars can be told apart
         x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04
-        look = look_of(name, results)
-        axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **look)
-        axes.vlines(
-            x,
-            rows["low"],
-            rows["high"],
-            color=look["color"],
-            linewidth=0.8,
-            alpha=0.55,
-        )
+        _curve(axes, x, shares, name, look_of(name, results.tables))
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
     axes.set(xlabel="confidence threshold", ylabel=words(measure))
     percent_axis(axes.yaxis)
@@ -152,7 +178,7 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
     return figure
 
 
-def budget_curve(results: Results, budget: str) -> Figure:
+def budget_curve(results: ClassResults, budget: str) -> Figure:
     """Draw accuracy against mean views or mean travel, over all thresholds.
 
     Args:
@@ -165,7 +191,9 @@ def budget_curve(results: Results, budget: str) -> Figure:
     figure, axes = new_figure(4.6, 3.5)
     for name in compared(results):
         rows = results.tables.sweep[results.tables.sweep["policy"] == name]
-        axes.plot(rows[budget], rows["accuracy"], label=name, **look_of(name, results))
+        axes.plot(
+            rows[budget], rows["accuracy"], label=name, **look_of(name, results.tables)
+        )
     axes.set(
         xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[
             budget
@@ -177,43 +205,38 @@ def budget_curve(results: Results, budget: str) -> Figure:
     return figure
 
 
-def differences(results: Results, threshold: float) -> Figure:
-    """Draw the difference of every policy from the reference in accuracy.
+def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
+    """Draw the differences of all policies from the reference.
 
     Lines are 95 % intervals; dots are filled where Holm's p is below 0.05.
 
     Args:
-        results: of the benchmark.
-        threshold: of the belief.
-
-    Returns:
-        The figure.
+        tables: of the benchmark.
+        tests: of one measure, in one set or in two.
+        what: the measure, in words.
     """
-    rows = results.tables.tests.query(
-        "threshold == @threshold and measure == 'accuracy'"
-    ).iloc[::-1]
-    figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
+    policies = list(tests["policy"].unique())[::-1]
+    sets = list(tests["set"].unique())
+    figure, axes = new_figure(4.6, 0.7 + 0.26 * max(3, len(policies)))
     row: Any  # a named tuple
-
-    for y, row in enumerate(rows.itertuples()):
-        colour = look_of(row.policy, results)["color"]
+    for row in tests.itertuples():
+        second = sets.index(row.set)
+        marker = "os"[second]
+        y = policies.index(row.policy) + (len(sets) - 1) * (0.14 - 0.28 * second)
+        colour = look_of(row.policy, tables)["color"]
         axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
         inside = colour if row.p_holm < SIGNIFICANT else "white"
-        axes.plot(
-            100 * row.difference,
-            y,
-            "o",
-            color=colour,
-            markersize=5,
-            markerfacecolor=inside,
-        )
+        dot = {"color": colour, "markersize": 5, "markerfacecolor": inside}
+        axes.plot(100 * row.difference, y, marker, clip_on=False, **dot)
+    if len(sets) > 1:
+        for name, marker in zip(sets, "os", strict=True):
+            axes.plot([], [], marker, color=INK, markerfacecolor="white", label=name)
+        legend(axes)
     axes.axvline(0, color=INK, linewidth=0.9)
-    axes.set_yticks(np.arange(len(rows)), rows["policy"])
+    axes.set_yticks(np.arange(len(policies)), policies)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    axes.set_xlabel(
-        f"accuracy, percentage points: difference to {results.settings['reference']}"
-    )
+    axes.set_xlabel(f"{what}, percentage points: difference to {tables.reference}")
 
     return figure
 
@@ -287,7 +310,7 @@ def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Fig
 
 
 def reliability_diagram(
-    results: Results,
+    results: ClassResults,
     policies: Sequence[str],
     threshold: float,
 ) -> Figure:
@@ -303,17 +326,15 @@ def reliability_diagram(
     Returns:
         The figure.
     """
-    error = results.tables.summary.query(
-        "measure == 'calibration_error' and threshold == @threshold"
-    )
-    errors = error.set_index("policy")["value"]
+    values = values_of(results.tables, ALL, threshold)
     table = results.tables.reliability.query("threshold == @threshold").rename(
         columns={"episodes": "answers"}
     )
-    curves = {
-        f"{n}  {errors[n]:.3f}": (table[table["policy"] == n], look_of(n, results))
-        for n in policies
-    }
+    curves = {}
+    for name in policies:
+        error = values[name, "calibration_error", 0][0]
+        own = table[table["policy"] == name]
+        curves[f"{name}  {error:.3f}"] = own, look_of(name, results.tables)
     return _reliability(curves, "when it stopped", "policy  calibration error")
 
 

@@ -1,18 +1,18 @@
-"""Leaderboard at one threshold, significant differences, and too few objects."""
+"""Leaderboard of classes: at one threshold, after numbers of views, and what follows from it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from nextview.benchmark.class_tables import ClassTables
+from nextview.benchmark.comparison import ALL, SIGNIFICANT, Tables, too_few, values_of
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.statistics import EXACT_FAMILIES, target_families
-from nextview.benchmark.summary import Tables
 from nextview.checks import extras
 
 with extras():
     import pandas as pd
 
-# a difference is called one when its p-value after Holm's correction is below this
-SIGNIFICANT = 0.05
 # with fewer objects, or wider intervals of differences in accuracy, little can be told
 FEW_OBJECTS = 200
 WIDE_INTERVAL = 0.03
@@ -23,7 +23,7 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
     return min(thresholds, key=lambda t: abs(t - 0.97))
 
 
-def leaderboard(tables: Tables, threshold: float) -> list[Any]:
+def leaderboard(tables: ClassTables, threshold: float) -> list[Any]:
     """List the policies at one threshold, the most accurate first and oracles last.
 
     Args:
@@ -35,14 +35,13 @@ def leaderboard(tables: Tables, threshold: float) -> list[Any]:
         (grid cells, over all episodes), difference and p_holm to the reference (NaN for the
         reference itself), and differs, whether the difference is significant.
     """
-    rows = tables.summary[tables.summary["threshold"] == threshold]
+    rows = tables.measures.query("set == @ALL and threshold == @threshold")
     table = rows.pivot(index="policy", columns="measure", values="value")
     table = table.join(
         rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]]
     )
-    table = table.join(
-        _tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]
-    ).reset_index()
+    tests = accuracy_tests(tables, threshold).set_index("policy")
+    table = table.join(tests[["difference", "p_holm"]]).reset_index()
     table = table.rename(columns={"travel_all": "travel"}).assign(
         differs=table["p_holm"] < SIGNIFICANT
     )
@@ -51,28 +50,55 @@ def leaderboard(tables: Tables, threshold: float) -> list[Any]:
     )
 
 
-def promised_risks(tables: Tables) -> list[Any]:
-    """Return the rows of ``Tables.risks``, and whether a guarantee is broken beyond chance."""
+def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]:
+    """What became of promised error rates, for the policies that a robot could follow.
+
+    Args:
+        tables: of the benchmark.
+        risks: thresholds by the error rates that they promise.
+
+    Returns:
+        Rows with policy, risk, threshold, error among the episodes that reached the threshold, its
+        interval (low, high), the share of these episodes (confident), and whether the promise is
+        broken beyond chance (broken).
+    """
+    rows = []
+    for risk, threshold in risks.items():
+        values = values_of(tables, ALL, threshold)
+        for policy in dict.fromkeys(policy for policy, _, _ in values):
+            # the upper end of accuracy is the lower of error
+            right, high, low = values[policy, "confident_accuracy", 0]
+            share = values[policy, "confident", 0][0]
+            row = (policy, float(risk), threshold, 1 - right, 1 - low, 1 - high, share)
+            rows += [] if is_oracle(policy) else [row]
+    columns = ["policy", "risk", "threshold", "error", "low", "high", "confident"]
+    table = pd.DataFrame(rows, columns=columns)
     return list(
-        tables.risks.assign(
-            broken=tables.risks["low"] > tables.risks["risk"]
-        ).itertuples(index=False)
+        table.assign(broken=table["low"] > table["risk"]).itertuples(index=False)
     )
 
 
-def level_rows(tables: Tables) -> list[list[tuple[str, list[Any]]]]:
-    """The rows of ``Tables.levels`` by level and policy, those that no robot could follow last."""
-    found = []
-    for _, rows in tables.levels.groupby("level", sort=False):
-        policies = [
-            (str(name), list(mine.itertuples()))
-            for name, mine in rows.groupby("policy", sort=False)
-        ]
-        found.append(sorted(policies, key=lambda policy: is_oracle(policy[0])))
+def levels_in(tables: Tables) -> dict[str, dict[str, Any]]:
+    """What is known of scenes after numbers of views, by level of clutter.
+
+    Returns:
+        Of each level "views"; "policies", those that no robot could follow last; "values", see
+        ``values_of``; and "tests" by policy and number of views.
+    """
+    found = {}
+    after = tables.measures.query("set != @ALL and views > 0")
+    for name, rows in after.groupby("set", sort=False):
+        tests = tables.tests[tables.tests["set"] == name]
+        found[str(name)] = {
+            "views": rows["views"].unique().tolist(),
+            "policies": sorted(rows["policy"].unique(), key=is_oracle),
+            "values": values_of(tables, str(name)),
+            "tests": tests.set_index(["policy", "views"]).to_dict("index"),
+        }
     return found
 
 
-def level_differences(tables: Tables, reference: str) -> str | None:
+def level_differences(tables: ClassTables, reference: str) -> str | None:
     """Return a sentence that names the policies that differ significantly in scenes.
 
     Args:
@@ -82,13 +108,12 @@ def level_differences(tables: Tables, reference: str) -> str | None:
     Returns:
         The sentence; None if no policy of a robot differs.
     """
+    tests = tables.tests.query("set != @ALL and p_holm < @SIGNIFICANT")
+    rows = tests[["policy", "difference", "views", "set"]].to_numpy(object).tolist()
     found = [
-        f"{policy} by {100 * row.difference:+.1f} points after {row.n_views} views under"
-        f" {row.level} clutter"
-        for policies in level_rows(tables)
-        for policy, rows in policies
-        for row in rows
-        if not is_oracle(policy) and row.p_holm < SIGNIFICANT
+        f"{policy} by {100 * difference:+.1f} points after {views} views under {name}"
+        for policy, difference, views, name in rows
+        if not is_oracle(policy)
     ]
     return (
         f"With no threshold, significantly different from {reference}: {'; '.join(found)}."
@@ -97,7 +122,11 @@ def level_differences(tables: Tables, reference: str) -> str | None:
     )
 
 
-def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:
+def nothing_differs(
+    tables: ClassTables,
+    threshold: float,
+    reference: str,
+) -> str | None:
     """Return a sentence if no policy of a robot differs significantly from the reference.
 
     Args:
@@ -117,23 +146,21 @@ def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | N
     )
 
 
-def too_few(tables: Tables, threshold: float, names: Sequence[str]) -> str | None:
+def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | None:
     """Return a warning if there are too few objects to compare policies.
 
     Args:
         tables: of the benchmark.
         threshold: of the belief.
-        names: of the objects.
+        objects: how many there are.
 
     Returns:
         The warning; None if there are enough.
     """
-    families = int(target_families(names).max()) + 1
-    corrected = int((tables.tests["measure"] == "accuracy").sum())
-    if hopeless := too_few_families(families, corrected):
-        return hopeless
+    hopeless = too_few(accuracy_tests(tables))
+    if hopeless:
+        return hopeless[ALL]
 
-    objects = len(names)
     tests = _robot_tests(tables, threshold)
     # NaN if nothing was compared
     half = float((tests["high"] - tests["low"]).median() / 2)
@@ -151,33 +178,56 @@ def too_few(tables: Tables, threshold: float, names: Sequence[str]) -> str | Non
     return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE_INTERVAL:g} points."
 
 
-def too_few_families(families: int, tests: int) -> str | None:
-    """Return a warning if no difference, however clear, could be significant.
-
-    Args:
-        families: number of families.
-        tests: how many tests are corrected together.
-
-    Returns:
-        The sentence; None if there are enough families.
-    """
-    wanted = families
-    while wanted < EXACT_FAMILIES and tests * 2.0 ** (1 - wanted) >= SIGNIFICANT:
-        wanted += 1
-    if wanted == families:
-        return None
-    return (
-        f"Too few to tell: no p-value of {families} is below {2.0 ** (1 - families):.2g}, and"
-        f" {tests} tests are corrected together, so that no difference can be significant; it"
-        f" takes {wanted} or more."
-    )
+def accuracy_tests(tables: Tables, threshold: float | None = None) -> "pd.DataFrame":
+    """The tests of accuracy at one threshold; by default at all of them."""
+    t = tables.tests.query("set == @ALL and views == 0 and measure == 'accuracy'")
+    return t if threshold is None else t[t["threshold"] == threshold]
 
 
-def _tests(tables: Tables, threshold: float) -> pd.DataFrame:
-    t = tables.tests
-    return t[(t["threshold"] == threshold) & (t["measure"] == "accuracy")]
-
-
-def _robot_tests(tables: Tables, threshold: float) -> pd.DataFrame:
-    tests = _tests(tables, threshold)
+def _robot_tests(tables: Tables, threshold: float) -> "pd.DataFrame":
+    tests = accuracy_tests(tables, threshold)
     return tests[~tests["policy"].map(is_oracle).astype(bool)]
+
+
+def after_views_rows(tables: Tables) -> "pd.DataFrame":
+    """Policies after fixed numbers of views as a table that is read: a row a policy, all text."""
+    after = tables.measures.query("set == @ALL and views > 0")
+    tested = tables.tests.query("set == @ALL and views > 0")
+    keys = ["policy", "reference", "views"]
+    tests = tested.set_index(keys)[["difference", "p_holm"]]
+    values = values_of(tables, ALL)
+    n_views = [int(k) for k in after["views"].unique()]
+    at = " at " + ", ".join(map(str, n_views))
+
+    def difference(name: str, reference: str, k: int) -> str:
+        place: Any = name, reference, k
+        value, p = tests.loc[place]
+        # rounded first: no minus before a zero
+        shown = f"{round(100 * value, 1) + 0.0:+.1f}"
+        if np.isnan(p):  # a ceiling is no rival
+            return shown
+        return f"{shown} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
+
+    rows = []
+    for name in after["policy"].unique():
+        row = {"policy": name}
+        for k in n_views:
+            row[f"{k} view{'s' * (k > 1)}"] = "{:.3f} ({:.3f}-{:.3f})".format(
+                *values[name, "accuracy", k]
+            )
+        row[f"travel{at}"] = ", ".join(
+            f"{values[name, 'travel', k][0]:.2f}" for k in n_views
+        )
+        for reference in tested["reference"].unique():
+            over = (
+                ""
+                if name == reference
+                else ", ".join(difference(name, reference, k) for k in n_views)
+            )
+            row[f"points over {reference}{at}"] = over
+        shares = [values[name, "share_of_gap", k][0] for k in n_views]
+        row[f"of the gap{at}"] = ", ".join(
+            "-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares
+        )
+        rows.append(row)
+    return pd.DataFrame(rows)

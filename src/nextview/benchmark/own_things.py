@@ -13,7 +13,7 @@ from nextview.recognition.protocol import (
     JudgesTogether,
     log_evidence_of_views,
 )
-from nextview.types import Float, Floats, Index
+from nextview.types import Float, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,32 +58,16 @@ class OwnThings:
         self._order = np.argsort(self.recogniser.classes, kind="stable")
         self.names = tuple(self.recogniser.classes[k] for k in self._order)
 
-    def log_evidence(self, observations: Sequence[Observation]) -> Floats:
-        """What it says of each view, (V, D): it can be summed over views.
-
-        Args:
-            observations: the views.
-
-        Raises:
-            ModelError: its answer is none.
-        """
-        return log_evidence_of_views(self.recogniser, observations)
-
-    def verify(
-        self,
-        observations: Sequence[Observation],
-        log_evidence: Floats,
-    ) -> OwnAnswer:
+    def __call__(self, observations: Sequence[Observation]) -> OwnAnswer:
         """What it says of views of one thing: together if it can, else by the sum of all.
 
         Args:
             observations: views that show the thing, in one object frame.
-            log_evidence: of each, (V, D).
 
         Raises:
             ModelError: its answer is none.
         """
-        total = log_evidence.sum(0)
+        total = log_evidence_of_views(self.recogniser, observations).sum(0)
         count = len(observations)
         if isinstance(self.recogniser, JudgesTogether):
             joint = self.recogniser.together(observations, total, count)

@@ -1,6 +1,7 @@
 """The report: one self-contained HTML page from a folder of benchmark results."""
 
 import base64
+from collections import Counter
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -13,12 +14,13 @@ from PIL import Image
 
 from nextview.benchmark import figures as draw
 from nextview.benchmark import leaderboard as board
+from nextview.benchmark.class_tables import ClassResults, class_set, levels_of
+from nextview.benchmark.classes import load
+from nextview.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.page import numbers, origin, picture, render, write_figures
 from nextview.benchmark.published import PUBLISHED_COLUMNS, published_threshold
-from nextview.benchmark.run import Results, load
 from nextview.benchmark.true_maps import stored_rows
-from nextview.benchmark.views import as_rows
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scene_views
@@ -48,7 +50,7 @@ def report(
     """Write one self-contained HTML page: tables, curves, and the worst failures.
 
     Args:
-        results: folder of nextview benchmark.
+        results: folder of nextview benchmark classes.
         out: page to write; by default RESULTS/report.html.
         store: view store of the objects' pictures; by default that of the predictions, if it is
             still in its place.
@@ -81,7 +83,8 @@ def report(
             "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
             "tests": tables.tests,
         }
-        shown |= {} if tables.views.empty else {"views": as_rows(tables.views)}
+        after = board.after_views_rows(tables)
+        shown |= {} if after.empty else {"views": after}
         write_figures(
             figures,
             _figures(loaded, headline_policy(loaded, at), at),
@@ -91,7 +94,7 @@ def report(
     return path
 
 
-def headline_policy(results: Results, threshold: float) -> str:
+def headline_policy(results: ClassResults, threshold: float) -> str:
     """Return the most accurate policy that a robot could follow, other than the reference.
 
     Args:
@@ -101,19 +104,17 @@ def headline_policy(results: Results, threshold: float) -> str:
     Returns:
         Its name; the reference if there is no other.
     """
-    found = numbers(results.tables.summary, "policy", "threshold", "measure")
+    found = values_of(results.tables, ALL, threshold)
     reference = results.settings["reference"]
     names = [
         n
         for n in results.tables.sweep["policy"].unique()
         if not is_oracle(n) and n != reference
     ]
-    return max(
-        names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference
-    )
+    return max(names, key=lambda n: found[n, "accuracy", 0][0], default=reference)
 
 
-def page(results: Results, store: ViewStore | None, why_not: str) -> str:
+def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
     """Return the page of a benchmark.
 
     Args:
@@ -129,14 +130,17 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     p = results.predictions
     at = board.headline_threshold(s["thresholds"])
     reference = s["reference"]
-    found = numbers(t.summary, "policy", "threshold", "measure")
+    whole = t.measures[t.measures["views"] == 0]
+    keys = ("policy", "threshold", "measure")
+    found = numbers(whole[whole["set"] == ALL], *keys)
+    labels = sorted(p.classes[k] for k in np.unique(p.labels))
+    of_class = {
+        label: numbers(whole[whole["set"] == class_set(label)], *keys)
+        for label in labels
+    }
     policies = list(t.sweep["policy"].unique())
     best = headline_policy(results, at)
-    tests = (
-        t.tests.query("threshold == @at and measure == 'accuracy'")
-        .set_index("policy")
-        .to_dict("index")
-    )
+    tests = board.accuracy_tests(t, at).set_index("policy").to_dict("index")
     wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, *draw.ceiling(results)))
     shown = [name for name in wanted if name in policies]
 
@@ -166,10 +170,10 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         at=at,
         best=best,
         reference=reference,
-        significant=board.SIGNIFICANT,
+        significant=SIGNIFICANT,
         found=found,
-        of_class=numbers(t.per_class, "policy", "threshold", "label", "measure"),
-        labels=sorted(t.per_class["label"].unique()),
+        of_class=of_class,
+        labels=labels,
         policies=policies,
         shown=shown,
         one_view=t.sweep.query("policy == @reference or policy == @best").iloc[0][
@@ -177,10 +181,11 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         ],
         tests=tests,
         nothing=board.nothing_differs(t, at, reference),
-        warning=board.too_few(t, at, p.names),
-        levels=board.level_rows(t),
+        warning=board.too_few_objects(t, at, len(p)),
+        levels=board.levels_in(t),
+        scenes=Counter(f"{level} clutter" for level in levels_of(p.names)),
         level_differences=board.level_differences(t, reference),
-        risks=board.promised_risks(t),
+        risks=board.promised_risks(t, s["risks"]),
         by_class_at=_thresholds(results, at),
         fixed_at=fixed_at,
         spoken=spoken,
@@ -197,7 +202,7 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
 def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float) -> str:
     if test is None:
         return f"{best} at threshold {at:g}"
-    if test["p_holm"] >= board.SIGNIFICANT:
+    if test["p_holm"] >= SIGNIFICANT:
         return (
             f"No policy that a robot could follow is clearly more accurate than {reference} at"
             f" threshold {at:g}"
@@ -206,14 +211,13 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
     return f"{best} is {100 * abs(test['difference']):.1f} points {more} accurate than {reference}"
 
 
-def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
+def _figures(results: ClassResults, best: str, at: float) -> dict[str, Figure]:
     sweep = results.tables.sweep
     reference = results.settings["reference"]
-    figures = (
-        {}
-        if results.tables.tests.empty
-        else {"differences": draw.differences(results, at)}
-    )
+    tests = board.accuracy_tests(results.tables, at)
+    figures = {}
+    if len(tests):
+        figures["differences"] = draw.differences(results.tables, tests, "accuracy")
     figures |= {
         measure: draw.threshold_curve(results, measure)
         for measure in ("class_accuracy", "accuracy")
@@ -234,12 +238,12 @@ def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
     return figures | {"reliability": draw.reliability_diagram(results, ran, at)}
 
 
-def _thresholds(results: Results, at: float) -> dict[str, float]:
+def _thresholds(results: ClassResults, at: float) -> dict[str, float]:
     """Return policies by class at their published thresholds (tables 8 to 11).
 
     For scenes nothing is published.
     """
-    if not results.tables.levels.empty:
+    if any(levels_of(results.predictions.names)):
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
     ran = set(results.tables.sweep["policy"])
     thresholds = results.settings["thresholds"]
@@ -282,7 +286,7 @@ def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
 
 
 def _failures(
-    results: Results,
+    results: ClassResults,
     best: str,
     at: float,
     store: ViewStore | None,
@@ -379,7 +383,9 @@ def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
     return found
 
 
-def _made(results: Results, store: ViewStore | None, why_not: str) -> dict[str, str]:
+def _made(
+    results: ClassResults, store: ViewStore | None, why_not: str
+) -> dict[str, str]:
     s = results.settings
     return {
         **origin(results.predictions, s),

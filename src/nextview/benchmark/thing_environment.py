@@ -17,7 +17,7 @@ from nextview.benchmark.thing_episodes import (
     Setting,
     ThingEpisode,
 )
-from nextview.benchmark.thing_jobs import opened, scan_of
+from nextview.benchmark.thing_runs import opened, scan_of
 from nextview.checks import extras, one_of, whole
 from nextview.errors import DatasetError, SessionError
 from nextview.geometry.mesh import UNITS

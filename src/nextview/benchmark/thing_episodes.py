@@ -39,7 +39,7 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
-from nextview.types import Float, Floats
+from nextview.types import Float
 
 Occlusion = Literal["none", "half", "heavy"]
 
@@ -156,13 +156,6 @@ class ThingEpisode:
             in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
         self._kept[f"{view}.in_camera"] = in_camera
 
-    def log_evidence(self, view: int) -> Floats:
-        """What the features say of a view that shows the thing."""
-        name = f"{view}.evidence"
-        if name not in self._answers:
-            self._answers[name] = self.things.log_evidence([self.observation(view)])[0]
-        return self._answers[name]
-
     def seen(self, views: Sequence[int]) -> list[int]:
         """Those of some views that show the thing."""
         return [view for view in views if self.observation(view).seen]
@@ -189,9 +182,8 @@ class ThingEpisode:
 
     def _verify(self, name: str, views: list[int]) -> None:
         observations = [self.observation(view) for view in views]
-        evidence = np.stack([self.log_evidence(view) for view in views])
         begun = time.process_time()
-        found = self.things.verify(observations, evidence)
+        found = self.things(observations)
         self._answers[f"{name}.seconds"] = np.array(time.process_time() - begun)
         for part, values in vars(found).items():
             self._answers[f"{name}.{part}"] = values
@@ -263,7 +255,9 @@ class ThingEpisode:
         joint = None
         if "joint" in needs:
             assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
-            total = np.sum([self.log_evidence(view) for view in seen], axis=0)
+            assert isinstance(self.things, TaughtThings)
+            views_seen = [self.observation(view) for view in seen]
+            total = self.things.log_evidence(views_seen).sum(0)
             here = EPISODE_SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
 

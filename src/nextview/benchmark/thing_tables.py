@@ -5,77 +5,54 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.benchmark.confusable import Alikeness
-from nextview.benchmark.statistics import (
-    by_family,
-    exchange_p,
-    holm,
-    interval,
-    resample_families,
-    sign_flip_p,
+from nextview.benchmark.comparison import (
+    ALL,
+    Counted,
+    Key,
+    corrected,
+    measures_of,
+    tests_of,
 )
+from nextview.benchmark.confusable import Alikeness
+from nextview.benchmark.results import Board, Column, ComparedTables
+from nextview.benchmark.statistics import exchange_p, interval, resample_families
 from nextview.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview.benchmark.thing_policies import CEILINGS
-from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
+from nextview.benchmark.thing_runs import (
+    EpisodeRuns,
+    ThingRun,
+    ThingSettings,
+    policies_in,
+)
 from nextview.checks import extras
 from nextview.session.result import SUSPICIOUS
 from nextview.session.system import UNKNOWN_ALPHA
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Index
 
 with extras():
     import pandas as pd
 
 
-ALL = "all"
 CONFUSABLE = "confusable half"
+TITLES = {ALL: "All things", CONFUSABLE: "The confusable half"}
 FAR_END = 0.95  # quantile of the error of the pose
 FAR_POSE = "pose error, 95 %"
 POSE_AFTER = 2  # views, after which the error of the pose is tested
 
 
 @dataclass(frozen=True)
-class Compared:
-    """How runs are compared.
+class ThingTables(ComparedTables):
+    """The tables of a benchmark of things. The sets are ``all`` and the ``confusable half``.
+
+    One Holm correction is over all tests.
 
     Attributes:
-        policies: in the order of the tables.
-        views: after how many views.
-        threshold: belief from which a thing is surely recognised.
-        families: whether things whose names begin alike, up to the first _, are drawn together.
-        samples: of the bootstrap.
-        reference: the policy that the others are compared with.
-    """
-
-    policies: tuple[str, ...]
-    views: tuple[int, ...]
-    threshold: float
-    families: bool
-    samples: int
-    reference: str = "random"
-
-
-@dataclass(frozen=True)
-class ThingTables:
-    """The tables of a benchmark of things.
-
-    Attributes:
-        measures: "things" (all, or the confusable half), "policy", "measure", "views" (0 for a
-            measure of whole episodes), "value", and its 95 % interval, "low" and "high".
-        tests: of the differences to the reference: the same columns with "difference", "low",
-            "high", "p" (see ``statistics.exchange_p``), "families", by which p was found, and
-            "p_holm", corrected over all rows.
-        alike: the things: "thing", "most_alike", "distance" (radii), "confusable".
+        things: the things: "thing", "most_alike", "distance" (radii), "confusable".
         episodes: how many there are of all things.
-        reference: the policy that the others are compared with.
-        chosen: how it was chosen, in a sentence; "" where it was named.
     """
 
-    measures: "pd.DataFrame"
-    tests: "pd.DataFrame"
-    alike: "pd.DataFrame"
+    things: "pd.DataFrame"
     episodes: int
-    reference: str
-    chosen: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,25 +118,13 @@ class _Runs:
             verification=np.array([each.verification[-1] for _, each in runs]),
         )
 
-    def mean(self, values: Float, drawn: Float) -> Float:
-        """Mean over things of a value of each run, in each sample of things, (S,).
+    def mean(self, values: Float) -> Float:
+        """Mean over the runs of each thing of a value of each run, (T,).
 
         Args:
             values: of each run, (R,).
-            drawn: how often each sample holds each thing, (S, things).
         """
-        weights = drawn[:, self.things] * self.weight
-        return np.asarray(weights @ values / weights.sum(1), np.float64)
-
-    def in_families(self, values: Float, family: Index) -> Float:
-        """Sum in each family of the means of its things, (F,).
-
-        Args:
-            values: of each run, (R,).
-            family: number of each thing's family, (T,).
-        """
-        weighted = (values * self.weight)[:, None]
-        return by_family(weighted, family[self.things])[:, 0]
+        return np.bincount(self.things, values * self.weight).astype(np.float64)
 
     def quantile(self, values: Float, drawn: Float, share: float) -> Float:
         """Quantile of the known values of runs, in each sample of things, (S,).
@@ -178,204 +143,211 @@ class _Runs:
         return np.asarray(values[order][first], np.float64)
 
 
-# by measure and number of views, a value a sample
-Sampled = dict[tuple[str, int], Float]
-
-
-def _sampled(runs: _Runs, views: tuple[int, ...], drawn: Float) -> Sampled:
-    """All measures of one policy in samples of the things, (S, T): each (S,).
-
-    The first sample is the things themselves.
-    """
-    found: Sampled = {}
+def _sums(runs: _Runs, policy: str, views: tuple[int, ...]) -> dict[Key, tuple]:
+    """The measures of one policy that are means over things, as sums of each thing."""
+    right = {k: runs.mean(runs.right[:, k - 1]) for k in views}
+    one = np.ones(len(right[views[0]]))
+    found = {Key(policy, None, k, "accuracy"): (right[k], one) for k in views}
     for k in views:
-        found["accuracy", k] = runs.mean(runs.right[:, k - 1], drawn)
-        found["travel, rad", k] = runs.mean(runs.travel[:, k - 1], drawn)
-        for share, name in ((0.5, "median"), (FAR_END, "95 %")):
-            found[f"pose error, {name}", k] = runs.quantile(
-                runs.pose[:, k - 1],
-                drawn,
-                share,
-            )
+        way = runs.mean(runs.travel[:, k - 1])
+        found[Key(policy, None, k, "travel, rad")] = (way, one)
 
     rows = np.arange(len(runs.things))
     way = runs.travel[rows, runs.until.astype(np.int64) - 1]
-    sure = runs.mean(runs.sure, drawn)
-    found["views until confident", 0] = runs.mean(runs.until, drawn)
-    found["travel until confident, rad", 0] = runs.mean(way, drawn)
-    found["confident", 0] = sure
-    found["wrong, of the confident", 0] = runs.mean(runs.wrong, drawn) / np.where(
-        sure > 0,
-        sure,
-        np.nan,
-    )
-    return found
+    sure = runs.mean(runs.sure)
+    whole = {
+        "views until confident": (runs.mean(runs.until), one),
+        "travel until confident, rad": (runs.mean(way), one),
+        "confident": (sure, one),
+        "wrong, of the confident": (runs.mean(runs.wrong), sure),
+    }
+    return found | {Key(policy, None, 0, name): both for name, both in whole.items()}
+
+
+def _far(runs: _Runs, views: tuple[int, ...], drawn: Float) -> dict[tuple, Float]:
+    """Quantiles of the error of the pose in samples of the things, (S, T): each (S,)."""
+    return {
+        (f"pose error, {name}", k): runs.quantile(runs.pose[:, k - 1], drawn, share)
+        for k in views
+        for share, name in ((0.5, "median"), (FAR_END, "95 %"))
+    }
 
 
 def summarise_things(
     runs: Sequence[EpisodeRuns],
     alike: Alikeness,
-    how: Compared,
+    how: ThingSettings,
+    chosen: str = "",
 ) -> ThingTables:
     """Compare policies over all things, and over the confusable half of them.
 
     Args:
         runs: of all episodes.
         alike: which things are most alike.
-        how: what is compared.
+        how: views, threshold, families, samples and reference.
+        chosen: how the reference was chosen, in a sentence; "" where it was named.
 
     Returns:
         The tables.
     """
     rng = np.random.default_rng(0)
-    number = {name: k for k, name in enumerate(alike.names)}
     groups = {ALL: np.ones(len(alike.names), bool), CONFUSABLE: alike.confusable}
-    rows: list[tuple] = []
-    tests: list[tuple] = []
+    measures: list[pd.DataFrame] = []
+    tests: list[pd.DataFrame] = []
+    boards = []
 
-    for things, chosen in groups.items():
-        some = [each for each in runs if chosen[number[each.thing]]]
-        if not some:
+    for name, mine in groups.items():
+        things = [alike.names[k] for k in np.flatnonzero(mine)]
+        if not things:
             continue
-        family = _families(chosen, alike.names, how)
-        drawn = _drawn(chosen, family, how, rng)
-        sampled: dict[str, Sampled] = {}
-        together: dict[str, _Runs] = {}
-        for policy in how.policies:
-            own = [(number[e.thing], run) for e in some for run in e.runs[policy]]
-            together[policy] = _Runs.of(own, how.threshold)
-            sampled[policy] = _sampled(together[policy], how.views, drawn)
-            rows += [(things, policy, *row) for row in _rows(sampled[policy])]
-            rows += [(things, policy, *row) for row in _times(together[policy])]
-        p_values = _p_values(together, family, how)
-        tests += [(things, *row) for row in _differences(sampled, p_values, how)]
+        number = {thing: k for k, thing in enumerate(things)}
+        some = [each for each in runs if each.thing in number]
+        family = _families(things, how)
+        weights = resample_families(family, how.samples, rng)
+        together = {
+            policy: _Runs.of(
+                [(number[e.thing], run) for e in some for run in e.runs[policy]],
+                how.threshold,
+            )
+            for policy in policies_in(runs)
+        }
+        sums: dict[Key, tuple] = {}
+        for policy, own in together.items():
+            sums |= _sums(own, policy, how.views)
+        counted = Counted.of(sums, family)
+        poses = _poses(name, together, family, weights, how)
+        found = [counted.measures(name, weights), poses[0], _times(name, together)]
+        apart = [counted.tests(name, weights, how.reference, _is_tested), poses[1]]
+        measures.append(_by_policy(found, list(together)))
+        tests.append(_by_policy(apart, list(together)))
+        about = f"{len(things)} thing{'s' * (len(things) > 1)}"
+        title = f"{TITLES[name]}: share named right after views"
+        boards.append(Board(title, name, _columns(how.views), about))
 
+    known = how.reference in CEILINGS
     return ThingTables(
-        pd.DataFrame(
-            rows,
-            columns=["things", "policy", "measure", "views", "value", "low", "high"],
-        ),
-        _corrected(tests),
+        pd.concat(measures, ignore_index=True),
+        corrected(tests, lambda policy: known or policy in CEILINGS),
+        how.reference,
+        tuple(boards),
+        chosen,
         _as_table(alike),
         len(runs),
-        how.reference,
     )
 
 
-def _families(chosen: Mask, names: Sequence[str], how: Compared) -> Index:
-    """The number of the family of each thing, (T,) int64; -1 for those that are not chosen."""
+def _by_policy(parts: list["pd.DataFrame"], policies: list[str]) -> "pd.DataFrame":
+    """Rows of one set, policy by policy."""
+    table = pd.concat(parts, ignore_index=True)
+    place = table["policy"].map(policies.index)
+    return table.iloc[np.argsort(place.to_numpy(), kind="stable")]
+
+
+def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
+    """What is shown of the policies."""
+    last = views[-1]
+    right = [Column(f"right after {k}", ("accuracy",), k, short=f"{k}") for k in views]
+    poses = [
+        Column(
+            f"pose error after {k}, mm: median, 95 %",
+            ("pose error, median", FAR_POSE),
+            k,
+            1,
+        )
+        for k in views
+        if k > 1
+    ]
+    until = "views until confident"
+    way = "travel until confident, rad"
+    wrong = "wrong, of the confident"
+    spent = ("decision, ms, median", "decision, ms, 95 %")
+    return (
+        *right,
+        Column(until, (until,), 0, 2, "until confident"),
+        Column("confident", ("confident",)),
+        Column(wrong, (wrong,), short="wrong"),
+        Column(f"travel to view {last}, rad", ("travel, rad",), last, 2, "travel"),
+        Column(way, (way,), 0, 2),
+        *poses,
+        Column("choice, ms of CPU: median, 95 %", spent, 0, 0, "choice, ms of CPU"),
+    )
+
+
+def _families(names: Sequence[str], how: ThingSettings) -> Index:
+    """The number of the family of each thing, (T,) int64."""
     bodies = [name.partition("_")[0] if how.families else name for name in names]
-    family = np.full(len(names), -1)
-    family[chosen] = np.unique(np.array(bodies)[chosen], return_inverse=True)[1]
-    return family
+    return np.asarray(np.unique(np.array(bodies), return_inverse=True)[1])
 
 
-def _drawn(
-    chosen: Mask,
-    family: Index,
-    how: Compared,
-    rng: np.random.Generator,
-) -> Float:
-    """How often each thing is drawn in each sample, (1 + S, T); in the first each once."""
-    drawn = np.zeros((how.samples, len(family)))
-    drawn[:, chosen] = resample_families(family[chosen], how.samples, rng)
-    return np.concatenate([chosen[None].astype(np.float64), drawn])
-
-
-def _rows(sampled: Sampled) -> list[tuple]:
-    """Measure, views, value and interval of one policy."""
-    found = []
-    for (measure, views), values in sampled.items():
-        low, high = interval(values[1:, None])
-        found.append((measure, views, float(values[0]), float(low[0]), float(high[0])))
-    return found
-
-
-def _times(runs: _Runs) -> list[tuple]:
-    """The times of one policy, milliseconds, as ``_rows``, without intervals."""
+def _times(name: str, runs: dict[str, _Runs]) -> "pd.DataFrame":
+    """The times of all policies, milliseconds, without intervals."""
     quantiles: list[tuple[str, Callable[[Float], float]]] = [
         ("median", lambda times: float(np.median(times))),
         ("95 %", lambda times: float(np.quantile(times, FAR_END))),
     ]
-    return [
-        (f"{what}, ms, {name}", 0, 1000 * of(times), np.nan, np.nan)
+    rows = []
+    for policy, own in runs.items():
         for what, times in (
-            ("decision", runs.decision),
-            ("verification", runs.verification),
-        )
-        for name, of in quantiles
-    ]
+            ("decision", own.decision),
+            ("verification", own.verification),
+        ):
+            rows += [
+                (policy, None, 0, f"{what}, ms, {which}", 1000 * of(times))
+                for which, of in quantiles
+            ]
+    return measures_of(name, [(*row, np.nan, np.nan) for row in rows])
 
 
-def _differences(
-    sampled: dict[str, Sampled],
-    p_values: dict[tuple[str, str, int], tuple[float, int]],
-    how: Compared,
-) -> list[tuple]:
-    """Differences to the reference: policy, measure, views, difference, interval, p, families."""
-    if how.reference not in sampled:
-        return []
-
-    found = []
-    for policy, own in sampled.items():
-        if policy == how.reference:
-            continue
-        for (measure, views), values in own.items():
-            if not _is_tested(measure, views):
-                continue
-            apart = values - sampled[how.reference][measure, views]
-            low, high = interval(apart[1:, None])
-            ends = (float(apart[0]), float(low[0]), float(high[0]))
-            found.append(
-                (policy, measure, views, *ends, *p_values[policy, measure, views])
-            )
-    return found
-
-
-def _is_tested(measure: str, views: int) -> bool:
-    """Whether a measure is compared with the reference's; the first view is the same."""
-    if measure == FAR_POSE:
-        return views == POSE_AFTER
-    return (measure == "accuracy" and views > 1) or measure == "views until confident"
-
-
-def _p_values(
+def _poses(
+    name: str,
     runs: dict[str, _Runs],
     family: Index,
-    how: Compared,
-) -> dict[tuple[str, str, int], tuple[float, int]]:
-    """p-values by policy, measure and views, and by how many families each was found.
-
-    They are NaN where one of the two policies knows the truth: a bound is no rival.
+    weights: Float,
+    how: ThingSettings,
+) -> tuple["pd.DataFrame", "pd.DataFrame"]:
+    """Measures and tests of the errors of the pose, which are quantiles and no means.
 
     Args:
+        name: of the set of things.
         runs: of all policies.
-        family: of each thing, see ``_families``.
+        family: of each thing, (T,).
+        weights: how often each sample holds each thing, (S, T).
         how: what is compared.
     """
+    # the first sample is the things themselves
+    drawn = np.concatenate([np.ones((1, len(family))), weights])
+    found = {policy: _far(own, how.views, drawn) for policy, own in runs.items()}
+    rows = [
+        (policy, None, k, measure, values[0], *_ends(values))
+        for policy, all_of_one in found.items()
+        for (measure, k), values in all_of_one.items()
+    ]
+    tests = []
     reference = runs.get(how.reference)
-    if reference is None:
-        return {}
+    if reference is not None and POSE_AFTER in how.views:
+        for policy, own in runs.items():
+            if policy == how.reference:
+                continue
+            both = (found[one][FAR_POSE, POSE_AFTER] for one in (policy, how.reference))
+            apart = np.subtract(*both)
+            key = Key(policy, None, POSE_AFTER, FAR_POSE)
+            p = _pose_p(own, reference, family)
+            count = int(family.max()) + 1
+            tests.append((key, apart[0], *_ends(apart), p, count))
+    return measures_of(name, rows), tests_of(name, how.reference, tests)
 
-    count = int(family.max()) + 1
-    found = {}
-    for policy, own in runs.items():
-        if policy == how.reference:
-            continue
-        known = policy in CEILINGS or how.reference in CEILINGS
-        means = [("views until confident", 0, own.until, reference.until)]
-        means += [
-            ("accuracy", k, own.right[:, k - 1], reference.right[:, k - 1])
-            for k in how.views
-        ]
-        for measure, k, ours, theirs in means:
-            sums = own.in_families(ours, family) - reference.in_families(theirs, family)
-            p = np.nan if known else float(sign_flip_p(sums[:, None])[0])
-            found[policy, measure, k] = (p, count)
-        if POSE_AFTER in how.views:
-            p = np.nan if known else _pose_p(own, reference, family)
-            found[policy, FAR_POSE, POSE_AFTER] = (p, count)
-    return found
+
+def _ends(values: Float) -> tuple[float, float]:
+    """The interval of samples, of which the first is none."""
+    low, high = interval(values[1:, None])
+    return float(low[0]), float(high[0])
+
+
+def _is_tested(key: Key) -> bool:
+    """Whether a measure is compared with the reference's; the first view is the same."""
+    if key.measure == "accuracy":
+        return key.views > 1
+    return key.measure == "views until confident"
 
 
 def _pose_p(own: _Runs, reference: _Runs, family: Index) -> float:
@@ -399,13 +371,6 @@ def _pose_p(own: _Runs, reference: _Runs, family: Index) -> float:
     if not len(order):
         return np.nan
     return float(exchange_p(int(family.max()) + 1, difference)[0])
-
-
-def _corrected(tests: list[tuple]) -> "pd.DataFrame":
-    """The tests as a table, with one correction over all of them."""
-    columns = ["things", "policy", "measure", "views", "difference", "low", "high", "p"]
-    table = pd.DataFrame(tests, columns=[*columns, "families"])
-    return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
 
 
 def _as_table(alike: Alikeness) -> "pd.DataFrame":

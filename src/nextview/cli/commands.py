@@ -32,6 +32,9 @@ EXPORTED = (
     "{found.card}: largest difference between torch and ONNX "
     "on real views {found.difference:.2g}"
 )
+MORE_POLICIES = (
+    "tables and figures are in {out}; one more policy: the same command with --policies"
+)
 COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(
         f"{CLI}.recognise:recognise",
@@ -156,23 +159,29 @@ COMMANDS = {  # by name, in the order in which they are listed
         "nextview.benchmark.evaluation_page:write_evaluation",
         "evaluate a recogniser and its maps on every view",
         "tables and evaluate.html are in {out}",
-        f"{CLI}.leaderboard_table:print_evaluation",
+        f"{CLI}.benchmark_tables:print_evaluation",
     ),
-    "benchmark": Command(
-        "nextview.benchmark.run:run_benchmark",
-        "compare next-view policies",
+    "benchmark classes": Command(
+        "nextview.benchmark.classes:benchmark_classes",
+        "compare next-view policies on objects of known classes",
         "next: nextview report {out}",
-        f"{CLI}.leaderboard_table:print_results",
+        f"{CLI}.benchmark_tables:print_classes",
     ),
-    "benchmark-things": Command(
-        "nextview.benchmark.thing_benchmark:benchmark_things",
+    "benchmark things": Command(
+        "nextview.benchmark.things:benchmark_things",
         "compare next-view policies on taught things",
-        "tables and figures are in {out}; one more policy: the same command with --policies",
-        f"{CLI}.things_table:print_things",
+        MORE_POLICIES,
+        f"{CLI}.benchmark_tables:print_compared",
+    ),
+    "benchmark tables": Command(
+        "nextview.benchmark.tables:benchmark_tables",
+        "compare next-view policies on tables with several things",
+        MORE_POLICIES,
+        f"{CLI}.benchmark_tables:print_compared",
     ),
     "report": Command(
         "nextview.benchmark.report:report",
-        "write one HTML page of a benchmark's results",
+        "write one HTML page of a benchmark of classes",
         "{found}",
     ),
 }
@@ -186,5 +195,6 @@ RESUMES = (
     "train segmentation",
     "learn",
     "scenes",
-    "benchmark-things",
+    "benchmark things",
+    "benchmark tables",
 )

@@ -44,7 +44,11 @@ def _run(arguments: list[str]) -> None:
 
     if len(words) == 2 or not listed:
         name = " ".join(words) if listed else group
-        near = did_you_mean(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)])
+        if listed and not did_you_mean(words[1], " ".join(listed).split()):
+            there = ", ".join(listed)
+            raise UsageError(f"there is no command {name!r}; there are {there}")
+        groups = [name.split()[0] for name in COMMANDS]
+        near = did_you_mean(name, listed or [*COMMANDS, *groups])
         raise UsageError(
             f"there is no command {name!r}{near or '; nextview --help lists all'}"
         )

@@ -31,7 +31,7 @@ def predict(
 
     Args:
         store: view store made by nextview render.
-        out: predictions to write (.npz), from which nextview benchmark replays policies.
+        out: predictions to write (.npz), from which nextview benchmark classes replays policies.
         split: predict only this split.
         models: name of bundled models, or folder of your own models.
         recogniser: recogniser to use instead: name of a bundled model, or path of a card.
@@ -72,7 +72,7 @@ def predict(
     for line in summed_up(Predictions.load(out)):
         console.print(line)
     console.print(
-        f"predictions in {out}; compare policies with: nextview benchmark {out} RESULTS",
+        f"predictions in {out}; compare policies with: nextview benchmark classes {out} RESULTS",
         soft_wrap=True,
     )
 

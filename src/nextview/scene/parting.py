@@ -36,7 +36,9 @@ LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
 # metres between segments in the picture that are tried as one object, at most
 NEAR_GAP = 0.02
-NEAR_STEP = 0.03  # metres between their depths there, at most
+NEAR_STEP = (
+    0.1  # metres between their depths there, at most: across the hollow of a bowl
+)
 MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
 # objects that are judged anew in a frame at most, those with the most pixels first
@@ -330,8 +332,33 @@ def _largest(masks: Mapping[int, Mask]) -> list[int]:
 
 
 def _joined(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Join objects that touch where one scan explains them all better than several do."""
-    groups = _groups(tracks, bench)
+    """Join objects that touch where one scan explains them all better than several do.
+
+    What was joined is tried with what is left beside it, until nothing is joined any more.
+    """
+    found, tried = list(tracks), list[Track]()
+    while True:
+        joined = _joined_once(found, bench, tried)
+        if len(joined) == len(found):
+            return joined
+        found, tried = joined, found
+
+
+def _joined_once(
+    tracks: Sequence[Track],
+    bench: Bench,
+    tried: Sequence[Track],
+) -> list[Track]:
+    """Join groups of objects that have none in common, the greatest gain first.
+
+    Groups of objects that were ``tried`` already are not tried again.
+    """
+    old = {id(track) for track in tried}
+    groups = [
+        group
+        for group in _groups(tracks, bench)
+        if not all(id(tracks[row]) in old for row in group)
+    ]
     masks = [track.mask_in(bench.number) for track in tracks]
     pixels = [0 if mask is None else np.count_nonzero(mask) for mask in masks]
     groups.sort(key=lambda group: -sum(pixels[row] for row in group))

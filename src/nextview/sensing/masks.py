@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from scipy.ndimage import uniform_filter
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import WHOLE, Frame, Part, within
-from nextview.sensing.mask_edges import trimmed
+from nextview.sensing.mask_edges import SQUARE_WIDTH, trimmed
 from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
-from nextview.types import Float, Mask
+from nextview.types import Float, Float32, Mask
 
 # height over a plane, as a part of the distance, above which a pixel at a mask's edge is not the
 # plane's
 STANDS = 0.02
+PLANE_SHARE = 0.003  # of the distance, by which a plane is off beside the noise
+BESIDE = 20  # pixels around a mask in which the noise of the plane is measured
+FEWEST_BESIDE = 100  # pixels of the plane by which it is
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
 BESIDE_POINTS = 200  # pixels at a border that are compared
@@ -76,7 +80,7 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     """
     depth = frame.depth[part]
     height = frame.along(plane.normal, plane.offset, part)
-    least = np.float32(0.003) * depth
+    least = np.float32(PLANE_SHARE) * depth
     high = (height > least) & (depth > 0)
 
     # Noise moves a point along its ray: it rises by so much as the ray does.
@@ -94,7 +98,7 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     z = depth[rows, columns]
     rise = np.abs((a * x)[columns] + (b * y + c)[rows])
     high[rows, columns] = height[rows, columns] > z * (
-        4 * noise.at(z) * z * rise + 0.003
+        4 * noise.at(z) * z * rise + PLANE_SHARE
     )
     return high
 
@@ -118,11 +122,46 @@ def inside_mask(
 
     high = frame.along(plane.normal, plane.offset) > STANDS * frame.depth
     mask = trimmed(frame.depth, given, noise, high)
-    part = within(mask)
+    part = within(mask, BESIDE)
     above = mask.copy()
-    above[part] &= above_plane(frame, plane, noise, part)
+    above[part] &= _above_in_the_mean(frame, mask, plane, noise, part)
     # a plane may lie above what is hidden or flat
     return above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
+
+
+def _above_in_the_mean(
+    frame: Frame,
+    mask: Mask,
+    plane: Plane,
+    noise: Noise,
+    part: Part,
+) -> Mask:
+    """Which pixels of a mask are higher above a plane than the noise of their neighbourhood.
+
+    The mean of the neighbours in the mask is less noisy than a pixel: with the noise of a pixel the
+    lower part of a small thing would be taken for the plane. How much less is measured beside the
+    mask, since neighbouring pixels of a sensor err together.
+    """
+    z = frame.depth[part]
+    own = mask[part] & (z > 0)
+    height = frame.along(plane.normal, plane.offset, part)
+    a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
+    x, y = frame.rays[0][part[1]], frame.rays[1][part[0]]
+    deviation = noise.at(z) * z**2 * np.abs(a * x + (b * y + c)[:, None])
+
+    beside = ~mask[part] & (z > 0) & (np.abs(height) < 4 * deviation + PLANE_SHARE * z)
+    means = _mean(height, beside)[beside] / np.maximum(deviation[beside], 1e-9)
+    left = 1.0
+    if len(means) >= FEWEST_BESIDE:
+        left = min(1.0, float(np.sqrt(np.mean(means**2))))
+    return own & (_mean(height, own) > 4 * left * deviation + PLANE_SHARE * z)
+
+
+def _mean(values: Float32, among: Mask) -> Float32:
+    """Means of the neighbours that are among some pixels, (H, W) float32."""
+    share = uniform_filter(among.astype(np.float32), SQUARE_WIDTH, mode="constant")
+    total = uniform_filter(values * among, SQUARE_WIDTH, mode="constant")
+    return np.asarray(total / np.maximum(share, np.float32(1e-6)))
 
 
 def touching(

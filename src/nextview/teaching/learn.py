@@ -131,7 +131,7 @@ class Learned:
             cases.
         notes: what there is to know, a sentence each.
         left_out: what could not be learned and why, a phrase each.
-        by_features: where ``accuracy`` is by geometry: the same cases by features and size alone.
+        by_outline: where ``accuracy`` is by geometry: the same cases by outline and size alone.
         judged: how many things were shown to tell it by geometry.
     """
 
@@ -142,7 +142,7 @@ class Learned:
     confused: tuple[tuple[str, str, float], ...]
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
-    by_features: tuple[float, ...] = ()
+    by_outline: tuple[float, ...] = ()
     judged: int = 0
 
     def __str__(self) -> str:
@@ -165,10 +165,12 @@ class Learned:
         shown = self.accuracy[:3]
         views = ", ".join(str(k) for k in VIEWS_FITTED[: len(shown)])
         named = f"named right after {views} views: {_percent(shown)}"
-        if not self.by_features:
+        if not self.by_outline:
             return named
         of_some = "" if self.judged == self.things else f", of {self.judged} of them"
-        return f"{named} (by features and size alone {_percent(self.by_features)}{of_some})"
+        return (
+            f"{named} (by outline and size alone {_percent(self.by_outline)}{of_some})"
+        )
 
 
 def _percent(shares: Sequence[float]) -> str:
@@ -602,7 +604,7 @@ def _write(
     )
     if verified is None:
         return learned
-    return replace(learned, by_features=verified.by_features, judged=verified.things)
+    return replace(learned, by_outline=verified.by_outline, judged=verified.things)
 
 
 def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
@@ -709,7 +711,7 @@ def _with_verification(
     scores = dict(card.scores)
     if verified.accuracy:
         scores["verified by geometry"] = _by_views(verified.accuracy)
-        scores["the same by features"] = _by_views(verified.by_features)
+        scores["the same by outline"] = _by_views(verified.by_outline)
     return replace_record(
         card,
         memory=replace_record(about, verification=verification),

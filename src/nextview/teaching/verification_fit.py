@@ -69,7 +69,7 @@ class VerifiedFit:
         verification: for the card, of the things of known geometry alone.
         accuracy: share of the cases that are named right after 1, 2 and 3 views, with weights that
             were fitted to other things; () if nothing was shown.
-        by_features: the same by features and size alone.
+        by_outline: the same by outline and size alone.
         confused: pairs of a class and the one that it was named, with the share of its cases, after
             two views.
         things: how many were shown.
@@ -77,7 +77,7 @@ class VerifiedFit:
 
     verification: Verification
     accuracy: tuple[float, ...] = ()
-    by_features: tuple[float, ...] = ()
+    by_outline: tuple[float, ...] = ()
     confused: tuple[tuple[int, int, float], ...] = ()
     things: int = 0
 
@@ -129,12 +129,11 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     observations = _views(_opened(card)[0], thing, sensor, rng)
     if not observations:
         return []
-    evidence = known.log_evidence(observations)
 
     found = []
     for count in VIEWS_VERIFIED[: len(observations)]:
         try:
-            verified = known.verify(observations[:count], evidence[:count])
+            verified = known(observations[:count])
         except (
             ObservationError
         ):  # what was seen is too little to be compared with surfaces
@@ -190,7 +189,7 @@ def _views(
         surface.name,
         "m",
     )
-    lies = known.verifier.rotations[known.verifier.owners == thing]
+    lies = known.lies(thing)
     shares = np.ones(1)
     if len(lies) > 1:
         stable = stable_poses(mesh)
@@ -217,15 +216,15 @@ def _views(
 
 def _of_classes(judged: JudgedEpisode, truth: int, labels: Index) -> JudgedEpisode:
     """The same in classes, by the class of each thing; ``truth`` is the class that is right."""
-    by_features = np.zeros(max(int(labels.max()), truth) + 1)
-    np.add.at(by_features, labels, judged.by_features)
+    by_outline = np.zeros(max(int(labels.max()), truth) + 1)
+    np.add.at(by_outline, labels, judged.by_outline)
     return JudgedEpisode(
         truth,
         labels[judged.things],
         judged.mean,
         judged.camera_costs,
         judged.log_belief,
-        by_features,
+        by_outline,
     )
 
 
@@ -251,11 +250,11 @@ def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
     residuals = _residuals(shown, labels)
     verification = as_stored(weights, residuals, len(labels))
     answers = [int(beliefs[id(one)].argmax()) for one in shown]
-    by_features = [int(one.judged.by_features.argmax()) for one in shown]
+    by_outline = [int(one.judged.by_outline.argmax()) for one in shown]
     return VerifiedFit(
         verification,
         _accuracy(shown, answers),
-        _accuracy(shown, by_features),
+        _accuracy(shown, by_outline),
         _confused(shown, answers),
         len(half),
     )
@@ -355,7 +354,7 @@ def with_new_things(
     """
     weights = EvidenceWeights(**before.weights)
     answers = [int(one.judged.belief(weights).argmax()) for one in shown]
-    by_features = [int(one.judged.by_features.argmax()) for one in shown]
+    by_outline = [int(one.judged.by_outline.argmax()) for one in shown]
 
     residuals = residuals_of(before, range(len(before.usual)))
     if residuals is not None:
@@ -365,7 +364,7 @@ def with_new_things(
     return VerifiedFit(
         verification,
         _accuracy(shown, answers),
-        _accuracy(shown, by_features),
+        _accuracy(shown, by_outline),
         _confused(shown, answers),
         len({one.thing for one in shown}),
     )

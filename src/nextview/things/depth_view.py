@@ -26,7 +26,11 @@ NOISE_ROWS = 40  # rows of an image in which its noise is measured
 NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
-LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
+LEVEL_NOISE = 4.0  # deviations of the noise within which a pixel lies on the ground
+LEVEL_SHARE = 0.003  # of its distance within which it does, beside the noise
+# metres by which something stands before a surface that it hides, at least
+HIDING = 0.005
+HIDING_NOISE = 4.0  # deviations of the noise by which it does
 KEPT_IMAGES = 12  # of the last objects: poses are asked for after the names
 
 
@@ -49,7 +53,8 @@ class DepthView:
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
             unit vectors; zero within it.
         ground: plane that the thing stands on, if it is seen.
-        level: pixels of the thing that lie on the ground, (P,) bool: they may not be of the thing.
+        level: pixels as low as the noise of the ground is high, (P,) bool: whether they show the
+            thing is not known, however they were segmented.
         shape: rows and columns of the grid; P is their product.
         step: distance between the grid's rows, and between its columns, (2,) float64, pixels of the
             image.
@@ -115,6 +120,7 @@ class MetricImage:
         intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
         noise: of single pixels.
         ground: plane that the thing stands on, if it is seen.
+        hiding: pixels around the thing that show something before it, (H, W) bool.
     """
 
     depth: Float32
@@ -123,6 +129,7 @@ class MetricImage:
     intrinsics: Float
     noise: Noise
     ground: Ground | None
+    hiding: Mask
 
     @classmethod
     def of(
@@ -177,6 +184,37 @@ class MetricImage:
         thing = kind[some] == THING
         return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
 
+    def find_hiding(self) -> Mask:
+        """Pixels around the thing that show something before it, (H, W) bool, but the ground."""
+        rows, columns = (
+            slice(lines[0], lines[-1] + 1)
+            for lines in _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
+        )
+        depth = self.depth[rows, columns]
+        kind = self.kind[rows, columns]
+        nearest = distance_transform_edt(
+            kind != THING, return_distances=False, return_indices=True
+        )
+        beside = depth[tuple(nearest)]
+        noise = self.noise.at(beside) * beside**2
+        apart = np.hypot(HIDING, HIDING_NOISE * np.minimum(noise, NOISIEST * beside))
+        hiding = (kind == ELSEWHERE) & (depth < beside - apart)
+        if self.ground is not None and hiding.any():
+            at = np.nonzero(hiding)
+            x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(
+                at[0] + rows.start, at[1] + columns.start
+            )
+            rays = np.stack([x, y, np.ones(len(x))], -1) @ self.pose[:3, :3].T
+            points = self.pose[:3, 3] + rays * depth[at][:, None].astype(np.float64)
+            heights = self.ground.heights(points)
+            allowed = np.hypot(
+                HIDING, HIDING_NOISE * self.ground.noise * depth[at] ** 2
+            )
+            hiding[at] = heights > allowed
+        every = np.zeros(self.kind.shape, bool)
+        every[rows, columns] = hiding
+        return every
+
     def _rays(self, rows: Index, columns: Index) -> Float:
         """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
         x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(rows, columns)
@@ -215,7 +253,9 @@ class MetricImage:
             heights = self.ground.heights(
                 origin + rays * finite[:, None].astype(np.float64)
             )
-            level = (kind == THING) & (np.abs(heights) < LEVEL_NOISE * noise)
+            rise = np.abs(rays @ self.ground.normal)
+            low = LEVEL_NOISE * noise * rise + LEVEL_SHARE * finite
+            level = (finite > 0) & (np.abs(heights) < low)
 
         return DepthView(
             origin=origin,
@@ -247,8 +287,10 @@ def _metric_image(observation: Observation, metres: float) -> MetricImage | None
     pose[:3, 3] *= metres
     some_rows = depth[:: max(1, len(depth) // NOISE_ROWS)]
     noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
-    image = MetricImage(depth, kind, pose, intrinsics, noise, None)
-    return replace(image, ground=image.find_ground())
+    nowhere = np.zeros(kind.shape, bool)
+    image = MetricImage(depth, kind, pose, intrinsics, noise, None, nowhere)
+    image = replace(image, ground=image.find_ground())
+    return replace(image, hiding=image.find_hiding())
 
 
 def _what_is_seen(

@@ -8,7 +8,7 @@ import numpy as np
 from nextview.types import Float, Floats
 
 FEWEST_PLANE_POINTS = 50  # on the plane
-LEAST_PLANE_SHARE = 0.25  # of what is measured beside the thing
+LEAST_PLANE_SHARE = 0.1  # of what is measured beside the thing
 # thickness of the layer that the plane is looked for in, half sizes of the thing
 PLANE_LAYER = 0.15
 THINNEST_LAYER = 0.006  # metres
@@ -47,8 +47,8 @@ def find_ground(
 ) -> Ground | None:
     """Find the plane that a thing stands on in what is measured beside it.
 
-    It is the level plane that most points lie on, at the bottom of what is seen of the thing or
-    below.
+    It is the highest level plane, at the bottom of what is seen of the thing or below, that a good
+    part of the points lies on: a floor below a small table may fill more of the image.
 
     Args:
         beside: what is measured beside the thing, object frame, (N, 3), metres.
@@ -67,7 +67,11 @@ def find_ground(
     layer = max(PLANE_LAYER * half_size, THINNEST_LAYER)
     heights = np.sort(beside[:, 2])
     inside = np.searchsorted(heights, heights + layer) - np.arange(len(heights))
-    lowest = heights[inside.argmax()]
+    below = (inside >= enough) & (heights <= np.quantile(thing[:, 2], 0.1) + layer)
+    if not below.any():
+        return None
+    highest = heights[below].max()
+    lowest = heights[np.where(heights >= highest - layer, inside * below, 0).argmax()]
     near = (beside[:, 2] >= lowest) & (beside[:, 2] <= lowest + layer)
 
     centre = beside.mean(0) * (1, 1, 0)

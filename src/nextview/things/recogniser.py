@@ -78,10 +78,7 @@ class VerifiedRecogniser(TaughtRecogniser):
 
     @cached_property
     def in_any_orientation(self) -> VerifiedRecogniser:
-        """The same for things that may be held, lean or fly: they need not rest.
-
-        Features remember things that rest, so outlines propose what is aligned.
-        """
+        """The same for things that may be held or fly: the ground does not count."""
         tilted = copy(self)
         tilted.things = self.things.in_any_orientation()
         return tilted
@@ -91,7 +88,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         """Class of each thing whose geometry is known, (T,) int64."""
         of_hypotheses = np.array(self.calibration.hypotheses)[self.things.rows]
         labels = np.zeros(len(self.things.names), np.int64)
-        labels[self.things.verifier.owners] = of_hypotheses
+        labels[self.things.owners] = of_hypotheses
         return labels
 
     def together(

@@ -15,7 +15,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
+from nextview.things.depth_view import (
+    ELSEWHERE,
+    HIDING,
+    HIDING_NOISE,
+    NOT_MEASURED,
+    THING,
+    DepthView,
+)
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -24,7 +31,6 @@ PLACE = slice(3, 6)
 POSE = 6
 """Unknowns of a step: turn and place of a hypothesis; the errors of the cameras follow."""
 
-FIXED_WEIGHT = 1e9  # weight of an unknown that does not change
 FREE_WEIGHT = 1e-3  # weight of one that nothing is known of
 SHIFT_LIMIT = 0.25  # radii that a step moves a hypothesis at most
 TURN_LIMIT = 0.3  # radians that a step turns it at most
@@ -81,13 +87,11 @@ class Level:
         steps: how many.
         off: by which part of its radius a surface is off.
         displaced: by which part of what it may be a view is still displaced.
-        turned: whether the tilt is aligned too, and not only azimuth and place.
     """
 
     steps: int
     off: float
     displaced: float
-    turned: bool
 
     def reach(self, radii: Float32, displaced: float) -> Float32:
         """Deviation to be expected of each hypothesis, (H,) float32, metres, without noise.
@@ -99,9 +103,9 @@ class Level:
         return np.hypot(self.off * radii, np.float32(self.displaced * displaced))
 
 
-FIRST = (Level(2, 0.25, 2.0, False),)
-COARSE_LEVELS = (Level(2, 0.1, 1.0, False), Level(1, 0.05, 0.5, True))
-FINE = (Level(2, 0.035, 0.25, True), Level(1, 0.02, 0.1, True))
+FIRST = (Level(2, 0.25, 2.0),)
+COARSE_LEVELS = (Level(2, 0.1, 1.0), Level(1, 0.05, 0.5))
+FINE = (Level(2, 0.035, 0.25), Level(1, 0.02, 0.1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +114,6 @@ class Alignment:
 
     Attributes:
         things: number of the surface of each hypothesis, (H,) int64.
-        ups: direction in the scan file's axes that points up where the thing rests, (H, 3) float64.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3) float64.
         centres: where the centre of the surface lies, (H, 3) float64.
         cameras: by how much each view sees the thing displaced, because of an error of the camera's
@@ -118,7 +121,6 @@ class Alignment:
     """
 
     things: Index
-    ups: Float
     rotations: Float
     centres: Float
     cameras: Float
@@ -144,17 +146,10 @@ class Alignment:
         """Some of the hypotheses, by index or mask."""
         return Alignment(
             things=self.things[rows],
-            ups=self.ups[rows],
             rotations=self.rotations[rows],
             centres=self.centres[rows],
             cameras=self.cameras[rows],
         )
-
-    @property
-    def tilts(self) -> Float:
-        """Turn about x and y out of the resting pose, (H, 2) float64, radians."""
-        ups = np.einsum("hij,hj->hi", self.rotations, self.ups)
-        return np.stack([-ups[:, 1], ups[:, 0]], 1)
 
     def poses(self, caster: SurfaceCaster) -> Float:
         """Poses of the scan files' frames in the object frame, (H, 4, 4) float64, metres."""
@@ -180,25 +175,28 @@ def joined(first: Alignment, second: Alignment) -> Alignment:
     return Alignment(**parts)
 
 
-def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignment:
-    """Hypotheses before anything is aligned: each with its centre in that of the object frame.
+def start(
+    things: NDArray[np.integer],
+    rotations: Float,
+    centres: Float,
+    views: int,
+) -> Alignment:
+    """Hypotheses before anything is aligned.
 
     Args:
         things: number of the surface of each, (H,) int.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3).
+        centres: of the surfaces in the object frame, (H, 3), metres.
         views: how many views there are.
 
     Returns:
         The hypotheses, with no error of any camera.
     """
-    count = len(things)
-    rotations = np.asarray(rotations, np.float64)
     return Alignment(
         things=np.asarray(things, np.int64),
-        ups=rotations[:, 2],
-        rotations=rotations,
-        centres=np.zeros((count, 3)),
-        cameras=np.zeros((count, views, 3)),
+        rotations=np.asarray(rotations, np.float64),
+        centres=np.asarray(centres, np.float64),
+        cameras=np.zeros((len(things), views, 3)),
     )
 
 
@@ -206,9 +204,6 @@ SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
 # and a part of its radius: large things are scanned less exactly
 RELATIVE_SCAN_ERROR = 0.005
 SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
-# metres by which something stands before a surface that it hides, at least
-HIDING = 0.005
-HIDING_NOISE = 4.0  # deviations of the noise by which it does
 # deviations of the noise at which a pixel counts half, however fine the level
 NOISE_REACH = 2.0
 
@@ -295,88 +290,6 @@ def render(
     return Rendered(depth, normals @ turns.swapaxes(1, 2), radii)
 
 
-def centred(
-    caster: SurfaceCaster,
-    alignment: Alignment,
-    views: Sequence[DepthView],
-) -> Alignment:
-    """Move each hypothesis so that what shows of it lies about where the thing was measured.
-
-    The centre of the object frame is that of what was seen, which need not be the centre of the
-    thing. A hypothesis that covers the outline of the thing better where it was stays there. Where
-    the ground is seen, each stands on it.
-
-    Args:
-        caster: of all surfaces.
-        alignment: the hypotheses.
-        views: the views, in the order of ``alignment.cameras``.
-
-    Returns:
-        The same hypotheses, turned as they were.
-    """
-    change = np.zeros((len(alignment), 3))
-    before = np.zeros(len(alignment))
-    for number, view in enumerate(views):
-        rendered = render(caster, alignment, view, number)
-        shows = np.isfinite(rendered.depth)
-        before += _overlap(view, shows)
-
-        seen = np.median(view.thing_points, axis=0)
-        some = shows.any(1)
-        depth = np.where(shows[some], rendered.depth[some], 0)
-        points = view.origin + view.rays * depth[..., None]
-        change[some] += (seen - _medians(points, shows[some])) / len(views)
-
-    standing = _heights_on_the_ground(caster, alignment, views)
-    if standing is not None:
-        change[:, 2] = standing - alignment.centres[:, 2]
-
-    moved = replace(alignment, centres=alignment.centres + change)
-    after = np.zeros(len(alignment))
-    for number, view in enumerate(views):
-        after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
-    better = after > before
-    return replace(
-        alignment,
-        centres=np.where(better[:, None], moved.centres, alignment.centres),
-    )
-
-
-def _medians(points: Float, shown: Mask) -> Float:
-    """Median of those points of each row, (H, P, 3), that are shown, (H, P): (H, 3)."""
-    ordered = np.where(shown[:, None], points.swapaxes(1, 2), np.inf)
-    ordered.sort(axis=2)
-    count = shown.sum(1)
-    row = np.arange(len(points))
-    return (ordered[row, :, (count - 1) // 2] + ordered[row, :, count // 2]) / 2
-
-
-def _heights_on_the_ground(
-    caster: SurfaceCaster,
-    alignment: Alignment,
-    views: Sequence[DepthView],
-) -> Float | None:
-    """Heights of the centres of hypotheses that stand on the ground, (H,); None if none is seen."""
-    grounds = [view.ground for view in views if view.ground is not None]
-    if not grounds:
-        return None
-    ground = np.mean([-ground.offset / ground.normal[2] for ground in grounds])
-    lowest = np.empty(len(alignment))
-    for hypothesis, thing in enumerate(alignment.things):
-        surface = caster.surfaces[thing]
-        down = alignment.rotations[hypothesis, 2].astype(np.float32)
-        lowest[hypothesis] = ((surface.vertices - surface.centre) @ down).min()
-    return ground - lowest
-
-
-def _overlap(view: DepthView, shows: Mask) -> Float:
-    """Intersection over union of where hypotheses show, (H, P), with the thing's pixels, (H,)."""
-    thing = view.kind == THING
-    hidden = view.kind == NOT_MEASURED
-    union = ((shows & ~hidden) | thing).sum(1)
-    return (shows & thing).sum(1) / np.maximum(union, 1)
-
-
 @dataclass(frozen=True, eq=False)
 class Pulls:
     """By how much, and in which direction, pixels of one view draw hypotheses: N pulls.
@@ -418,7 +331,8 @@ def pulls_of(
     # Where the thing was measured: along the normal.
     measured = shows & (view.kind == THING)
     # Where the hypothesis shows, and the outline says that it does not: towards the outline.
-    beyond = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
+    elsewhere = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
+    beyond = elsewhere & ~(view.level & ~rendered.seen_behind(view))
     # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
     # drawn there.
     shows_somewhere = shows.any(1, keepdims=True)
@@ -763,10 +677,7 @@ def priors_of(
     weights = np.zeros((len(alignment), POSE + cameras))
     so_far = np.zeros((len(alignment), POSE + cameras))
 
-    weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED_WEIGHT
-    weights[:, 2] = FREE_WEIGHT
-    if level.turned:
-        so_far[:, :2] = alignment.tilts
+    weights[:, TURN] = FREE_WEIGHT
 
     reach = prior.place * caster.radii[alignment.things].astype(np.float64)
     weights[:, PLACE] = 1 / reach[:, None] ** 2

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.things.below_ground import ground_height
 from nextview.things.depth_view import DepthView
 from nextview.things.registration import (
     FINE,
@@ -37,6 +36,7 @@ from nextview.things.registration import (
     rotations_of,
     scan_errors,
 )
+from nextview.things.stability import ground_height
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.weighing import EvidenceWeights
@@ -60,7 +60,7 @@ STRETCH = slice(POSE, POSE + 3)
 UNKNOWNS = POSE + 3
 """Unknowns of a step: turn, place and stretch of the hypothesis; the cameras' errors follow."""
 
-STRETCH_LEVELS = (Level(5, 0.05, 0.5, True), Level(5, 0.02, 0.1, True))
+STRETCH_LEVELS = (Level(5, 0.05, 0.5), Level(5, 0.02, 0.1))
 # logarithm by which a step stretches at most, and by which it is damped
 STRETCH_STEP = 0.1
 UNTOLD = 1.0  # deviation of a stretch that the views tell nothing of

@@ -68,6 +68,16 @@ class Surface:
         return (self.vertices.min(0) + self.vertices.max(0)) / 2
 
     @cached_property
+    def hull(self) -> Float32:
+        """Corners of the convex hull, (N, 3) float32, metres; all vertices of what is flat."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:
+            return self.vertices[ConvexHull(self.vertices).vertices]
+        except QhullError:
+            return self.vertices
+
+    @cached_property
     def radius(self) -> float:
         """Distance of the farthest vertex from the centre, metres."""
         return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())

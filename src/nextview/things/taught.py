@@ -13,19 +13,18 @@ from nextview.recognition.protocol import log_evidence_of_views
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import Verified, Verifier, rival_turns
+from nextview.things.verifier import UNUSUAL, Verified, Verifier, rival_turns
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
 # The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
 SMALLEST_SHARE = 0.25
 LARGEST_SEEN_SHARE = 2.0
-# p-value of a thing in a known resting pose from which no other orientation is searched
-FOUND = 0.2
+TINY = 1e-300  # belief that has a logarithm
 
 
 class TaughtThings:
-    """Names taught things by features, size and geometry, and tells their poses.
+    """Names taught things by their geometry, and tells their poses.
 
     Attributes:
         recogniser: what is remembered of their views.
@@ -35,7 +34,9 @@ class TaughtThings:
             fitted.
         symmetries: of each thing, in the same order.
         any_orientation: whether they need not rest: all orientations are equally likely.
-        rows: hypotheses of the memory that are of these things, (R,) int64.
+        rows: resting poses of the memory that are of these things, (R,) int64.
+        owners: which of the things each of these is of, (R,) int64.
+        of_classes: whether some class of the memory has several things.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class TaughtThings:
         Args:
             recogniser: what is remembered of the things.
             surfaces: of the things that shall be recognised, by their names in the memory.
-            weights: how much features, size and geometry count.
+            weights: how much outlines, size and geometry count.
             residuals: how badly known things are explained, in the order of the surfaces.
 
         Raises:
@@ -70,14 +71,18 @@ class TaughtThings:
         rows = [
             row for row, thing in enumerate(memory.thing.tolist()) if thing in number
         ]
-        owners = np.array([number[int(memory.thing[row])] for row in rows])
+        labels = np.array(recogniser.calibration.hypotheses)[
+            np.unique(memory.thing, return_index=True)[1]
+        ]
+        self.of_classes = len(np.unique(labels)) < len(labels)
         self.rows = np.array(rows)
+        self.owners = np.array([number[int(memory.thing[row])] for row in rows])
         self.recogniser = recogniser
         self.residuals = residuals
         self.symmetries = tuple(
             about.things[known[name]].symmetries for name in self.names
         )
-        self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
+        self.verifier = Verifier(surfaces, weights)
         self.verifier.rivals = tuple(
             rival_turns(about.things[known[name]].near_symmetries)
             for name in self.names
@@ -136,51 +141,43 @@ class TaughtThings:
             raise ObservationError(
                 "no view shows the thing, so nothing can be recognised"
             )
-        return self.verify(seen, self.log_evidence(seen))
+        if not self.of_classes:
+            return self.verifier(seen, self.any_orientation)
+        calibration = self.recogniser.calibration
+        classes = len(self.recogniser.classes)
+        total = self.log_evidence(seen).sum(0)
+        return self.judge(
+            seen, calibration.joint(total, len(seen), classes, np.zeros(()))
+        )
+
+    def judge(self, observations: Sequence[Observation], joint: Float) -> Verified:
+        """Recognise the thing that some views show, of which the features have been looked at.
+
+        Features count where a class has several things: others of it differ from those that were
+        taught, and geometry alone cannot tell them.
+
+        Args:
+            observations: views that show one thing, all in one object frame.
+            joint: belief in each resting pose of the memory and azimuth bin by features and size,
+                (H, bins), see ``Calibration.joint``.
+
+        Returns:
+            The belief in each thing, and the poses.
+        """
+        prior = None
+        if self.of_classes:
+            of_things = np.zeros(len(self.names))
+            np.add.at(of_things, self.owners, joint[self.rows].sum(1))
+            prior = np.log(of_things / of_things.sum() + TINY)
+        return self.verifier(observations, self.any_orientation, prior)
+
+    def lies(self, thing: int) -> Floats:
+        """Rotations of a thing into the resting poses that it was taught in, (P, 3, 3)."""
+        return self.recogniser.memory.rotations[self.rows[self.owners == thing]]
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
         """What features and size say of each view, (V, D): it can be summed over views."""
         return log_evidence_of_views(self.recogniser, observations)
-
-    def verify(
-        self,
-        observations: Sequence[Observation],
-        log_evidence: Floats,
-    ) -> Verified:
-        """Recognise the thing that some views show, of which the features have been looked at.
-
-        Args:
-            observations: views that show one thing, all in one object frame.
-            log_evidence: of each view, (V, D), see the method of this name.
-
-        Returns:
-            The belief in each thing, and the poses.
-        """
-        calibration = self.recogniser.calibration
-        classes = len(self.recogniser.classes)
-        total = log_evidence.sum(0)
-        joint = calibration.joint(total, len(observations), classes, np.zeros(()))
-        return self.judge(observations, joint)
-
-    def judge(self, observations: Sequence[Observation], joint: Float) -> Verified:
-        """Recognise the thing that some views show, of which the features are summed up.
-
-        Args:
-            observations: views that show one thing, all in one object frame.
-            joint: belief in each hypothesis of the memory and azimuth bin by features and size,
-                (H, bins), see ``Calibration.joint``, for an azimuth of zero.
-
-        Returns:
-            The belief in each thing, and the poses.
-        """
-        if self.any_orientation:
-            return self.verifier.in_any_orientation(observations)
-        known = joint[self.rows]
-        resting = self.verifier(observations, known / known.sum())
-        p_value = self.p_value(observations, resting)
-        if p_value is not None and p_value >= FOUND:
-            return resting
-        return self.verifier.whole_search(observations, resting)
 
     def log_odds_of_stranger(
         self,
@@ -211,7 +208,8 @@ class TaughtThings:
         """Share of known things that are explained as badly by the likeliest hypothesis.
 
         What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is.
+        few pixels say: it gets the least p-value that there is. Few things do not stand on the
+        ground that is seen below them.
 
         Args:
             observations: the views.
@@ -233,13 +231,14 @@ class TaughtThings:
 
         explained = float(found.explained[0].mean())
         noise_share = float(found.noise_share[0].mean())
-        return self.residuals.of_real_camera(
+        p_value = self.residuals.of_real_camera(
             found.residual,
             likeliest,
             views,
             explained,
             noise_share,
         )
+        return p_value if found.stands[0] else UNUSUAL * p_value
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:

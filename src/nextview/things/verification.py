@@ -80,8 +80,9 @@ def likelihood(
 
     The depth on the thing is compared with the surface under the noise of the sensor, which grows
     where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
-    where the surface should be visible and what is behind it was measured. What stands in front of
-    the surface is neutral, as are pixels where neither shows. What lies below the ground counts
+    where the surface should be visible and what is behind it was measured. Pixels as low as the
+    noise of the ground are judged by their depth, however they were segmented. What stands in front
+    of the surface is neutral, as are pixels where neither shows. What lies below the ground counts
     like as large a share of the pixels that is seen through, whether it is visible or not.
 
     Args:
@@ -114,24 +115,24 @@ def likelihood(
     inner = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
     deep = np.where(view.level, 0.1, inner)  # of the ground, more likely
     thing = view.kind == THING
-    through = (
-        shows
-        & (view.kind == ELSEWHERE)
-        & (~rendered.hidden(view) | rendered.sunk(view))
-    )
+    sunk = rendered.sunk(view)
+    through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | sunk)
     hole = shows & (view.kind == NOT_MEASURED)
 
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    judged = np.where(through, model.outlier * deep, judged)
+    # Whether low pixels show the thing is not known: what they measure decides.
+    low = view.level & ~sunk
+    judged = np.where(through, np.where(low, match, model.outlier) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)
 
     counted = thing | through | hole
     explained = (shows & thing & (squared < 9)).sum(1) / max(1, int(thing.sum()))
     # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
     missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
-    seen_through = np.where(through, deep, 0).sum(1) / np.maximum(shows.sum(1), 1)
+    seen_through = np.where(through, judged / model.outlier, 0).sum(1)
+    seen_through /= np.maximum(shows.sum(1), 1)
     impossible = np.minimum(seen_through + below, 1)
     # Real sensors round off edges.
     both = np.where(shows & thing, inner, 0)

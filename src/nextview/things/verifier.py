@@ -7,14 +7,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.errors import ModelError, ObservationError
+from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import rotation_z
 from nextview.recognition.model_card import Symmetry
-from nextview.things.below_ground import BelowGround, below_ground
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
-from nextview.things.proposals import propose
 from nextview.things.registration import (
     COARSE_LEVELS,
     FINE,
@@ -24,38 +21,28 @@ from nextview.things.registration import (
     RegistrationPrior,
     align,
     camera_cost,
-    centred,
     different_poses,
     joined,
     render,
     rotations_of,
     start,
 )
+from nextview.things.stability import Stability, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
-from nextview.things.view_templates import MOST_ORIENTATIONS, ViewTemplates
+from nextview.things.view_templates import ViewTemplates, rank_within
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
-from nextview.types import Float, Floats, Index
+from nextview.types import Float, Index, Mask
 
-# radians by which a thing in any orientation is off its proposal: hardly held
-ANY_TILT = 0.3
-TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
-# misfit for each unit of log-belief that features hold against a thing
-AGAINST_FEATURES = 0.1
-TINY = 1e-300  # belief that has a logarithm
-LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
-AROUND_LEVELS = (
-    Level(1, 0.05, 0.5, False),
-)  # steps of the alignment at azimuths all around
-AROUND_THINGS = 2  # likeliest things that are also judged at azimuths all around
-AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
-AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
-
-
+# share of things that do not stand on what is seen below them: they lean on something, or hang
+UNUSUAL = 0.1
+THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
+LIKELY_THINGS = (
+    4  # the same of the likeliest by outline: of what is hidden the first may fail
+)
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
-
-UNUSUAL = 0.01  # as likely beforehand as a known resting pose is any other orientation
+RIVAL_THINGS = 2  # likeliest things that are turned
 
 
 @dataclass(frozen=True)
@@ -65,38 +52,26 @@ class Stage:
     Attributes:
         side: rows and columns of pixels.
         levels: steps of the alignment.
-        most: how many hypotheses survive at most.
+        most: how many hypotheses survive at most, half of them of one thing.
         hopeless: a hypothesis that is by so much less likely than the best one, as a logarithm, is
             given up.
-        around: whether the likeliest things are also tried at azimuths all around afterwards.
-        rivals: whether the likeliest hypothesis is also tried in the poses that a near symmetry
-            leads to.
+        rivals: whether the likeliest hypotheses of RIVAL_THINGS things are also tried in the poses
+            that a near symmetry leads to.
     """
 
     side: int
     levels: tuple[Level, ...]
     most: int
     hopeless: float
-    around: bool = False
     rivals: bool = False
 
 
 FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
-VERIFICATION_STAGES = (
-    Stage(16, FIRST, 24, 50.0, around=True),
-    Stage(24, COARSE_LEVELS, 12, 25.0, rivals=True),
+STAGES = (
+    Stage(16, FIRST, 32, 100.0, rivals=True),
+    Stage(24, COARSE_LEVELS, 12, 25.0),
     Stage(FINE_SIDE, FINE, 12, np.inf),
 )
-TILTED_STAGES = tuple(
-    replace(
-        stage,
-        levels=tuple(replace(level, turned=True) for level in stage.levels),
-        most=most,
-        around=False,
-    )
-    for stage, most in zip(VERIFICATION_STAGES, (32, 12, 12), strict=True)
-)
-"""The same for things in any orientation, which are turned about all axes from the beginning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,43 +82,40 @@ class Verified:
         belief: in each thing, (T,) float64, sums to 1.
         things: thing of each hypothesis that was judged, the likeliest hypothesis first, (M,)
             int64.
-        ups: direction in the scan file's axes that points up where each hypothesis rests or, if it
-            was proposed in any orientation, as it was proposed, (M, 3) float64.
         probabilities: of these hypotheses, (M,) float64, their sum is 1.
         poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
         cameras: by how much each view sees them displaced, (M, V, 3) float64, metres, object frame.
         mean: mean log-likelihood of the pixels of each view, (M, V) float64.
         camera_costs: half the squared deviations of each camera's place, (M, V) float64.
-        log_belief: log-belief in each hypothesis by features and size, (M,) float64.
-        by_features: belief in each thing by features and size alone, (T,) float64.
+        log_belief: log-belief in the thing of each hypothesis by outline and size, (M,) float64.
+        by_outline: belief in each thing by outline and size alone, (T,) float64.
         explained: share of the thing's pixels in each view that each hypothesis explains, (M, V)
             float64.
         misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
-        against: what features hold against each thing, nats, (T,) float64; 0 for things in any
-            orientation, whose outlines are judged by the geometry anyway.
         seen_behind: share of what should be visible of each hypothesis that the cameras see past,
             of all views together, (M,) float64.
         below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
             noise, tilt and errors of the scan explain it.
+        stands: whether each hypothesis touches the ground, and would not fall over, (M,) bool;
+            True where no view shows the ground.
     """
 
     belief: Float
     things: Index
-    ups: Float
     probabilities: Float
     poses: Float
     cameras: Float
     mean: Float
     camera_costs: Float
     log_belief: Float
-    by_features: Float
+    by_outline: Float
     explained: Float
     misfit: Float
     noise_share: Float
-    against: Float
     seen_behind: Float
     below: Float
+    stands: Mask
 
     def select(self, rows: NDArray) -> "Verified":
         """Some of the hypotheses, by index or mask."""
@@ -161,7 +133,7 @@ class Verified:
             self.mean,
             self.camera_costs,
             self.log_belief,
-            self.by_features,
+            self.by_outline,
         )
 
     def alignment(self, rows: Index, verifier: "Verifier") -> Alignment:
@@ -176,7 +148,6 @@ class Verified:
         own_centres = verifier.caster.centres[things].astype(np.float64)
         return Alignment(
             things=things,
-            ups=self.ups[rows],
             rotations=rotations,
             centres=np.einsum("hij,hj->hi", rotations, own_centres)
             + self.poses[rows, :3, 3],
@@ -185,17 +156,12 @@ class Verified:
 
     @property
     def residual(self) -> float:
-        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly.
-
-        Features that speak against it add a little.
-        """
-        against = min(self.against[self.things[0]], -np.log(LEAST_BY_FEATURES))
-        return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
+        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly."""
+        return float(self.misfit[0].mean())
 
 
 OF_HYPOTHESES = (
     "things",
-    "ups",
     "poses",
     "cameras",
     "mean",
@@ -205,6 +171,7 @@ OF_HYPOTHESES = (
     "noise_share",
     "seen_behind",
     "below",
+    "stands",
 )
 """What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
 
@@ -216,24 +183,35 @@ class _Proposed:
     Attributes:
         things: number of the surface of each, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
+        centres: of the surfaces in the object frame, (M, 3) float64, metres.
         log_belief: before the geometry is looked at, (M,) float64.
-        by_features: belief in each thing before that, (T,) float64, sums to 1.
-        against: see ``Verified``.
+        by_outline: belief in each thing before that, (T,) float64, sums to 1.
     """
 
     things: Index
     rotations: Float
+    centres: Float
     log_belief: Float
-    by_features: Float
-    against: Float
+    by_outline: Float
 
     def select(self, rows: NDArray) -> "_Proposed":
-        """Some of the hypotheses, by index."""
+        """Some of the hypotheses, by index or mask."""
         return replace(
             self,
             things=self.things[rows],
             rotations=self.rotations[rows],
+            centres=self.centres[rows],
             log_belief=self.log_belief[rows],
+        )
+
+    def followed_by(self, others: "_Proposed") -> "_Proposed":
+        """These hypotheses, and others after them."""
+        return replace(
+            self,
+            things=np.concatenate([self.things, others.things]),
+            rotations=np.concatenate([self.rotations, others.rotations]),
+            centres=np.concatenate([self.centres, others.centres]),
+            log_belief=np.concatenate([self.log_belief, others.log_belief]),
         )
 
 
@@ -242,8 +220,6 @@ class Verifier:
 
     Attributes:
         caster: the surfaces of the things.
-        owners: thing of each hypothesis, (H,) int64. A hypothesis is a thing in a resting pose.
-        rotations: from the axes of the scan file into the resting pose, (H, 3, 3) float64.
         weights: how much each kind of evidence counts.
         rivals: of each thing the turns about its centroid after which it hardly looks different,
             (N, 3, 3) float64; () where none are known.
@@ -252,8 +228,6 @@ class Verifier:
     def __init__(
         self,
         surfaces: Sequence[Surface],
-        owners: NDArray[np.integer],
-        rotations: Floats,
         weights: EvidenceWeights = EvidenceWeights(),
         pixels: PixelModel = PixelModel(),
         prior: RegistrationPrior = RegistrationPrior(),
@@ -262,104 +236,59 @@ class Verifier:
 
         Args:
             surfaces: of the things.
-            owners: thing of each hypothesis, (H,).
-            rotations: into the resting pose of each hypothesis, (H, 3, 3).
             weights: how much each kind of evidence counts.
             pixels: what pixels are like if a hypothesis is true.
             prior: how far off cameras and the vertical may be.
-
-        Raises:
-            ModelError: owners that are none of the things, or rotations of other hypotheses.
         """
-        self.owners = np.asarray(owners, np.int64)
-        self.rotations = np.asarray(rotations, np.float64)
-        unknown = set(self.owners.tolist()) - set(range(len(surfaces)))
-        if unknown or self.rotations.shape != (len(self.owners), 3, 3):
-            raise ModelError(
-                f"{len(surfaces)} surfaces do not fit {len(self.owners)} resting poses of things"
-            )
-
         self.caster = SurfaceCaster(surfaces)
         self.weights = weights
         self.pixels = pixels
         self.prior = prior
         self.rivals: tuple[Float, ...] = ()
 
-    def __call__(self, observations: Sequence[Observation], joint: Float) -> Verified:
-        """Align what is likely with all views, and judge it.
+    def __call__(
+        self,
+        observations: Sequence[Observation],
+        any_orientation: bool = False,
+        prior: Float | None = None,
+    ) -> Verified:
+        """Search all things in all orientations, align what is likely with all views, judge it.
 
         Args:
             observations: views of one thing, all in one object frame.
-            joint: belief in each hypothesis and azimuth bin by features and size, (H, bins): see
-                ``propose``.
+            any_orientation: whether all orientations are equally likely, and the ground does not
+                count: the thing is held, or flies.
+            prior: log-belief in each thing beforehand, (T,); None for none.
 
         Returns:
-            The belief by features, size and geometry, and the poses.
+            The belief by outline, size and geometry, and the poses.
 
         Raises:
-            ObservationError: no view shows the thing, or its scale is not known.
+            ObservationError: no view shows enough of the thing, or its scale is not known.
         """
-        if joint.shape[0] != len(self.owners):
-            raise ModelError(
-                f"a belief in {joint.shape[0]} hypotheses, and there are {len(self.owners)}"
+        if any_orientation:
+            images, level = _held(observations)
+        else:
+            images, level = _levelled(observations)
+
+        found = self.templates.propose(images)
+        if not len(found.things):
+            raise ObservationError(
+                "no view shows enough of the thing to be compared with others"
             )
-
-        proposals = propose(joint)
-        turns = rotation_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
-        by_features = np.zeros(len(self.caster.surfaces))
-        np.add.at(by_features, self.owners, joint.sum(1))
-        by_features /= by_features.sum()
+        by_outline = found.log_belief + (0 if prior is None else prior)
+        by_outline -= by_outline.max()
+        belief = np.exp(by_outline)
         proposed = _Proposed(
-            things=self.owners[proposals.hypotheses],
-            rotations=turns,
-            log_belief=proposals.log_belief,
-            by_features=by_features,
-            against=-np.log(by_features + TINY),
+            things=found.things,
+            rotations=found.rotations,
+            centres=found.centres,
+            log_belief=by_outline[found.things],
+            by_outline=belief / belief.sum(),
         )
-
-        images, level = _levelled(observations)
-        return self._settled(proposed, images, VERIFICATION_STAGES, self.prior, level)
-
-    def in_any_orientation(
-        self,
-        observations: Sequence[Observation],
-    ) -> Verified:
-        """The same for a thing that need not rest on anything: held, leaning or thrown.
-
-        Args:
-            observations: views of one thing, all in one object frame.
-
-        Returns:
-            The belief by size, outline and geometry, and the poses.
-
-        Raises:
-            ObservationError: no view shows the thing, or its scale is not known.
-        """
-        return self._tilted(*_held(observations))
-
-    def whole_search(
-        self,
-        observations: Sequence[Observation],
-        resting: Verified,
-    ) -> Verified:
-        """Search on, in all orientations, where no thing in a known resting pose was found.
-
-        A thing may rest in a rare pose, lean, or stand as somebody put it. Such hypotheses compete
-        with those that rest, each ``UNUSUAL`` times as likely beforehand; the ground counts.
-
-        Args:
-            observations: views of one thing, all in one object frame.
-            resting: what was found of resting things.
-
-        Returns:
-            What is found of both kinds of hypotheses together.
-        """
-        images, level = _levelled(observations)
-        try:
-            unusual = self._tilted(images, level)
-        except ObservationError:  # too little is seen to be compared
-            return resting
-        return self._joined(resting, unusual)
+        return self._settled(
+            *self._started(proposed, found.ranks, images), images, level
+        )
 
     def log_odds_of_stranger(
         self,
@@ -394,95 +323,62 @@ class Verifier:
         """Pictures of the things from all around, which propose orientations."""
         return ViewTemplates(self.caster)
 
-    def _tilted(self, images: Sequence[MetricImage], level: Float) -> Verified:
-        """What is found in any orientation, in a frame that was turned to be level."""
-        each = max(1, TILTED_PROPOSALS // len(images))
-        of_one = max(1, MOST_ORIENTATIONS // len(images))
-        found = [self.templates.propose(image, each, of_one) for image in images]
-        things = np.concatenate([one.things for one in found])
-        if not len(things):
-            raise ObservationError(
-                "no view shows enough of the thing to be compared with others"
-            )
+    def _started(
+        self,
+        proposed: _Proposed,
+        ranks: Index,
+        images: Sequence[MetricImage],
+    ) -> tuple[_Proposed, Alignment]:
+        """The first orientation of each thing, and all of the likeliest things by either.
 
-        by_outline = np.mean([one.log_belief for one in found], axis=0)
-        belief = np.exp(by_outline - by_outline.max())
-        proposed = _Proposed(
-            things=things,
-            rotations=np.concatenate([one.rotations for one in found]),
-            log_belief=by_outline[things] - by_outline.max(),
-            by_features=belief / belief.sum(),
-            against=np.zeros(len(belief)),
-        )
-        prior = replace(self.prior, tilt=ANY_TILT)
-        return self._settled(proposed, images, TILTED_STAGES, prior, level)
+        Args:
+            proposed: orientations of things.
+            ranks: how many orientations of the same thing come before each, (M,).
+            images: the views.
 
-    def _joined(self, resting: Verified, unusual: Verified) -> Verified:
-        """Hypotheses of resting things and of others, the likeliest first."""
-        logs = [resting.log_belief, unusual.log_belief + np.log(UNUSUAL)]
-        log_belief = np.concatenate(logs)
-        both = {
-            name: np.concatenate([getattr(resting, name), getattr(unusual, name)])
-            for name in OF_HYPOTHESES
-        }
-        scores = self.weights.scores(both["mean"], both["camera_costs"], log_belief)
+        Returns:
+            What is worth aligning, and where it starts.
+        """
+        stage = STAGES[0]
+        views = [image.view(stage.side) for image in images]
+        first = proposed.select(ranks == 0)
+        tried = start(first.things, first.rotations, first.centres, len(views))
+        tried = align(self.caster, tried, views, stage.levels, self.prior)
+        order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
 
-        order = np.argsort(-scores, kind="stable")
-        shares = np.exp(scores - scores.max())
-        whole = replace(
-            resting,
-            belief=self.weights.belief(scores, both["things"], resting.by_features),
-            probabilities=(shares / shares.sum())[order],
-            log_belief=log_belief[order],
-            **{name: values[order] for name, values in both.items()},
-        )
-        alike = different_poses(
-            self.caster, whole.alignment(np.arange(len(order)), self)
-        )
-        return whole.select(alike)
+        best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_ALIGNED]
+        best += np.argsort(-proposed.by_outline)[:LIKELY_THINGS].tolist()
+        others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
+        alignment = start(others.things, others.rotations, others.centres, len(views))
+        return first.followed_by(others), joined(tried, alignment)
 
     def _settled(
         self,
         proposed: _Proposed,
+        alignment: Alignment,
         images: Sequence[MetricImage],
-        stages: Sequence[Stage],
-        prior: RegistrationPrior,
         level: Float,
     ) -> Verified:
         """The proposals aligned and judged, coarse to fine, in a frame that was turned to be
         level.
         """
-        views = [image.view(stages[0].side) for image in images]
-        alignment = start(proposed.things, proposed.rotations, len(views))
-        alignment = centred(self.caster, alignment, views)
-
-        for stage in stages:
+        for stage in STAGES:
             views = [image.view(stage.side) for image in images]
-            alignment = align(self.caster, alignment, views, stage.levels, prior)
-            judged = self._judge(alignment, views)
-            mean = np.stack([view.mean for view in judged], 1)
-            costs = camera_cost(alignment, views, prior)
-            scores = self.weights.scores(mean, costs, proposed.log_belief)
+            alignment = align(self.caster, alignment, views, stage.levels, self.prior)
+            scores, costs, judged = self._scores(proposed, alignment, views)
 
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
-            rows = order[different_poses(self.caster, alignment.select(order))][
-                : stage.most
-            ]
+            rows = order[different_poses(self.caster, alignment.select(order))]
+            # no thing crowds out all others, as a round one would
+            rows = rows[rank_within(alignment.things[rows]) < stage.most // 2]
+            rows = rows[: stage.most]
             alignment = alignment.select(rows)
             proposed = proposed.select(rows)
-            if stage.around:
-                turned, source = self._around(alignment, proposed, views, prior)
-                alignment = joined(alignment, turned)
-                proposed = proposed.select(
-                    np.concatenate([np.arange(len(rows)), source])
-                )
             if stage.rivals and self.rivals:
-                turned = self._rivals(alignment)
+                turned, source = self._rivals(alignment)
                 alignment = joined(alignment, turned)
-                proposed = proposed.select(
-                    np.r_[np.arange(len(rows)), np.zeros(len(turned), int)]
-                )
+                proposed = proposed.select(np.r_[np.arange(len(rows)), source])
 
         return self._verified(
             proposed,
@@ -494,89 +390,57 @@ class Verifier:
             level,
         )
 
-    def _around(
+    def _scores(
         self,
-        alignment: Alignment,
         proposed: _Proposed,
+        alignment: Alignment,
         views: Sequence[DepthView],
-        prior: RegistrationPrior,
-    ) -> tuple[Alignment, Index]:
-        """The likeliest things, turned about the vertical to where they explain the views best.
+    ) -> tuple[Float, Float, list[ViewLikelihood]]:
+        """Log-likelihoods of hypotheses, (M,), and the cameras' costs and pixels behind them."""
+        ground = self._standing(alignment, views)
+        judged = self._judge(alignment, views, ground)
+        mean = np.stack([view.mean for view in judged], 1)
+        costs = camera_cost(alignment, views, self.prior)
+        scores = self.weights.scores(mean, costs, proposed.log_belief)
+        return scores + np.where(ground.stands, 0, np.log(UNUSUAL)), costs, judged
 
-        A small part of a round body draws a hypothesis only from near its own azimuth.
-
-        Args:
-            alignment: hypotheses, the best ones first.
-            proposed: the same.
-            views: of the thing.
-            prior: how far off cameras may be.
+    def _rivals(self, alignment: Alignment) -> tuple[Alignment, Index]:
+        """The likeliest hypotheses in the poses in which their things hardly look different.
 
         Returns:
-            Hypotheses at the best azimuths, and the rows from which each was turned, (N,).
+            These, and the row of the hypothesis from which each was turned, (N,).
         """
-        first = np.sort(np.unique(alignment.things, return_index=True)[1])[
-            :AROUND_THINGS
+        first = np.sort(np.unique(alignment.things, return_index=True)[1])
+        some = [
+            (row, self.rivals[alignment.things[row]]) for row in first[:RIVAL_THINGS]
         ]
-        source = np.repeat(first, AROUND_STEPS)
-        azimuths = 2 * np.pi * np.arange(AROUND_STEPS) / AROUND_STEPS
-        turns = np.tile(rotation_z(azimuths), (len(first), 1, 1))
-        some = alignment.select(source)
-        # About an axis that a round body shares, however far a part of it stands out.
-        surfaces = [self.caster.surfaces[thing] for thing in some.things]
-        arms = np.stack([surface.centroid - surface.centre for surface in surfaces])
-        axes = some.centres + np.einsum("hij,hj->hi", some.rotations, arms)
-        rotations = turns @ some.rotations
-        centres = axes - np.einsum("hij,hj->hi", rotations, arms)
-        some = replace(some, rotations=rotations, centres=centres)
-        some = align(self.caster, some, views, AROUND_LEVELS, prior)
-
-        mean = np.stack([view.mean for view in self._judge(some, views)], 1)
-        costs = camera_cost(some, views, prior)
-        scores = self.weights.scores(mean, costs, proposed.log_belief[source])
-        circles = scores.reshape(len(first), AROUND_STEPS)
-        peak = (circles >= np.roll(circles, 1, 1)) & (circles > np.roll(circles, -1, 1))
-        peak[:, 0] = False  # as they are
-        best = np.argsort(-np.where(peak, circles, -np.inf), axis=1, kind="stable")[
-            :,
-            :AROUND_PEAKS,
-        ]
-        rows = (best + AROUND_STEPS * np.arange(len(first))[:, None])[
-            np.take_along_axis(peak, best, 1)
-        ]
-        return some.select(rows), source[rows]
-
-    def _rivals(self, alignment: Alignment) -> Alignment:
-        """The first hypothesis in the poses in which its thing hardly looks different."""
-        thing = int(alignment.things[0])
-        turns = self.rivals[thing]
-        some = alignment.select(np.zeros(len(turns), np.int64))
-        surface = self.caster.surfaces[thing]
-        arm = surface.centroid - surface.centre
-        rotations = some.rotations @ turns
-        fixed = some.centres + some.rotations @ arm
-        ups = np.einsum("nji,nj->ni", turns, some.ups)
-        return replace(
-            some, ups=ups, rotations=rotations, centres=fixed - rotations @ arm
-        )
+        source = np.concatenate([np.full(len(turns), row) for row, turns in some])
+        turned = alignment.select(source)
+        surfaces = [self.caster.surfaces[thing] for thing in turned.things]
+        arms = np.array([one.centroid - one.centre for one in surfaces]).reshape(-1, 3)
+        rotations = turned.rotations @ np.concatenate([turns for _, turns in some])
+        fixed = turned.centres + np.einsum("nij,nj->ni", turned.rotations, arms)
+        centres = fixed - np.einsum("nij,nj->ni", rotations, arms)
+        return replace(turned, rotations=rotations, centres=centres), source
 
     def _judge(
         self,
         alignment: Alignment,
         views: Sequence[DepthView],
+        ground: Stability,
     ) -> list[ViewLikelihood]:
-        below = self._below(alignment, views).share
         return [
             likelihood(
                 view,
                 render(self.caster, alignment, view, number),
                 self.pixels,
-                below,
+                ground.below,
             )
             for number, view in enumerate(views)
         ]
 
-    def _below(self, alignment: Alignment, views: Sequence[DepthView]) -> BelowGround:
-        return below_ground(self.caster, alignment, views, self.prior.tilt)
+    def _standing(self, alignment: Alignment, views: Sequence[DepthView]) -> Stability:
+        return standing(self.caster, alignment, views, self.prior.tilt)
 
     def _verified(
         self,
@@ -595,24 +459,24 @@ class Verifier:
         visible = np.sum([view.visible for view in judged], axis=0)
         behind = np.sum([view.seen_behind for view in judged], axis=0)
         aligned = alignment.turned(level.T)
+        ground = self._standing(alignment, views)
         shares = np.exp(scores - scores.max())
         return Verified(
-            belief=self.weights.belief(scores, alignment.things, proposed.by_features),
+            belief=self.weights.belief(scores, alignment.things, proposed.by_outline),
             things=alignment.things,
-            ups=alignment.ups,
             probabilities=shares / shares.sum(),
             poses=aligned.poses(self.caster),
             cameras=aligned.cameras,
             mean=np.stack([view.mean for view in judged], 1),
             camera_costs=costs,
             log_belief=proposed.log_belief,
-            by_features=proposed.by_features,
+            by_outline=proposed.by_outline,
             explained=np.stack([view.explained for view in judged], 1),
             misfit=np.stack([view.misfit for view in judged], 1),
             noise_share=np.stack([view.noise_share for view in judged], 1),
-            against=proposed.against,
             seen_behind=behind / np.maximum(visible, 1),
-            below=self._below(alignment, views).depth,
+            below=ground.depth,
+            stands=ground.stands,
         )
 
 

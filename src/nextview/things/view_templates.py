@@ -2,23 +2,23 @@
 
 Each thing is rendered from directions all around it, as template matching does (Hinterstoisser et
 al., "Model based training, detection and pose estimation of texture-less 3D objects in heavily
-cluttered scenes", 2012). A picture is a small grid over the outline, centred and scaled by the
-moments of the outline, so that where the thing is and how far away does not matter. What is seen is
-turned in the image plane instead of the templates. Outlines are compared by their intersection over
-union, depths by the mean squared difference where both show, and sizes by the ratio of the
-outlines. All of it is a few matrix products.
+cluttered scenes", 2012). A picture is a small grid over the outline, in metres, so that a picture
+of another size does not fit. What is seen is turned in the image plane instead of the templates.
+Outlines are compared by their intersection over union where it is known what is there: not where
+something stands before the thing, where nothing was measured, or beyond the border of the image.
+What is partly hidden is also compared displaced to what hides it. Depths are compared by the mean
+squared difference where both show. All of it is a few matrix products.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
-from nextview.things.depth_view import THING, MetricImage
+from nextview.things.depth_view import NOT_MEASURED, THING, MetricImage
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
@@ -29,15 +29,27 @@ TEMPLATE_REACH = 2.2  # from its centre to its borders, root mean squares of the
 RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
 TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
+THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
+NO_FIT = 12.0  # cost of a template of another size than what is seen
 SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 
 OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
-SIZE_WEIGHT = 3.0
-"""How much a unit of the mismatch of outlines, depths and sizes costs."""
-SIZE_DEVIATION = 0.1  # of the logarithm of the ratio of sizes, as large as is usual
-LARGEST_SIZE_COST = 3.0  # half squared deviations: something may be hidden
+"""How much a unit of the mismatch of outlines and depths costs."""
+SIZE_STEP = 0.06  # of the logarithm of the sizes at which what is seen is compared
+SIZES = (
+    -0.36,
+    0.36,
+)  # of outlines that are compared with a seen one, logarithms of ratios
+SIZES_HIDDEN = (-0.24, 1.2)  # the same where something hides a part of what is seen
+SHIFTS = (
+    0.5,
+    1.5,
+)  # step and reach, in sizes, by which the middle of what is hidden is moved
+HIDDEN_SHARE = (
+    0.05  # of the pixels around an outline that hide something, from which it is moved
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,29 +58,48 @@ class Pictures:
 
     Attributes:
         outline: which cells show the thing, 0 or 1, (N, C) float32.
-        depth: behind the mean of the outline, root mean squares of the outline; 0 where nothing
+        depth: behind the middle of the outline, root mean squares of the outline; 0 where nothing
             shows, (N, C) float32.
-        size: root mean square of the outline, metres, (N,) float64.
     """
 
     outline: Float32
     depth: Float32
-    size: Float
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPictures:
+    """What a view shows on the grid of templates of one size, turned and moved, A pictures.
+
+    Attributes:
+        outline: which cells show the thing, 0 or 1, (A, C) float32.
+        known: of which cells it is known whether they show it, 0 or 1, (A, C) float32.
+        depth: as that of ``Pictures``.
+        area: of the whole outline, cells.
+    """
+
+    outline: Float32
+    known: Float32
+    depth: Float32
+    area: float
 
 
 @dataclass(frozen=True, eq=False)
 class OrientedProposals:
-    """Hypotheses of things in any orientation, the likeliest first.
+    """Hypotheses of things in any orientation.
 
     Attributes:
         things: thing of each, (M,) int64.
+        ranks: how many orientations of its thing suit its view better, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
-        log_belief: in each thing by outline, size and the shape of the depth, up to a constant,
-            (T,) float64.
+        centres: of the surfaces in the object frame, (M, 3) float64, metres.
+        log_belief: in each thing by outline and the shape of the depth, up to a constant, (T,)
+            float64.
     """
 
     things: Index
+    ranks: Index
     rotations: Float
+    centres: Float
     log_belief: Float
 
 
@@ -77,7 +108,11 @@ class ViewTemplates:
 
     Attributes:
         things: thing of each template, (N,) int64.
-        rotations: from the axes of the scan file to those of the camera, (N, 3, 3) float64.
+        rotations: from the axes of the scan file to those of a camera that looks at the middle of
+            the outline, (N, 3, 3) float64.
+        offsets: from the middle of the outline, at its median depth, to the centre of the surface,
+            in these axes, (N, 3) float64, metres.
+        sizes: root mean square of the outline, metres, (N,) float64.
         pictures: what the camera sees.
     """
 
@@ -88,65 +123,143 @@ class ViewTemplates:
             caster: of the things.
         """
         looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
-        things = []
-        rotations = []
-        found = []
-
-        for thing in range(len(caster.surfaces)):
-            for look, picture in _rendered(caster, thing, looks):
-                things.append(thing)
-                rotations.append(look)
-                found.append(picture)
+        found = [
+            (thing, *rendered)
+            for thing in range(len(caster.surfaces))
+            for rendered in _rendered(caster, thing, looks)
+        ]
+        things, rotations, offsets, sizes, outlines, depths = zip(*found, strict=True)
         self.things = np.array(things)
         self.rotations = np.array(rotations)
-        self.pictures = Pictures(
-            np.stack([one[0] for one in found]),
-            np.stack([one[1] for one in found]),
-            np.array([one[2] for one in found]),
-        )
+        self.offsets = np.array(offsets)
+        self.sizes = np.array(sizes)
+        self.pictures = Pictures(np.stack(outlines), np.stack(depths))
 
-    def propose(
-        self,
-        image: MetricImage,
-        count: int,
-        of_one: int = MOST_ORIENTATIONS,
-    ) -> OrientedProposals:
-        """The likeliest things and orientations, given what one view shows.
+    def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
+        """Orientations of the likeliest things, given what some views show.
+
+        Each view proposes orientations, of things that suit all of the views.
 
         Args:
-            image: the view.
-            count: number of proposals.
-            of_one: of one thing, at most.
+            images: the views, of one thing.
 
         Returns:
-            The proposals; none where too little is seen.
+            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none where too little is
+            seen.
         """
         known = int(self.things.max()) + 1
-        turned, look = seen(image)
-        if turned is None:
+        views = [one for one in map(SeenOutline.of, images) if one is not None]
+        if not views:
+            nothing = np.zeros(0, np.int64)
+            nowhere = np.zeros((0, 3))
             return OrientedProposals(
-                np.zeros(0, np.int64),
-                np.zeros((0, 3, 3)),
-                np.zeros(known),
+                nothing, nothing, np.zeros((0, 3, 3)), nowhere, np.zeros(known)
             )
 
-        costs = mismatch(turned, self.pictures)
-        turn = costs.argmin(0)
-        best = costs[turn, np.arange(len(turn))]
-        of_things = np.full(known, np.inf)
-        np.minimum.at(of_things, self.things, best)
+        fits = [self._fit(view) for view in views]
+        of_things = np.full((len(views), known), NO_FIT)
+        for row, fit in enumerate(fits):
+            np.minimum.at(of_things[row], self.things, fit.cost)
+        together = of_things.sum(0)
+        likely = np.zeros(known, bool)
+        likely[np.argsort(together, kind="stable")[:THINGS_PROPOSED]] = True
 
-        order = np.argsort(best, kind="stable")
-        rank = _rank_within(self.things[order])
-        order = order[rank < of_one][:count]
-        rotations = (
-            look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        of_one = max(1, MOST_ORIENTATIONS // len(views))
+        proposed = []
+        for fit, view in zip(fits, views, strict=True):
+            order = np.argsort(fit.cost, kind="stable")
+            order = order[likely[self.things[order]] & (fit.cost[order] < NO_FIT)]
+            rank = rank_within(self.things[order])
+            order = order[rank < of_one]
+            proposed.append(
+                (
+                    self.things[order],
+                    rank[rank < of_one],
+                    *self._poses(fit, view, order),
+                )
+            )
+        things, ranks, rotations, centres = (
+            np.concatenate(parts) for parts in zip(*proposed, strict=True)
         )
-        return OrientedProposals(self.things[order], rotations, -of_things)
+        return OrientedProposals(
+            things, ranks, rotations, centres, -together / len(views)
+        )
+
+    def _fit(self, view: "SeenOutline") -> "TemplateFit":
+        """How well each template fits a view, where it fits best."""
+        count = len(self.things)
+        fit = TemplateFit(
+            np.full(count, NO_FIT, np.float32),
+            np.zeros(count),
+            np.zeros((count, 2)),
+            np.zeros(count),
+        )
+        bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
+        sizes = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
+        first, last = (round(one / SIZE_STEP) for one in sizes)
+        if not ((bins >= first) & (bins <= last)).any():
+            bins = bins.clip(first, last)  # those of the next size are the likeliest
+        turns = 2 * np.pi * np.arange(TURNS) / TURNS
+        grid = turned_grid(turns)
+        for step in range(first, last + 1):
+            rows = np.flatnonzero(bins == step)
+            if not len(rows):
+                continue
+            size = view.size * np.exp(step * SIZE_STEP)
+            pixels = size * view.focal / view.middle
+            templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
+            for shift in view.shifts:
+                seen = view.pictures(size, shift * pixels, grid)
+                costs, behind = mismatch(seen, templates)
+                turn = costs.argmin(0)
+                cost = costs[turn, np.arange(len(rows))]
+                better = cost < fit.cost[rows]
+                some = rows[better]
+                fit.cost[some] = cost[better]
+                fit.turn[some] = turns[turn[better]]
+                fit.shift[some] = shift * pixels
+                fit.behind[some] = size * behind[turn[better], np.flatnonzero(better)]
+        return fit
+
+    def _poses(
+        self, fit: "TemplateFit", view: "SeenOutline", rows: Index
+    ) -> tuple[Float, Float]:
+        """Rotations, (M, 3, 3), and centres, (M, 3), of some templates where they fit best."""
+        x, y = view.camera.slopes(*(view.centre + fit.shift[rows])[:, ::-1].T)
+        ahead = np.stack([x, y, np.ones(len(rows))], -1)
+        lengths = np.linalg.norm(ahead, axis=1, keepdims=True)
+        axes = np.stack([_from_z_to(one) for one in ahead / lengths])
+        looks = view.pose[:3, :3] @ axes @ rotation_z(fit.turn[rows])
+        middles = ahead * (view.middle + fit.behind[rows])[:, None]
+        centres = middles @ view.pose[:3, :3].T + view.pose[:3, 3]
+        centres += np.einsum("nij,nj->ni", looks, self.offsets[rows])
+        return looks @ self.rotations[rows], centres
 
 
-def _rank_within(things: Index) -> Index:
-    """How many earlier elements are the same, for each element, (N,)."""
+@dataclass(frozen=True, eq=False)
+class TemplateFit:
+    """How well N templates fit a view, and where.
+
+    Attributes:
+        cost: (N,) float32; NO_FIT where they cannot.
+        turn: in the image plane, radians, (N,) float64.
+        shift: of the middle of the outline, x and y, pixels, (N, 2) float64.
+        behind: by how much the middle of the outline lies behind that of what is seen, metres, (N,)
+            float64.
+    """
+
+    cost: Float32
+    turn: Float
+    shift: Float
+    behind: Float
+
+
+def rank_within(things: Index) -> Index:
+    """How many earlier elements are the same, for each element, (N,).
+
+    Args:
+        things: numbers, (N,).
+    """
     order = np.argsort(things, kind="stable")
     first = np.searchsorted(things[order], things[order])
     rank = np.empty(len(things), np.int64)
@@ -179,15 +292,17 @@ def _rendered(
     caster: SurfaceCaster,
     thing: int,
     looks: Float,
-) -> Iterator[tuple[Float, tuple[Float32, Float32, float]]]:
-    """The pictures of one thing from cameras with these axes, (N, 3, 3)."""
+) -> Iterator[tuple[Float, Float, float, Float32, Float32]]:
+    """The pictures of one thing from cameras with these axes, (N, 3, 3).
+
+    Rotation, offset, size, outline and depth of each: see ``ViewTemplates``.
+    """
     radius = float(caster.radii[thing])
     focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
-    lines = (np.arange(RENDERING_PIXELS) + 0.5 - RENDERING_PIXELS / 2) / focal
-    rays = np.stack(
-        [*np.meshgrid(lines, lines), np.ones((RENDERING_PIXELS, RENDERING_PIXELS))],
-        -1,
-    ).reshape(-1, 3)
+    camera = PinholeCamera.centred(focal, (RENDERING_PIXELS, RENDERING_PIXELS))
+    slopes = camera.slopes(np.arange(RENDERING_PIXELS), np.arange(RENDERING_PIXELS))
+    ones = np.ones((RENDERING_PIXELS, RENDERING_PIXELS))
+    rays = np.stack([*np.meshgrid(*slopes), ones], -1).reshape(-1, 3)
 
     origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
     depth, _ = caster.cast(
@@ -195,36 +310,150 @@ def _rendered(
         origins.astype(np.float32),
         (rays @ looks).astype(np.float32),
     )
+    grid = turned_grid(np.zeros(1))
     for look, image in zip(
         looks,
         depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS),
         strict=True,
     ):
-        picture = _picture(image, np.isfinite(image), focal, np.zeros(1))
-        if picture is not None:
-            yield look, (picture[0][0], picture[1][0], picture[2])
+        shown = np.isfinite(image)
+        if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
+            continue
+        outline = SeenOutline.of_depth(image, shown, shown | True, camera, np.eye(4))
+        seen = outline.pictures(outline.size, np.zeros(2), grid)
+        axes = outline.axes.T
+        middle = outline.middle * outline.ahead
+        offset = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle
+        yield axes @ look, axes @ offset, outline.size, seen.outline[0], seen.depth[0]
 
 
-def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
-    """What a view shows of the thing, turned in the image plane by so many angles.
+@dataclass(frozen=True, eq=False)
+class SeenOutline:
+    """What a view shows of a thing.
+
+    Attributes:
+        depth: of all pixels, (H, W) float32, metres.
+        shown: pixels that show the thing, (H, W) bool.
+        known: pixels of which it is known whether they show it, (H, W) bool.
+        camera: of the image.
+        pose: camera-to-object, (4, 4).
+        centre: of the outline, x and y, pixels, (2,).
+        middle: median depth of the thing, metres.
+        size: root mean square of the outline, metres.
+        shifts: by which the middle of the thing may be off that of what is seen, x and y, sizes,
+            (S, 2); the first is none.
+    """
+
+    depth: Float32
+    shown: Mask
+    known: Mask
+    camera: PinholeCamera
+    pose: Float
+    centre: Float
+    middle: float
+    size: float
+    shifts: Float
+
+    @classmethod
+    def of(cls, image: MetricImage) -> "SeenOutline | None":
+        """That of an image; None where too little is seen."""
+        shown = without_specks(image.kind == THING)
+        if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
+            return None
+        known = ~image.hiding & (image.kind != NOT_MEASURED)
+        known &= shown | (image.kind != THING)
+        camera = PinholeCamera.of(image.intrinsics, image.depth.shape)
+        found = cls.of_depth(image.depth, shown, known, camera, image.pose)
+
+        around = ndimage.binary_dilation(shown, iterations=2) & ~shown
+        hiding = around & image.hiding
+        if np.count_nonzero(hiding) < HIDDEN_SHARE * np.count_nonzero(around):
+            return found
+        rows, columns = np.nonzero(hiding)
+        towards = np.array([columns.mean(), rows.mean()]) - found.centre
+        step, reach = SHIFTS
+        lines = np.arange(-reach, reach + step / 2, step)
+        grid = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+        grid = grid[(np.linalg.norm(grid, axis=1) <= reach) & (grid @ towards > 0)]
+        return replace(found, shifts=np.concatenate([np.zeros((1, 2)), grid]))
+
+    @classmethod
+    def of_depth(
+        cls,
+        depth: Float32,
+        shown: Mask,
+        known: Mask,
+        camera: PinholeCamera,
+        pose: Float,
+    ) -> "SeenOutline":
+        """That of some pixels, which are enough."""
+        rows, columns = np.nonzero(shown)
+        centre = np.array([columns.mean(), rows.mean()])
+        spread = float(
+            np.sqrt(columns.var() + rows.var() + 1 / 6)
+        )  # a pixel is a square
+        middle = float(np.median(depth[rows, columns]))
+        size = spread * middle / np.sqrt(camera.fx * camera.fy)
+        shifts = np.zeros((1, 2))
+        return cls(depth, shown, known, camera, pose, centre, middle, size, shifts)
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return float(np.sqrt(self.camera.fx * self.camera.fy))
+
+    @property
+    def ahead(self) -> Float:
+        """Towards the middle of the outline, camera axes, one metre of depth long, (3,)."""
+        x, y = self.camera.slopes(*self.centre[::-1])
+        return np.array([x, y, 1.0])
+
+    @property
+    def axes(self) -> Float:
+        """Axes of a camera that looks at the middle of the outline, columns, (3, 3)."""
+        return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
+
+    def pictures(self, size: float, shift: Float, grid: Float32) -> SeenPictures:
+        """Outline and depth on the grid of templates of a size.
+
+        Args:
+            size: root mean square of their outlines, metres.
+            shift: of the grid's middle from that of the outline, pixels, (2,).
+            grid: cells of the grid, turned in the image plane, see ``turned_grid``, (A, C, 2).
+        """
+        pixels = size * self.focal / self.middle
+        turned = grid * np.float32(pixels) + (self.centre + shift).astype(np.float32)
+        column, row = np.rint(turned).astype(np.int32).transpose(2, 0, 1)
+        height, width = self.shown.shape
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        row = np.where(inside, row, 0)
+        column = np.where(inside, column, 0)
+
+        outline = inside & self.shown[row, column]
+        known = inside & self.known[row, column]
+        behind = np.where(outline, (self.depth[row, column] - self.middle) / size, 0)
+        cell = 2 * TEMPLATE_REACH * pixels / TEMPLATE_SIDE
+        return SeenPictures(
+            outline.astype(np.float32),
+            known.astype(np.float32),
+            np.clip(behind, -3, 3).astype(np.float32),
+            np.count_nonzero(self.shown) / cell**2,
+        )
+
+
+def turned_grid(turns: Float) -> Float32:
+    """Cells of a template's grid, turned in the image plane by some angles.
+
+    Args:
+        turns: radians, (A,).
 
     Returns:
-        The pictures, None where too little is seen; and the axes of a camera in the same place that
-        looks at the middle of the outline, columns, (3, 3), object frame.
+        x and y of each cell, sizes, (A, C, 2) float32.
     """
-    shown = without_specks(image.kind == THING)
-    focal = float(image.intrinsics[[0, 1], [0, 1]].mean())
-    found = _picture(image.depth, shown, focal, 2 * np.pi * np.arange(TURNS) / TURNS)
-    if found is None:
-        return None, np.eye(3)
-    outline, depth, size = found
-
-    rows, columns = np.nonzero(shown)
-    camera = PinholeCamera.of(image.intrinsics, image.depth.shape)
-    x, y = camera.slopes(rows.mean(), columns.mean())
-    ahead = np.array([x, y, 1.0]) / np.sqrt(x**2 + y**2 + 1)
-    look = image.pose[:3, :3] @ _from_z_to(ahead)
-    return Pictures(outline, depth, np.full(TURNS, size)), look
+    lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
+    cells = TEMPLATE_REACH * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    turned = cells @ rotation_z(turns)[:, :2, :2].swapaxes(1, 2)
+    return turned.astype(np.float32)
 
 
 def without_specks(shown: Mask) -> Mask:
@@ -251,62 +480,25 @@ def _from_z_to(direction: Float) -> Float:
     return np.eye(3) + skew + skew @ skew / (1 + direction[2])
 
 
-def _picture(
-    depth: NDArray,
-    shown: Mask,
-    focal: float,
-    turns: Float,
-) -> tuple[Float32, Float32, float] | None:
-    """Outlines and depths on grids that are turned by some angles, (A, C), and the size, metres.
-
-    None where too few pixels show the thing.
-    """
-    rows, columns = np.nonzero(shown)
-    if len(rows) < FEWEST_OUTLINE_PIXELS:
-        return None
-    centre = np.array([columns.mean(), rows.mean()])
-    spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))  # a pixel is a square
-    middle = float(np.median(depth[rows, columns]))
-    size = spread * middle / focal
-
-    lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
-    cells = (
-        TEMPLATE_REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
-    )
-    turned = np.einsum("aij,cj->aci", rotation_z(turns)[:, :2, :2], cells) + centre
-    column, row = np.rint(turned).astype(np.int64).transpose(2, 0, 1)
-    inside = (
-        (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
-    )
-    row = np.where(inside, row, 0)
-    column = np.where(inside, column, 0)
-
-    outline = inside & shown[row, column]
-    behind = np.where(outline, (depth[row, column] - middle) / size, 0)
-    return outline.astype(np.float32), np.clip(behind, -3, 3).astype(np.float32), size
-
-
-def mismatch(seen: Pictures, known: Pictures) -> Float32:
-    """Return how badly pictures fit others.
+def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
+    """Return how badly pictures fit templates of their size.
 
     Args:
         seen: A pictures.
-        known: N pictures.
+        known: N templates.
 
     Returns:
-        Costs, (A, N) float32; 0 for a perfect fit.
+        Costs, (A, N) float32, 0 for a perfect fit; and how far behind the template what is seen
+        lies in the mean, sizes, (A, N) float32.
     """
     both = seen.outline @ known.outline.T
-    one = seen.outline.sum(1)[:, None] + known.outline.sum(1) - both
-    overlap = both / np.maximum(one, 1)
+    one = max(seen.area, 1.0) + seen.known @ known.outline.T - both
+    overlap = both / np.maximum(one, both + 1e-6)
 
     # The mean squared difference where both show, without its mean.
     count = np.maximum(both, 1)
     mean = (seen.depth @ known.outline.T - seen.outline @ known.depth.T) / count
     squares = (seen.depth**2) @ known.outline.T + seen.outline @ (known.depth**2).T
     squares = (squares - 2 * seen.depth @ known.depth.T) / count - mean**2
-
-    ratio = np.log(seen.size[:, None] / known.size)
-    size = np.minimum((ratio / SIZE_DEVIATION) ** 2 / 2, LARGEST_SIZE_COST)
     costs = OUTLINE_WEIGHT * (1 - overlap) + DEPTH_WEIGHT * np.sqrt(squares.clip(0))
-    return costs + SIZE_WEIGHT * size.astype(np.float32)
+    return costs, mean

@@ -1,4 +1,4 @@
-"""How much features, size and geometry count beside each other, and the belief that follows."""
+"""How much outlines, size and geometry count beside each other, and the belief that follows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ NEVER = -1e9  # log-likelihood of a thing that was not aligned
 LEAST_TRUE_BELIEF = 1e-9
 
 GEOMETRY_WEIGHTS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
-FEATURE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)
+OUTLINE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)
 CAMERA_WEIGHTS = (0.1, 0.5)
 VIEW_CORRELATIONS = (0.0, 0.2, 0.5, 1.0)
 DOUBTS = (0.001, 0.003, 0.01, 0.03)
@@ -31,15 +31,15 @@ class EvidenceWeights:
 
     Attributes:
         geometry: of the mean log-likelihood of a view's pixels.
-        features: of the log-belief by features and size.
+        outlines: of the log-belief by outline and size.
         cameras: of the log-likelihood of the errors of the cameras' places.
         correlation: of two views, 0 to 1: the sum over k views is divided by ``1 + correlation * (k
             - 1)``.
-        doubt: share of the belief that is left to features and size alone.
+        doubt: share of the belief that is left to outline and size alone.
     """
 
     geometry: float = 40.0
-    features: float = 0.6
+    outlines: float = 0.6
     cameras: float = 0.1
     correlation: float = 0.5
     doubt: float = 0.001
@@ -50,31 +50,31 @@ class EvidenceWeights:
         Args:
             mean: mean log-likelihood of the pixels of each view, (M, V).
             camera_costs: half the squared deviations of each camera's place, (M, V).
-            log_belief: log-belief in each hypothesis by features and size, (M,).
+            log_belief: log-belief in the thing of each hypothesis by outline and size, (M,).
 
         Returns:
             (M,) float64.
         """
         of_views = self.geometry * mean - self.cameras * camera_costs
         together = 1 + self.correlation * (mean.shape[1] - 1)
-        return of_views.sum(1) / together + self.features * log_belief
+        return of_views.sum(1) / together + self.outlines * log_belief
 
-    def belief(self, scores: Float, things: Index, by_features: Float) -> Float:
+    def belief(self, scores: Float, things: Index, by_outline: Float) -> Float:
         """Belief in each thing, by its likeliest hypothesis.
 
         Args:
             scores: of M hypotheses, (M,).
             things: thing of each, (M,) int.
-            by_features: belief in each thing by features and size alone, (T,), sums to 1.
+            by_outline: belief in each thing by outline and size alone, (T,), sums to 1.
 
         Returns:
             (T,) float64, sums to 1.
         """
-        best = np.full(len(by_features), NEVER)
+        best = np.full(len(by_outline), NEVER)
         np.maximum.at(best, things, scores)
         belief = np.exp(best - best.max())
         belief /= belief.sum()
-        return (1 - self.doubt) * belief + self.doubt * by_features
+        return (1 - self.doubt) * belief + self.doubt * by_outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +86,8 @@ class JudgedEpisode:
         things: thing of each hypothesis, (M,) int64.
         mean: mean log-likelihood of the pixels of each view, (M, V) float64.
         camera_costs: half the squared deviations of each camera's place, (M, V) float64.
-        log_belief: log-belief in each hypothesis by features and size, (M,) float64.
-        by_features: belief in each thing by features and size alone, (T,) float64.
+        log_belief: log-belief in the thing of each hypothesis by outline and size, (M,) float64.
+        by_outline: belief in each thing by outline and size alone, (T,) float64.
     """
 
     truth: int
@@ -95,12 +95,12 @@ class JudgedEpisode:
     mean: Float
     camera_costs: Float
     log_belief: Float
-    by_features: Float
+    by_outline: Float
 
     def belief(self, weights: EvidenceWeights) -> Float:
         """Belief in each thing with some weights, (T,) float64."""
         scores = weights.scores(self.mean, self.camera_costs, self.log_belief)
-        return weights.belief(scores, self.things, self.by_features)
+        return weights.belief(scores, self.things, self.by_outline)
 
 
 def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
@@ -123,7 +123,7 @@ def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
     tried = []
     for values in product(
         GEOMETRY_WEIGHTS,
-        FEATURE_WEIGHTS,
+        OUTLINE_WEIGHTS,
         CAMERA_WEIGHTS,
         VIEW_CORRELATIONS,
     ):

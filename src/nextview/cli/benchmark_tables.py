@@ -1,5 +1,6 @@
 """The results of a benchmark and of an evaluation as tables in the terminal."""
 
+from dataclasses import replace
 from math import isfinite
 from typing import Any
 
@@ -8,23 +9,24 @@ from rich.table import Table
 from rich.text import Text
 
 from nextview.benchmark import leaderboard as board
+from nextview.benchmark.class_tables import ClassResults
+from nextview.benchmark.comparison import SIGNIFICANT, significant
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.page import Number, numbers
-from nextview.benchmark.run import Results
-from nextview.benchmark.views import as_rows, markdown
+from nextview.benchmark.results import Board, ComparedTables, board_rows, markdown
 from nextview.cli.progress import Terminal
 from nextview.errors import EntryError
 
 
-def print_results(found: Results) -> None:
+def print_classes(found: ClassResults) -> None:
     """Print the leaderboard; then what failed is an error."""
     print_leaderboard(found)
     if found.settings["failures"]:
         raise EntryError("; ".join(found.settings["failures"].values()))
 
 
-def print_leaderboard(results: Results) -> None:
+def print_leaderboard(results: ClassResults) -> None:
     """Print the policies at the headline threshold, and what follows from them."""
     tables = results.tables
     reference = results.settings["reference"]
@@ -35,19 +37,20 @@ def print_leaderboard(results: Results) -> None:
         console.print(_policies(board.leaderboard(tables, at), at, reference))
         console.print(
             f"* differs from {reference} in accuracy: p after Holm's correction is below"
-            f" {board.SIGNIFICANT}"
+            f" {SIGNIFICANT}"
         )
-        few = board.too_few(tables, at, results.predictions.names)
+        few = board.too_few_objects(tables, at, len(results.predictions))
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
                 console.print(sentence)
 
-    if not tables.views.empty:
-        print(markdown(as_rows(tables.views)), end="")
+    after = board.after_views_rows(tables)
+    if not after.empty:
+        print(markdown(after.columns, after.itertuples(index=False)), end="")
     if sentence := board.level_differences(tables, reference):
         console.print(sentence)
 
-    for r in board.promised_risks(tables):
+    for r in board.promised_risks(tables, results.settings["risks"]):
         if r.broken:
             wrong = (
                 f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are"
@@ -110,6 +113,31 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
             style=style,
         )
 
+    return table
+
+
+def print_compared(found: ComparedTables) -> None:
+    """Print a table for each board, in 80 columns, and what follows from them."""
+    console = Terminal()
+    for each in found.boards:
+        console.print(_compared(found, each))
+    console.print(
+        f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT}"
+    )
+    for sentence in found.sentences():
+        console.print(sentence)
+
+
+def _compared(found: ComparedTables, shown: Board) -> Table:
+    table = Table(title=shown.title, caption=shown.about, box=box.SIMPLE_HEAD)
+    table.add_column("policy", no_wrap=True)
+    columns = [
+        replace(column, measures=column.measures[:1]) for column in shown.narrow()
+    ]
+    for column in columns:
+        table.add_column(column.short, justify="right")
+    for cells in board_rows(found, shown, columns, significant(found, shown.name)):
+        table.add_row(*cells)
     return table
 
 

@@ -1,4 +1,4 @@
-"""The benchmark: from predictions to a folder of results, and back from the folder."""
+"""The benchmark of classes: from predictions to a folder of results, and back from the folder."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -7,15 +7,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from nextview.benchmark.class_tables import ClassResults, ClassTables, summarise
 from nextview.benchmark.entries import default_entries
+from nextview.benchmark.leaderboard import after_views_rows
 from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
-from nextview.benchmark.summary import Tables, summarise
-from nextview.benchmark.views import as_rows, markdown
+from nextview.benchmark.results import RECORD, markdown, write_results
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import EntryError, ResultsError, UsageError
-from nextview.files import check_new, command, new_folder, sha256_of
+from nextview.files import check_new, command, sha256_of
 from nextview.policies.registry import with_cards
 from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
@@ -29,7 +30,7 @@ with extras():
 
 
 @dataclass(frozen=True)
-class BenchmarkSettings:
+class ClassSettings:
     """Policies, thresholds and statistics.
 
     Attributes:
@@ -66,46 +67,14 @@ class BenchmarkSettings:
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Results:
-    """A folder of results: how it was run, from which predictions, and the tables.
-
-    Attributes:
-        folder: that holds them.
-        settings: with which they were made.
-        predictions: that were replayed.
-        tables: the results.
-    """
-
-    folder: Path
-    settings: dict[str, Any]
-    predictions: Predictions
-    tables: Tables
-
-    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
-        """Read the episodes of a policy at a threshold.
-
-        Args:
-            policy: name of the policy.
-            threshold: of the belief; None for fixed views.
-
-        Returns:
-            One episode per row: run by run, with the objects in the order of the predictions.
-        """
-        cell = [("policy", "==", policy)] + (
-            [] if threshold is None else [("threshold", "==", threshold)]
-        )
-        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
-
-
-def run_benchmark(
+def benchmark_classes(
     predictions: Path,
     out: Path,
-    settings: BenchmarkSettings = BenchmarkSettings(),
+    settings: ClassSettings = ClassSettings(),
     *,
     overwrite: bool = False,
     track: TrackProgress = silently,
-) -> Results:
+) -> ClassResults:
     """Run all policies at all thresholds from the same first views, and compare them.
 
     It writes episodes, tables and significance tests; nextview report makes a page of them. If a
@@ -132,7 +101,6 @@ def run_benchmark(
         settings.reference,
         settings.samples,
         rng,
-        promised,
         sorted(set(settings.views)),
     )
 
@@ -151,23 +119,21 @@ def run_benchmark(
         "valley_classes": [table.classes[i] for i in grid.specs.valley_classes(LEM)],
     }
 
-    with new_folder(out, overwrite, last="benchmark.json", withdraw=True) as part:
+    def more(part: Path) -> None:
         _write_episodes(part / "episodes.parquet", grid)
-        for name, frame in vars(tables).items():
-            frame.to_csv(part / f"{name}.csv", index=False)
         if settings.views:
-            (part / "views.md").write_text(
-                markdown(as_rows(tables.views)),
-                encoding="utf-8",
-            )
+            rows = after_views_rows(tables)
+            text = markdown(rows.columns, rows.itertuples(index=False))
+            (part / "views.md").write_text(text, encoding="utf-8")
         table.save(part / "predictions.npz")
-        (part / "benchmark.json").write_text(json.dumps(made, indent=1) + "\n")
+
+    write_results(out, tables, made, more, overwrite, withdraw=True)
     return load(out)
 
 
 def _prepare(
     predictions: Path,
-    s: BenchmarkSettings,
+    s: ClassSettings,
 ) -> tuple[Grid, list[str], dict[float, float]]:
     """What is run, the names of the entries, and the threshold that promises each error rate."""
     if not s.thresholds:
@@ -233,29 +199,26 @@ def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictio
     return table
 
 
-def load(folder: Path) -> Results:
+def load(folder: Path) -> ClassResults:
     """Read a folder of results."""
     folder = Path(folder)
     try:
-        settings = json.loads((folder / "benchmark.json").read_text())
-        files = {name: folder / f"{name}.csv" for name in Tables.__dataclass_fields__}
-        # earlier results
-        files = {
-            name: file
-            for name, file in files.items()
-            if name != "views" or file.exists()
+        settings = json.loads((folder / RECORD).read_text())
+        frames = {
+            name: pd.read_csv(folder / f"{name}.csv")
+            for name in ("measures", "tests", "sweep", "reliability")
         }
-        tables = Tables(**{name: pd.read_csv(file) for name, file in files.items()})
+        tables = ClassTables(reference=settings["reference"], **frames)
         pq.read_schema(folder / "episodes.parquet")
     except (FileNotFoundError, NotADirectoryError):
         raise ResultsError(
-            f"{folder}: holds no benchmark results; make some with nextview benchmark"
+            f"{folder}: holds no benchmark results; make some with nextview benchmark classes"
         ) from None
     except (ValueError, RecursionError, pa.ArrowInvalid) as error:
         raise ResultsError(
             f"{folder}: these benchmark results are damaged ({error})"
         ) from None
-    return Results(
+    return ClassResults(
         folder,
         settings,
         Predictions.load(folder / "predictions.npz"),

@@ -1,0 +1,247 @@
+"""What policies come to: one format of measures and of tests, whatever was looked at."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nextview.benchmark import statistics as st
+from nextview.checks import extras
+from nextview.types import Float, Index
+
+with extras():
+    import pandas as pd
+
+ALL = "all"  # the set of everything that was looked at
+# a difference is called one when its p-value after Holm's correction is below this
+SIGNIFICANT = 0.05
+
+
+class Key(NamedTuple):
+    """What a number is of.
+
+    Attributes:
+        policy: its name.
+        threshold: of the belief, at which episodes stop; None where no threshold ends them.
+        views: after how many; 0 for whole episodes.
+        measure: its name.
+    """
+
+    policy: str
+    threshold: float | None
+    views: int
+    measure: str
+
+
+MEASURE_COLUMNS = ["set", *Key._fields, "value", "low", "high"]
+TEST_COLUMNS = ["set", *Key._fields, "reference", "difference", "low", "high", "p"]
+TEST_COLUMNS += ["families"]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The results of a benchmark. Intervals are 95 % bootstrap intervals, ``low`` to ``high``.
+
+    Attributes:
+        measures: a number a row, with the columns MEASURE_COLUMNS; "set" says of which objects.
+        tests: differences to a reference policy, with the columns TEST_COLUMNS and "p_holm": p by
+            flips of signs (``statistics.sign_flip_p``) over "families" families of objects, and p
+            after Holm's correction over all tests of one question.
+        reference: the policy that the others are compared with.
+    """
+
+    measures: "pd.DataFrame"
+    tests: "pd.DataFrame"
+    reference: str
+
+    def policies(self) -> list[str]:
+        """The policies, in their order."""
+        return list(self.measures["policy"].unique())
+
+    def frames(self) -> dict[str, "pd.DataFrame"]:
+        """All tables by their names."""
+        there = vars(self).items()
+        return {name: table for name, table in there if isinstance(table, pd.DataFrame)}
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """What M measures of policies are of N objects: each is a ratio of sums over the objects.
+
+    Attributes:
+        keys: of the measures.
+        top: numerators, (N, M) float64.
+        bottom: denominators, (N, M) float64.
+        families: number of each object's family, (N,) int64; families are drawn as a whole.
+    """
+
+    keys: tuple[Key, ...]
+    top: Float
+    bottom: Float
+    families: Index
+
+    @classmethod
+    def of(
+        cls,
+        sums: Mapping[Key, tuple[Float, Float]],
+        families: Index,
+    ) -> "Counted":
+        """Put numerators and denominators, (N,) each, side by side.
+
+        Args:
+            sums: of each measure.
+            families: number of each object's family, (N,).
+        """
+        tops, bottoms = zip(*sums.values(), strict=True)
+        return cls(tuple(sums), np.stack(tops, 1), np.stack(bottoms, 1), families)
+
+    def only(self, measures: Sequence[str]) -> "Counted":
+        """Some of the measures, by name."""
+        kept = [i for i, key in enumerate(self.keys) if key.measure in measures]
+        keys = tuple(self.keys[i] for i in kept)
+        return Counted(keys, self.top[:, kept], self.bottom[:, kept], self.families)
+
+    def measures(
+        self,
+        name: str,
+        weights: Float,
+        labels: Index | None = None,
+    ) -> "pd.DataFrame":
+        """The measures with their intervals.
+
+        Args:
+            name: of the set of objects.
+            weights: how often each sample of the bootstrap holds each object, (S, N).
+            labels: class of each object, (N,), for means over classes; None for sums over objects.
+        """
+        value, drawn = st.estimate(self.top, self.bottom, weights, labels)
+        numbers = zip(self.keys, value, *st.interval(drawn), strict=True)
+        return measures_of(name, [(*key, *number) for key, *number in numbers])
+
+    def tests(
+        self,
+        name: str,
+        weights: Float,
+        reference: str,
+        tested: Callable[[Key], bool],
+    ) -> "pd.DataFrame":
+        """Differences to a reference policy.
+
+        Args:
+            name: of the set of objects.
+            weights: how often each sample of the bootstrap holds each object, (S, N).
+            reference: the policy; its measures have the same denominators.
+            tested: which measures are compared.
+        """
+        place = {key: i for i, key in enumerate(self.keys)}
+        pairs = [
+            (place[key], place[rival])
+            for key in self.keys
+            if key.policy != reference and tested(key)
+            if (rival := key._replace(policy=reference)) in place
+        ]
+        if not pairs:
+            return tests_of(name, reference, [])
+        own, theirs = np.array(pairs).T
+        apart = self.top[:, own] - self.top[:, theirs]
+        value, drawn = st.estimate(apart, self.bottom[:, own], weights)
+        p = st.sign_flip_p(st.by_family(apart, self.families))
+        count = int(self.families.max()) + 1
+        numbers = zip(own, value, *st.interval(drawn), p, strict=True)
+        rows = [(self.keys[i], *number, count) for i, *number in numbers]
+        return tests_of(name, reference, rows)
+
+
+def measures_of(name: str, rows: Sequence[tuple]) -> "pd.DataFrame":
+    """Measures of a set as a table.
+
+    Args:
+        name: of the set.
+        rows: policy, threshold, views, measure, value, low and high of each.
+    """
+    table = pd.DataFrame([(name, *row) for row in rows], columns=MEASURE_COLUMNS)
+    return table.astype({"threshold": "float64"})
+
+
+def tests_of(name: str, reference: str, rows: Sequence[tuple]) -> "pd.DataFrame":
+    """Tests in a set as a table.
+
+    Args:
+        name: of the set.
+        reference: the policy that the others are compared with.
+        rows: key, difference, low, high, p and number of families of each.
+    """
+    given = [(name, *key, reference, *rest) for key, *rest in rows]
+    return pd.DataFrame(given, columns=TEST_COLUMNS).astype({"threshold": "float64"})
+
+
+def corrected(
+    tests: Sequence["pd.DataFrame"],
+    bound: Callable[[str], bool] | None = None,
+) -> "pd.DataFrame":
+    """Tests of one question with their p-values after one Holm correction, "p_holm".
+
+    Args:
+        tests: of the question.
+        bound: which policies know the truth: such a bound is no rival, and is not tested.
+    """
+    table = pd.concat(tests, ignore_index=True)
+    if bound is not None:
+        table["p"] = table["p"].mask(table["policy"].map(bound).astype(bool))
+    return table.assign(p_holm=st.holm(table["p"].to_numpy(np.float64)))
+
+
+def too_few(tests: "pd.DataFrame") -> dict[str, str]:
+    """Warnings where no difference, however clear, could be significant.
+
+    Args:
+        tests: that are corrected together.
+
+    Returns:
+        A sentence for each set of too few families of objects, by its name.
+    """
+    tested = tests[tests["p"].notna()]
+    found = {}
+    for name, rows in tested.groupby("set", sort=False):
+        families = int(rows["families"].iloc[0])
+        wanted = families
+        while (
+            wanted < st.EXACT_FAMILIES
+            and len(tested) * 2.0 ** (1 - wanted) >= SIGNIFICANT
+        ):
+            wanted += 1
+        if wanted > families:
+            found[str(name)] = (
+                f"Too few to tell: no p-value of {families} is below {2.0 ** (1 - families):.2g},"
+                f" and {len(tested)} tests are corrected together, so that no difference can be"
+                f" significant; it takes {wanted} or more."
+            )
+    return found
+
+
+def values_of(
+    tables: Tables,
+    name: str,
+    threshold: float | None = None,
+) -> dict[tuple[str, str, int], Any]:
+    """Value, low and high by policy, measure and number of views.
+
+    Args:
+        tables: of the benchmark.
+        name: of the set of objects.
+        threshold: of the belief; None for measures that no threshold ends.
+    """
+    some = tables.measures[tables.measures["set"] == name]
+    at = some["threshold"]
+    some = some[at.isna() if threshold is None else at == threshold]
+    keys = zip(some["policy"], some["measure"], some["views"], strict=True)
+    numbers = some[["value", "low", "high"]].to_numpy(np.float64).tolist()
+    return dict(zip(keys, map(tuple, numbers), strict=True))
+
+
+def significant(tables: Tables, name: str) -> set[tuple[str, str, int]]:
+    """Policy, measure and number of views of the differences that are significant in a set."""
+    tests = tables.tests
+    some = tests[(tests["set"] == name) & (tests["p_holm"] < SIGNIFICANT)]
+    return set(zip(some["policy"], some["measure"], some["views"], strict=True))

@@ -1,0 +1,377 @@
+"""Tables with several things each: what is found and named by frames that policies choose.
+
+On each simulated table stand 6 to 10 things in resting poses, 0 to 10 cm apart, one of them a
+stranger of the size of such things. A camera 0.6 m from the middle of the table looks through the
+wrist sensor, with errors of its poses and of the vertical. The first view is drawn, and is the same
+for all policies. Workers import this module, and so neither pandas nor matplotlib.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from scipy.spatial import cKDTree
+
+from nextview.benchmark.jobs import Job
+from nextview.checks import whole
+from nextview.errors import ObservationError, UsageError
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.resting import resting_poses
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.scene.scene import Scene
+from nextview.segmentation.instances import LearnedSegmenter, Segmenter
+from nextview.session.system import System, load
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.types import Float, Index
+
+TablePolicy = Literal["target", "random", "fixed"]
+TABLE_POLICIES: tuple[TablePolicy, ...] = ("target", "random", "fixed")
+"""Where the next view is: ``Scene.target``; any candidate view; a quarter of a circle on, at the
+same elevation."""
+FEWEST_THINGS = 6
+MOST_THINGS = 10
+MOST_DRAWN = 20  # draws of one table, until all things fit on it
+CAMERA_FROM_TABLE = 0.6  # metres between the camera and the middle of the table
+VIEW_ELEVATIONS = (30.0, 60.0)  # degrees
+TABLE_CENTRE = np.array([0, 0, 0.03])  # metres
+STRANGER_RADII = (0.04, 0.10)  # metres
+STRANGER = "stranger"
+ADD_S_POINTS = 1000  # of a scan
+CLOSE_POSE = 0.1  # of the diameter
+
+
+class TableRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one policy made of one table.
+
+    Attributes:
+        counts: by name, after each number of frames that is compared, see ``Looking.count``.
+        done: after how many frames the scene was done, one more than were taken where it was not.
+    """
+
+    counts: list[dict[str, float]]
+    done: int
+
+
+class TableRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What all policies made of one table.
+
+    Attributes:
+        table: its number.
+        runs: by policy.
+    """
+
+    table: int
+    runs: dict[str, TableRun]
+
+
+@dataclass(frozen=True)
+class TableSettings:
+    """Tables, policies and statistics.
+
+    Attributes:
+        models: name or folder of the memory that knows the scans.
+        network: card of a network of nextview train segmentation; by default the bundled one.
+        tables: how many tables.
+        views: numbers of frames after which the policies are compared; so many as the last are
+            taken.
+        policies: target goes where the scene says, random to any candidate view, and fixed a
+            quarter of a circle on. Only missing results are computed.
+        reference: policy that the others are compared with; it always takes part.
+        samples: number of bootstrap samples.
+        seed: seed of the tables, the first views and the errors of the camera.
+    """
+
+    models: str = "ycb"
+    network: Path | None = None
+    tables: int = 100
+    views: tuple[int, ...] = (1, 2, 4)
+    policies: tuple[TablePolicy, ...] = TABLE_POLICIES
+    reference: TablePolicy = "random"
+    samples: int = 10_000
+    seed: int = 0
+
+    def check(self) -> None:
+        """See that it makes sense, before any work is done.
+
+        Raises:
+            UsageError: a number that there is none of.
+        """
+        whole(self.tables, "the number of tables", 1)
+        whole(self.samples, "the samples of the bootstrap", 100)
+        if not self.views or list(self.views) != sorted(set(self.views)):
+            raise UsageError("the numbers of views ascend, as in --views 1 2 4")
+        whole(self.views[0], "a number of views", 1)
+
+
+@dataclass(frozen=True)
+class TableJob(Job):
+    """One table, and the policies that look at it.
+
+    Attributes:
+        scans: folder of the scans of the things, metres.
+        strangers: folder of meshes of other things.
+        table: number of the table.
+    """
+
+    scans: Path
+    strangers: Path
+    table: int
+
+
+@lru_cache(maxsize=1)
+def opened_models(
+    models: str,
+    network: Path | None,
+) -> tuple[System, Segmenter | None]:
+    """The system that knows the things, and what tells them apart; None for the bundled network.
+
+    Args:
+        models: name or folder of the memory.
+        network: card of another segmentation network.
+    """
+    segmenter = None if network is None else LearnedSegmenter(network)
+    return load(models, threads=1), segmenter
+
+
+@lru_cache(maxsize=2)
+def meshes_in(folder: Path) -> tuple[Path, ...]:
+    """The files in a folder and those below it, in their order.
+
+    Raises:
+        UsageError: there is none.
+    """
+    files = tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+    if not files:
+        raise UsageError(f"{folder}: holds no mesh")
+    return files
+
+
+def work_at_table(job: TableJob) -> None:
+    """Look at a table as the policies of a job say, and write down what they found."""
+    before = job.earlier(TableRuns)
+    runs = {} if before is None else before.runs
+    drawn = np.random.default_rng([job.settings.seed, job.table])
+    table = draw_table(meshes_in(job.scans), meshes_in(job.strangers), drawn)
+    for policy in job.policies:
+        runs[policy] = look_at_table(job, table, policy)
+    job.write(TableRuns(job.table, runs))
+
+
+@lru_cache(maxsize=512)
+def mesh_of(path: Path, radius: float | None = None) -> Mesh:
+    """A scan in metres, or a mesh of no unit that gets a radius, metres."""
+    if radius is None:
+        return replace(load_mesh(path, unit="m"), name=path.stem)
+    return replace(
+        load_mesh(path),
+        radius=radius,
+        centre=np.zeros(3),
+        name=STRANGER,
+        unit="m",
+    )
+
+
+@lru_cache(maxsize=512)
+def rests_of(name: str, radius: float, path: Path) -> Float:
+    """Rotations of a mesh into its resting poses."""
+    mesh = mesh_of(path) if name != STRANGER else mesh_of(path, radius)
+    return resting_poses(mesh)
+
+
+def draw_table(
+    scans: Sequence[Path],
+    strangers: Sequence[Path],
+    rng: np.random.Generator,
+) -> SimulatedTable:
+    """A table with 6 to 10 things, the last of them a stranger.
+
+    What does not fit on the table is drawn again.
+
+    Raises:
+        UsageError: MOST_DRAWN draws do not fit.
+    """
+    for _ in range(MOST_DRAWN - 1):
+        with suppress(UsageError):
+            return _draw(scans, strangers, rng)
+    return _draw(scans, strangers, rng)
+
+
+def _draw(
+    scans: Sequence[Path],
+    strangers: Sequence[Path],
+    rng: np.random.Generator,
+) -> SimulatedTable:
+    count = int(rng.integers(FEWEST_THINGS, MOST_THINGS + 1))
+    paths = [scans[k] for k in rng.choice(len(scans), count - 1, replace=False)]
+    meshes = [mesh_of(path) for path in paths]
+    paths.append(strangers[int(rng.integers(len(strangers)))])
+    meshes.append(mesh_of(paths[-1], float(rng.uniform(*STRANGER_RADII))))
+
+    where = {id(mesh): path for mesh, path in zip(meshes, paths, strict=True)}
+    order = [meshes[k] for k in rng.permutation(len(meshes))]
+    return SimulatedTable.draw(
+        order,
+        rng,
+        resting=lambda mesh: rests_of(mesh.name, mesh.radius, where[id(mesh)]),
+    )
+
+
+class Looking:
+    """A table under way: the frames so far, and what each of their pixels truly shows.
+
+    Attributes:
+        scene: what is known of it.
+        camera: over it.
+        owners: thing of each pixel, -1 for none, (H, W) int64, by frame.
+        cameras: believed and true pose of the camera, (4, 4) each, metres, by frame.
+        seconds: of CPU for the last frame.
+    """
+
+    def __init__(
+        self,
+        camera: TableCamera,
+        system: System,
+        segmentation: Segmenter | None = None,
+    ) -> None:
+        """Begin with no frame.
+
+        Args:
+            camera: over the table.
+            system: that knows the things.
+            segmentation: that tells them apart; None for the bundled network.
+        """
+        self.scene = Scene(system, segmentation=segmentation)
+        self.camera = camera
+        self.owners: list[Index] = []
+        self.cameras: list[tuple[Float, Float]] = []
+        self.seconds = 0.0
+
+    def look(self, pose: Float) -> None:
+        """Take a frame from a pose."""
+        frame = self.camera.frame(pose)
+        begun = time.process_time()
+        try:
+            taken = self.scene.update(frame).taken
+        except ObservationError:
+            taken = False
+        self.seconds = time.process_time() - begun
+        if taken:
+            self.owners.append(self.camera.owner)
+            self.cameras.append((pose, self.camera.true_pose))
+
+    def truth(self, thing: SceneObject) -> int:
+        """Which thing most pixels of an object show, -1 for none."""
+        votes = np.zeros(len(self.camera.table.things) + 1, np.int64)
+        for frame, mask in thing.pixels.items():
+            votes += np.bincount(self.owners[frame][mask] + 1, minlength=len(votes))
+        return int(votes.argmax()) - 1
+
+    def count(self) -> dict[str, float]:
+        """What was found by now.
+
+        Returns:
+            How many there are of: "things", taught ones on the table; "named", objects with a name;
+            "right", things that are named right; "sure" and "sure_right", the same of confident
+            names; "close" and "close_in_camera", those named right whose ADD-S is small in the
+            world, and in the frame of the last camera that saw them; "strangers", found ones, and
+            "unknown", those of them that are called unknown. And "seconds" of CPU for the last
+            frame.
+        """
+        things = self.camera.table.things
+        counts = Counter[str]()
+        right: dict[int, SceneObject] = {}
+        of_stranger: set[bool] = set()  # whether it has a name
+        for found in self.scene.objects:
+            number = self.truth(found)
+            name = things[number].name if number >= 0 else ""
+            named = found.name != UNKNOWN_NAME
+            if name == STRANGER:
+                of_stranger.add(named)
+            counts["named"] += named
+            counts["sure"] += named and found.confident
+            if named and found.name == name and number not in right:
+                right[number] = found
+                counts["sure_right"] += found.confident
+        for number, found in right.items():
+            for where, in_camera in (("close", False), ("close_in_camera", True)):
+                counts[where] += self._add_s(number, found, in_camera) < CLOSE_POSE
+        of_all = {
+            "things": len(things) - 1,
+            "right": len(right),
+            "strangers": bool(of_stranger),
+            "unknown": of_stranger == {False},
+            "seconds": self.seconds,
+        }
+        return {name: float(value) for name, value in {**counts, **of_all}.items()}
+
+    def _add_s(self, number: int, found: SceneObject, in_camera: bool) -> float:
+        """Mean distance of the true surface's points from the found one, diameters."""
+        thing = self.camera.table.things[number]
+        points = thing.vertices[:: max(1, len(thing.vertices) // ADD_S_POINTS)]
+        pose = found.pose
+        assert pose is not None
+        true = self.camera.lean @ thing.pose
+        if in_camera:
+            frame = max(found.pixels)
+            believed, really = self.cameras[frame]
+            pose = pose.copy()
+            shifts = found.candidates[0].displacements
+            if len(shifts) == len(found.pixels):
+                pose[:3, 3] += shifts[sorted(found.pixels).index(frame)]
+            pose = np.linalg.inv(believed) @ pose
+            true = np.linalg.inv(really) @ thing.pose
+        diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
+        placed = points @ pose[:3, :3].T + pose[:3, 3]
+        there = points @ true[:3, :3].T + true[:3, 3]
+        return float(np.mean(cKDTree(placed).query(there)[0])) / diameter
+
+
+def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun:
+    """Look at a table as one policy says.
+
+    Args:
+        job: seeds and views of all policies.
+        table: with the things.
+        policy: one of TABLE_POLICIES.
+    """
+    how: TableSettings = job.settings
+    rng = np.random.default_rng([how.seed, job.table, 1])
+    camera = TableCamera(table, SENSORS["wrist"], rng)
+    looking = Looking(camera, *opened_models(how.models, how.network))
+    choose = np.random.default_rng([how.seed, job.table, 2])
+    azimuth = choose.uniform(0, 2 * np.pi)
+    elevation = np.radians(choose.uniform(*VIEW_ELEVATIONS))
+    pose = _view(azimuth, elevation)
+
+    counts = []
+    done = how.views[-1] + 1
+    for number in range(1, done):
+        looking.look(pose)
+        if looking.scene.done:
+            done = min(done, number)
+        if number in how.views:
+            counts.append(looking.count())
+        if policy == "fixed":
+            pose = _view(azimuth + number * np.pi / 2, elevation)
+        elif policy == "random":
+            around = choose.uniform(0, 2 * np.pi, 1)[0]
+            pose = _view(around, np.radians(choose.uniform(*VIEW_ELEVATIONS)))
+        else:
+            target = looking.scene.target
+            pose = pose if target is None else target
+    return TableRun(counts, done)
+
+
+def _view(azimuth: float, elevation: float) -> Float:
+    """The pose of a camera that looks at the middle of the table, (4, 4), metres; radians."""
+    return poses_around(
+        np.array([azimuth]), elevation, CAMERA_FROM_TABLE, TABLE_CENTRE
+    )[0]

@@ -1,0 +1,174 @@
+"""The benchmark of tables with several things: from scans to a folder of tables, resumable."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from nextview.benchmark.comparison import ALL, Counted, Key, corrected
+from nextview.benchmark.jobs import check_place, check_same, run_jobs
+from nextview.benchmark.results import (
+    Board,
+    Column,
+    ComparedTables,
+    write_compared,
+)
+from nextview.benchmark.statistics import resample
+from nextview.benchmark.table_runs import (
+    MOST_THINGS,
+    TABLE_POLICIES,
+    TableJob,
+    TableRuns,
+    TableSettings,
+    meshes_in,
+    work_at_table,
+)
+from nextview.data import pool
+from nextview.data.progress import TrackProgress, silently
+from nextview.errors import UsageError
+from nextview.files import command, only_one
+from nextview.things.memory import open_memory
+
+# by measure: what is counted, of what, and the heading in narrow tables
+SHARES = {
+    "recall": ("right", "things", "recall"),
+    "precision": ("right", "named", "precision"),
+    "recall, confident": ("sure_right", "things", "confident recall"),
+    "precision, confident": ("sure_right", "sure", "confident precision"),
+    "ADD-S < 0.1 d, world": ("close", "right", ""),
+    "ADD-S < 0.1 d, camera": ("close_in_camera", "right", ""),
+    "strangers unknown": ("unknown", "strangers", "strangers unknown"),
+}
+
+
+def benchmark_tables(
+    scans: Path,
+    strangers: Path,
+    out: Path,
+    settings: TableSettings = TableSettings(),
+    workers: int | None = None,
+    track: TrackProgress = silently,
+) -> ComparedTables:
+    """Compare next-view policies on simulated tables with several things each.
+
+    On each table stand 6 to 10 things at true size in resting poses, one of them a stranger. The
+    tables say, after so many frames, which share of the things was found and named right (recall)
+    and which share of the names is right (precision; a name of the stranger or of a piece counts as
+    wrong); the same for confident names; how many poses of the right ones are good (ADD-S below a
+    tenth of the diameter), in the world and in the frame of the last camera; and how many strangers
+    are called unknown. An interrupted run resumes.
+
+    Args:
+        scans: folder of the scans of things that the memory knows, metres, by their names.
+        strangers: folder of meshes of other things.
+        out: folder of the results; an existing one is continued.
+        workers: number of processes; by default one for each core; 0 uses this process.
+        track: follows the work.
+
+    Raises:
+        UsageError: settings that make no sense, or a folder without meshes.
+        ResultsError: OUT holds the results of other settings.
+    """
+    settings.check()
+    scans, strangers, out = Path(scans), Path(strangers), Path(out)
+    check_place(out)
+    pool.count(workers)
+    least = MOST_THINGS - 1  # one is a stranger
+    if len(meshes_in(scans)) < least:
+        raise UsageError(
+            f"{scans}: holds {len(meshes_in(scans))} scans; a table takes up to {least}"
+        )
+    policies = tuple(dict.fromkeys([settings.reference, *settings.policies]))
+    shown = {
+        "memory_sha256": open_memory(settings.models)[0].sha256,
+        "network": str(settings.network or ""),
+        "scans": len(meshes_in(scans)),
+        "strangers": len(meshes_in(strangers)),
+        "views": list(settings.views),
+        "seed": settings.seed,
+    }
+    jobs = [
+        TableJob(settings, out, f"{table:04d}", policies, scans, strangers, table)
+        for table in range(settings.tables)
+    ]
+    with only_one(out):
+        check_same(out, shown)
+        runs = run_jobs(work_at_table, jobs, TableRuns, workers, track)
+        there = [name for name in TABLE_POLICIES if all(name in e.runs for e in runs)]
+        tables = summarise_tables(runs, there, settings)
+        made = asdict(settings) | {
+            "network": shown["network"],
+            "policies": there,
+            "command": command(),
+            "scans": str(scans),
+            "strangers": str(strangers),
+        }
+        write_compared(out, tables, made, "recall", "found and named right")
+    return tables
+
+
+def summarise_tables(
+    runs: Sequence[TableRuns],
+    policies: Sequence[str],
+    settings: TableSettings,
+) -> ComparedTables:
+    """Compare policies over all tables. One Holm correction is over all tests.
+
+    Args:
+        runs: of all tables.
+        policies: in the order of the tables.
+        settings: views, reference, samples and seed.
+    """
+    one = np.ones(len(runs))
+    sums: dict[Key, tuple] = {}
+    for policy in policies:
+        mine = [each.runs[policy] for each in runs]
+        for row, k in enumerate(settings.views):
+            counts = [run.counts[row] for run in mine]
+
+            def of(name: str, counts: list = counts) -> np.ndarray:
+                return np.array([each.get(name, 0) for each in counts], np.float64)
+
+            sums |= {
+                Key(policy, None, k, measure): (of(found), of(there))
+                for measure, (found, there, _) in SHARES.items()
+            }
+            sums[Key(policy, None, k, "CPU, s")] = of("seconds"), one
+        done = np.array([run.done for run in mine], np.float64)
+        sums[Key(policy, None, 0, "frames until done")] = done, one
+
+    counted = Counted.of(sums, np.arange(len(runs)))
+    weights = resample(
+        len(runs), settings.samples, np.random.default_rng(settings.seed)
+    )
+    tests = counted.tests(ALL, weights, settings.reference, _is_compared)
+    things = sum(each.runs[policies[0]].counts[0]["things"] for each in runs)
+    about = f"{len(runs)} tables, {things:g} known things"
+    return ComparedTables(
+        counted.measures(ALL, weights),
+        corrected([tests]),
+        settings.reference,
+        tuple(
+            Board(f"After {k} frame{'s' * (k > 1)}", ALL, _columns(k), about)
+            for k in settings.views
+        ),
+        "",
+    )
+
+
+def _is_compared(key: Key) -> bool:
+    """Whether a measure is compared with the reference's; the first view is the same."""
+    if key.measure == "recall":
+        return key.views > 1
+    return key.measure == "frames until done"
+
+
+def _columns(k: int) -> tuple[Column, ...]:
+    """What is shown of the policies after a number of frames."""
+    until = "frames until done"
+    shares = [
+        Column(name, (name,), k, short=short) for name, (_, _, short) in SHARES.items()
+    ]
+    spent = Column("CPU for the last frame, s", ("CPU, s",), k, 2)
+    return (*shares, Column(until, (until,), 0, 2, "until done"), spent)
