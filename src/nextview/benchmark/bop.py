@@ -245,6 +245,7 @@ def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
             raise UsageError(
                 f"--ids takes NAME=NUMBER, such as mug=14, not {one_line(repr(text))}"
             )
+
         number = int(digits)
         if number not in dataset.models:
             there = ", ".join(map(str, sorted(dataset.models)))
@@ -295,6 +296,7 @@ def _numbers_of_things(
     for name in given:
         if name not in things:
             raise UsageError(f"--ids: {memory} knows nothing called {one_line(name)}")
+
     named = {
         name: number for name in things if (number := model_number(name)) is not None
     }
@@ -303,6 +305,7 @@ def _numbers_of_things(
         for name, number in (named | given).items()
         if number in dataset.models
     }
+
     if not numbers:
         raise UsageError(
             f"{memory}: none of its things ({_few(things)}) is called as a model of"
@@ -383,7 +386,8 @@ def _look(
     poses = []
     others = []
     for thing in scene.objects:
-        name, pose = thing.result.pose_of, thing.pose
+        name = thing.result.pose_of
+        pose = thing.pose
         if name is None or pose is None:
             continue
         if name not in numbers:
@@ -402,6 +406,7 @@ def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(BOP_COLUMNS)
+
         for image, one in found.items():
             for pose in one.poses:
                 matrix = pose.matrix

@@ -235,6 +235,7 @@ def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
         between = [right[:, labels == label].mean() for label in np.unique(labels)]
+
         values = {
             "calibration_error": metrics.calibration_error(
                 ends.confidence,

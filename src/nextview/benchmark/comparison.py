@@ -144,10 +144,12 @@ class Counted:
         ]
         if not pairs:
             return tests_of(name, reference, [])
+
         own, theirs = np.array(pairs).T
         apart = self.top[:, own] - self.top[:, theirs]
         value, drawn = st.estimate(apart, self.bottom[:, own], weights)
         p = st.sign_flip_p(st.by_family(apart, self.families))
+
         count = int(self.families.max()) + 1
         numbers = zip(own, value, *st.interval(drawn), p, strict=True)
         rows = [(self.keys[i], *number, count) for i, *number in numbers]
@@ -206,6 +208,8 @@ def too_few(tests: "pd.DataFrame") -> dict[str, str]:
     found = {}
     for name, rows in tested.groupby("set", sort=False):
         families = int(rows["families"].iloc[0])
+
+        # two-sided sign flips of n families have p-values of 2^(1 - n) and more
         wanted = families
         while (
             wanted < st.EXACT_FAMILIES
@@ -242,7 +246,12 @@ def values_of(
 
 
 def significant(tables: Tables, name: str) -> set[tuple[str, str, int]]:
-    """Return policy, measure and number of views of the significant differences in a set."""
+    """Return policy, measure and number of views of the significant differences in a set.
+
+    Args:
+        tables: of the benchmark.
+        name: of the set of objects.
+    """
     tests = tables.tests
     some = tests[(tests["set"] == name) & (tests["p_holm"] < SIGNIFICANT)]
     return set(zip(some["policy"], some["measure"], some["views"], strict=True))

@@ -41,6 +41,7 @@ def symmetries_of(info: BopModelInfo) -> Float:
     )
     steps = int(np.ceil(np.pi / SYMMETRY_STEP))
     turns = [np.eye(4)]
+
     for one in info.symmetries_continuous:
         axis = np.array(one.axis, np.float64) / np.linalg.norm(one.axis)
         offset = np.array(one.offset, np.float64)
@@ -50,6 +51,7 @@ def symmetries_of(info: BopModelInfo) -> Float:
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             turn[:3, 3] = offset - turn[:3, :3] @ offset
             turns.append(turn)
+
     return (np.array(turns)[:, None] @ discrete).reshape(-1, 4, 4)
 
 

@@ -168,7 +168,12 @@ def work_at_table(job: TableJob) -> None:
 
 @lru_cache(maxsize=512)
 def mesh_of(path: Path, radius: float | None = None) -> Mesh:
-    """Load a scan in metres, or a mesh without unit scaled to a radius, metres."""
+    """Load a scan in metres, or a mesh without unit, which is scaled.
+
+    Args:
+        path: of the mesh file.
+        radius: of a mesh without unit, metres; None for a scan.
+    """
     if radius is None:
         return replace(load_mesh(path, unit="m"), name=path.stem)
     return replace(
@@ -182,7 +187,16 @@ def mesh_of(path: Path, radius: float | None = None) -> Mesh:
 
 @lru_cache(maxsize=512)
 def rests_of(name: str, radius: float, path: Path) -> Float:
-    """Return the rotations of a mesh to its resting poses."""
+    """Return the rotations of a mesh to its resting poses.
+
+    Args:
+        name: of the thing; STRANGER for a mesh without unit.
+        radius: of the thing, metres.
+        path: of the mesh file.
+
+    Returns:
+        (P, 3, 3) float64.
+    """
     mesh = mesh_of(path) if name != STRANGER else mesh_of(path, radius)
     return resting_poses(mesh)
 
@@ -195,6 +209,11 @@ def draw_table(
     """Draw a table with 6 to 10 objects, the last of them a stranger.
 
     A table on which the objects do not fit is drawn again.
+
+    Args:
+        scans: files of the taught things.
+        strangers: files of other meshes.
+        rng: source of all random numbers.
 
     Raises:
         UsageError: MOST_DRAWN attempts failed.
@@ -289,6 +308,7 @@ class Looking:
         counts = Counter[str]()
         right: dict[int, SceneObject] = {}
         of_stranger: set[bool] = set()  # whether the stranger has a name
+
         for found in self.scene.objects:
             number = self.truth(found)
             name = things[number].name if number >= 0 else ""
@@ -300,9 +320,11 @@ class Looking:
             if named and found.name == name and number not in right:
                 right[number] = found
                 counts["sure_right"] += found.confident
+
         for number, found in right.items():
             for where, in_camera in (("close", False), ("close_in_camera", True)):
                 counts[where] += self._add_s(number, found, in_camera) < CLOSE_POSE
+
         of_all = {
             "things": len(things) - 1,
             "right": len(right),
@@ -318,6 +340,7 @@ class Looking:
         points = thing.vertices[:: max(1, len(thing.vertices) // ADD_S_POINTS)]
         pose = found.pose
         assert pose is not None
+
         true = self.camera.lean @ thing.pose
         if in_camera:
             frame = max(found.pixels)
@@ -328,6 +351,7 @@ class Looking:
                 pose[:3, 3] += shifts[sorted(found.pixels).index(frame)]
             pose = np.linalg.inv(believed) @ pose
             true = np.linalg.inv(really) @ thing.pose
+
         diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
         placed = points @ pose[:3, :3].T + pose[:3, 3]
         there = points @ true[:3, :3].T + true[:3, 3]

@@ -72,7 +72,9 @@ def benchmark_tables(
         ResultsError: OUT contains the results of other settings.
     """
     settings.check()
-    scans, strangers, out = Path(scans), Path(strangers), Path(out)
+    scans = Path(scans)
+    strangers = Path(strangers)
+    out = Path(out)
     check_place(out)
     pool.count(workers)
     least = MOST_THINGS - 1  # one is a stranger
@@ -80,6 +82,7 @@ def benchmark_tables(
         raise UsageError(
             f"{scans}: holds {len(meshes_in(scans))} scans; a table takes up to {least}"
         )
+
     policies = tuple(dict.fromkeys([settings.reference, *settings.policies]))
     shown = {
         "memory_sha256": open_memory(settings.models)[0].sha256,

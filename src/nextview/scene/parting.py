@@ -341,16 +341,18 @@ def _largest(masks: Mapping[int, Mask]) -> list[int]:
 
 
 def _joined(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Join objects that touch where one scan explains them all better than several do.
+    """Join objects that touch if one scan explains them all better than several do.
 
-    What was joined is tried with what is left beside it, until nothing is joined any more.
+    Joined objects are tried with their remaining neighbours until no more are joined.
     """
-    found, tried = list(tracks), list[Track]()
+    found = list(tracks)
+    tried: list[Track] = []
     while True:
         joined = _joined_once(found, bench, tried)
         if len(joined) == len(found):
             return joined
-        found, tried = joined, found
+        tried = found
+        found = joined
 
 
 def _joined_once(
@@ -358,9 +360,9 @@ def _joined_once(
     bench: Bench,
     tried: Sequence[Track],
 ) -> list[Track]:
-    """Join groups of objects that have none in common, the greatest gain first.
+    """Join disjoint groups of objects, those with the largest gain first.
 
-    Groups of objects that were ``tried`` already are not tried again.
+    Groups whose objects are all in ``tried`` are skipped.
     """
     old = {id(track) for track in tried}
     groups = [

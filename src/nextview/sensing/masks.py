@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
-from scipy.ndimage import uniform_filter
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import WHOLE, Frame, Part, within
@@ -15,9 +14,12 @@ from nextview.types import Float, Float32, Mask
 
 # height above a plane, relative to the distance, from which a pixel at a mask's edge is not on it
 STANDS = 0.02
-PLANE_SHARE = 0.003  # of the distance, by which a plane is off beside the noise
-BESIDE = 20  # pixels around a mask in which the noise of the plane is measured
-FEWEST_BESIDE = 100  # pixels of the plane by which it is
+# A point is on a plane if its height is at most so many deviations of its noise, and this share of
+# its distance.
+PLANE_NOISE = 4.0
+PLANE_SHARE = 0.003
+BESIDE = 20  # width of the margin around a mask in which the noise of the plane is measured, pixels
+FEWEST_BESIDE = 100  # least number of pixels for that measurement
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
 BESIDE_POINTS = 200  # pixels at a border that are compared
@@ -83,23 +85,29 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     high = (height > least) & (depth > 0)
 
     # Noise moves a point along its ray, so the height error depends on the slope of the ray.
-    a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
-    x = frame.rays[0][part[1]]
-    y = frame.rays[1][part[0]]
-    most_noise = 4 * float(noise.sigmas.max(initial=0.0))
-    steepest = float(
-        np.abs(a) * np.abs(x).max() + np.abs(b) * np.abs(y).max() + np.abs(c)
-    )
+    of_columns, of_rows = _rise(frame, plane, part)
+    steepest = float(np.abs(of_columns).max() + np.abs(of_rows).max())
+    most_noise = PLANE_NOISE * float(noise.sigmas.max(initial=0.0))
     unsure = height < least + np.float32(most_noise * steepest) * depth**2
     unsure &= high
 
     rows, columns = np.divmod(np.flatnonzero(unsure), high.shape[1])
     z = depth[rows, columns]
-    rise = np.abs((a * x)[columns] + (b * y + c)[rows])
+    rise = np.abs(of_columns[columns] + of_rows[rows])
     high[rows, columns] = height[rows, columns] > z * (
-        4 * noise.at(z) * z * rise + PLANE_SHARE
+        PLANE_NOISE * noise.at(z) * z * rise + PLANE_SHARE
     )
     return high
+
+
+def _rise(frame: Frame, plane: Plane, part: Part) -> tuple[Float32, Float32]:
+    """Return by how much rays rise over a plane with depth: a term of each column, one of each row.
+
+    The rise of a pixel's ray is the sum of its two terms.
+    """
+    a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
+    x, y = frame.rays
+    return a * x[part[1]], b * y[part[0]] + c
 
 
 def inside_mask(
@@ -123,43 +131,47 @@ def inside_mask(
     mask = trimmed(frame.depth, given, noise, high)
     part = within(mask, BESIDE)
     above = mask.copy()
-    above[part] &= _above_in_the_mean(frame, mask, plane, noise, part)
+    above[part] &= _above_on_average(frame, mask, plane, noise, part)
     # a plane may lie above what is hidden or flat
     return above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
 
 
-def _above_in_the_mean(
+def _above_on_average(
     frame: Frame,
     mask: Mask,
     plane: Plane,
     noise: Noise,
     part: Part,
 ) -> Mask:
-    """Which pixels of a mask are higher above a plane than the noise of their neighbourhood.
+    """Return the pixels of a mask whose neighbourhood is above a plane by more than its noise.
 
-    The mean of the neighbours in the mask is less noisy than a pixel: with the noise of a pixel the
-    lower part of a small thing would be taken for the plane. How much less is measured beside the
-    mask, since neighbouring pixels of a sensor err together.
+    The mean height of the neighbours in the mask has less noise than a single pixel, whose noise
+    would hide the lower part of a small object. The errors of neighbouring pixels are correlated,
+    so the noise of the mean is measured on the plane beside the mask.
     """
     z = frame.depth[part]
     own = mask[part] & (z > 0)
     height = frame.along(plane.normal, plane.offset, part)
-    a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
-    x, y = frame.rays[0][part[1]], frame.rays[1][part[0]]
-    deviation = noise.at(z) * z**2 * np.abs(a * x + (b * y + c)[:, None])
+    of_columns, of_rows = _rise(frame, plane, part)
+    deviation = noise.at(z) * z**2 * np.abs(of_columns + of_rows[:, None])
 
-    beside = ~mask[part] & (z > 0) & (np.abs(height) < 4 * deviation + PLANE_SHARE * z)
-    means = _mean(height, beside)[beside] / np.maximum(deviation[beside], 1e-9)
-    left = 1.0
+    on_plane = np.abs(height) < PLANE_NOISE * deviation + PLANE_SHARE * z
+    beside = ~mask[part] & (z > 0) & on_plane
+    means = _local_mean(height, beside)[beside] / np.maximum(deviation[beside], 1e-9)
+    ratio = 1.0  # deviation of the mean, relative to that of a pixel
     if len(means) >= FEWEST_BESIDE:
-        left = min(1.0, float(np.sqrt(np.mean(means**2))))
-    return own & (_mean(height, own) > 4 * left * deviation + PLANE_SHARE * z)
+        ratio = min(1.0, float(np.sqrt(np.mean(means**2))))
+
+    least = PLANE_NOISE * ratio * deviation + PLANE_SHARE * z
+    return own & (_local_mean(height, own) > least)
 
 
-def _mean(values: Float32, among: Mask) -> Float32:
-    """Means of the neighbours that are among some pixels, (H, W) float32."""
-    share = uniform_filter(among.astype(np.float32), SQUARE_WIDTH, mode="constant")
-    total = uniform_filter(values * among, SQUARE_WIDTH, mode="constant")
+def _local_mean(values: Float32, among: Mask) -> Float32:
+    """Return means over the neighbours within a mask, (H, W) float32."""
+    share = ndimage.uniform_filter(
+        among.astype(np.float32), SQUARE_WIDTH, mode="constant"
+    )
+    total = ndimage.uniform_filter(values * among, SQUARE_WIDTH, mode="constant")
     return np.asarray(total / np.maximum(share, np.float32(1e-6)))
 
 

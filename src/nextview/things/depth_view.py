@@ -11,6 +11,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.facets import Noise, estimate_noise
+from nextview.sensing.masks import PLANE_NOISE, PLANE_SHARE
 from nextview.things.ground import Ground, find_ground
 from nextview.types import Float, Float32, Index, Mask
 
@@ -26,8 +27,6 @@ NOISE_ROWS = 40  # rows of an image in which its noise is measured
 NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
-LEVEL_NOISE = 4.0  # deviations of the noise within which a pixel lies on the ground
-LEVEL_SHARE = 0.003  # of its distance within which it does, beside the noise
 # metres by which something stands before a surface that it hides, at least
 HIDING = 0.005
 HIDING_NOISE = 4.0  # deviations of the noise by which it does
@@ -53,8 +52,8 @@ class DepthView:
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
             unit vectors; zero within it.
         ground: plane that the thing stands on, if it is seen.
-        level: pixels as low as the noise of the ground is high, (P,) bool: whether they show the
-            thing is not known, however they were segmented.
+        level: pixels on the ground within its noise, (P,) bool: whether they show the thing is
+            unknown, whatever they were segmented as.
         shape: rows and columns of the grid; P is their product.
         step: distance between the grid's rows, and between its columns, (2,) float64, pixels of the
             image.
@@ -185,13 +184,17 @@ class MetricImage:
         return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
 
     def find_hiding(self) -> Mask:
-        """Pixels around the thing that show something before it, (H, W) bool, but the ground."""
+        """Return the pixels around the thing that show an occluder in front of it, (H, W) bool.
+
+        The ground is no occluder.
+        """
         rows, columns = (
             slice(lines[0], lines[-1] + 1)
             for lines in _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
         )
         depth = self.depth[rows, columns]
         kind = self.kind[rows, columns]
+
         nearest = distance_transform_edt(
             kind != THING, return_distances=False, return_indices=True
         )
@@ -199,6 +202,7 @@ class MetricImage:
         noise = self.noise.at(beside) * beside**2
         apart = np.hypot(HIDING, HIDING_NOISE * np.minimum(noise, NOISIEST * beside))
         hiding = (kind == ELSEWHERE) & (depth < beside - apart)
+
         if self.ground is not None and hiding.any():
             at = np.nonzero(hiding)
             x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(
@@ -211,6 +215,7 @@ class MetricImage:
                 HIDING, HIDING_NOISE * self.ground.noise * depth[at] ** 2
             )
             hiding[at] = heights > allowed
+
         every = np.zeros(self.kind.shape, bool)
         every[rows, columns] = hiding
         return every
@@ -254,7 +259,7 @@ class MetricImage:
                 origin + rays * finite[:, None].astype(np.float64)
             )
             rise = np.abs(rays @ self.ground.normal)
-            low = LEVEL_NOISE * noise * rise + LEVEL_SHARE * finite
+            low = PLANE_NOISE * noise * rise + PLANE_SHARE * finite
             level = (finite > 0) & (np.abs(heights) < low)
 
         return DepthView(

@@ -29,9 +29,9 @@ NO_SCALE = "the scale of the views is not known in metres"
 
 
 class VerifiedRecogniser(TaughtRecogniser):
-    """Recognises taught things by all that was seen: features and size propose, geometry decides.
+    """Recognises taught things in all views together, by their geometry.
 
-    What it says of single views, which policies see, is what the memory's features and sizes say.
+    The evidence of single views, which policies use, comes from the memory's features and sizes.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:

@@ -5,8 +5,7 @@ and draws it towards what was measured: along the surface's normals where the ra
 depth was measured (point to plane, Chen and Medioni, "Object modelling by registration of multiple
 range images", 1992, projected along the ray as in Blais and Levine 1995), and within the image
 where it sticks out of the thing's outline. Weights are robust (Cauchy), and come down from coarse
-to fine. A tilt from the pose that it rests in and an error of each camera's place are held near
-zero.
+to fine. A prior holds the error of each camera's place near zero.
 """
 
 from collections.abc import Sequence
@@ -165,7 +164,12 @@ class Alignment:
 
 
 def joined(first: Alignment, second: Alignment) -> Alignment:
-    """Put the hypotheses of two alignments with the same views one after the other."""
+    """Concatenate the hypotheses of two alignments with the same views.
+
+    Args:
+        first: H hypotheses.
+        second: K more.
+    """
     parts = {
         field.name: np.concatenate(
             [getattr(first, field.name), getattr(second, field.name)]
@@ -323,9 +327,13 @@ def pulls_of(
     centres: Float,
     reach: Float32,
 ) -> Pulls:
-    """What draws the hypotheses whose centres are these, (H, 3), as this view sees them.
+    """Compute the pulls of one view on hypotheses.
 
-    ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
+    Args:
+        view: the view.
+        rendered: what it would show of the H hypotheses.
+        centres: of the hypotheses, (H, 3), object frame, metres.
+        reach: expected deviation of each hypothesis beside the noise, (H,), metres.
     """
     shows = np.isfinite(rendered.depth)
     # Where the thing was measured: along the normal.
@@ -515,7 +523,6 @@ def _equations(
         caster,
         alignment,
         displaced if errors_too else None,
-        level,
         prior,
     )
     left += weights[:, :, None] * np.eye(unknowns)
@@ -570,7 +577,7 @@ def pose_covariances(
     """
     level = FINE[-1]
     displaced = prior.displaced(views)
-    weights, _ = priors_of(caster, alignment, None, level, prior)
+    weights, _ = priors_of(caster, alignment, None, prior)
     information = weights[:, :, None] * np.eye(POSE)
 
     for number, view in enumerate(views):
@@ -601,10 +608,15 @@ def inverses(information: Float) -> Float:
 
 
 def pulls_of_outline(view: DepthView, rendered: Rendered, centres: Float) -> Pulls:
-    """What holds hypotheses that lie right, with these centres, (H, 3), at the thing's outline.
+    """Compute the pulls that hold hypotheses in their right poses at the thing's outline.
 
     These are the pixels of the thing next to others where something farther, or nothing, shows:
     the thing ends there, and is not hidden.
+
+    Args:
+        view: the view.
+        rendered: what it would show of the H hypotheses.
+        centres: of the hypotheses, (H, 3), object frame, metres.
     """
     thing = (view.kind == THING).reshape(view.shape)
     depth = np.where(view.kind == NOT_MEASURED, 0, view.depth).reshape(view.shape)
@@ -666,12 +678,19 @@ def priors_of(
     caster: SurfaceCaster,
     alignment: Alignment,
     displaced: Float | None,
-    level: Level,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Weights that hold unknowns near zero, and where these are by now, (H, unknowns) each.
+    """Return weights that hold unknowns near zero, and their present values.
 
-    ``displaced`` says how far off each view may be, (V,); None if the cameras are no unknowns.
+    Args:
+        caster: of all surfaces.
+        alignment: H hypotheses.
+        displaced: standard deviation of the place in which each view sees them, (V,), metres; None
+            if the errors of the cameras are no unknowns.
+        prior: how far off things may be before anything was aligned.
+
+    Returns:
+        Weights and values, (H, unknowns) float64 each.
     """
     cameras = 0 if displaced is None else 3 * len(displaced)
     weights = np.zeros((len(alignment), POSE + cameras))

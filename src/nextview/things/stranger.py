@@ -258,9 +258,7 @@ def _equations(
             right[own] += towards[: len(own)]
 
     errors = displaced if of_cameras else None
-    weights, so_far = priors_of(
-        comparison.caster, aligned, errors, level, comparison.prior
-    )
+    weights, so_far = priors_of(comparison.caster, aligned, errors, comparison.prior)
     held = np.append(np.arange(POSE), np.arange(UNKNOWNS, len(left)))
     left[held, held] += weights[0]
     right[held] -= weights[0] * so_far[0]

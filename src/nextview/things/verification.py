@@ -122,7 +122,7 @@ def likelihood(
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    # Whether low pixels show the thing is not known: what they measure decides.
+    # Low pixels may show the thing or the ground: their depth decides.
     low = view.level & ~sunk
     judged = np.where(through, np.where(low, match, model.outlier) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)

@@ -38,9 +38,8 @@ from nextview.types import Float, Index, Mask
 # share of things that do not stand on what is seen below them: they lean on something, or hang
 UNUSUAL = 0.1
 THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
-LIKELY_THINGS = (
-    4  # the same of the likeliest by outline: of what is hidden the first may fail
-)
+# the same of the likeliest by outline: the first orientation of an occluded thing may fail
+LIKELY_THINGS = 4
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 
@@ -329,7 +328,9 @@ class Verifier:
         ranks: Index,
         images: Sequence[MetricImage],
     ) -> tuple[_Proposed, Alignment]:
-        """The first orientation of each thing, and all of the likeliest things by either.
+        """Align the first orientation of each thing, and add all others of the likeliest things.
+
+        The likeliest are those that fit best after alignment, and those of the likeliest outlines.
 
         Args:
             proposed: orientations of things.
@@ -337,7 +338,7 @@ class Verifier:
             images: the views.
 
         Returns:
-            What is worth aligning, and where it starts.
+            Hypotheses to be aligned, and their poses so far.
         """
         stage = STAGES[0]
         views = [image.view(stage.side) for image in images]
@@ -458,9 +459,11 @@ class Verifier:
         """
         visible = np.sum([view.visible for view in judged], axis=0)
         behind = np.sum([view.seen_behind for view in judged], axis=0)
+
         aligned = alignment.turned(level.T)
         ground = self._standing(alignment, views)
         shares = np.exp(scores - scores.max())
+
         return Verified(
             belief=self.weights.belief(scores, alignment.things, proposed.by_outline),
             things=alignment.things,

@@ -37,18 +37,13 @@ SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
 """How much a unit of the mismatch of outlines and depths costs."""
-SIZE_STEP = 0.06  # of the logarithm of the sizes at which what is seen is compared
-SIZES = (
-    -0.36,
-    0.36,
-)  # of outlines that are compared with a seen one, logarithms of ratios
-SIZES_HIDDEN = (-0.24, 1.2)  # the same where something hides a part of what is seen
-SHIFTS = (
-    0.5,
-    1.5,
-)  # step and reach, in sizes, by which the middle of what is hidden is moved
+SIZE_STEP = 0.06  # between the logarithms of the sizes at which a view is compared
+# range of the template's size relative to that of the seen outline, logarithms
+SIZES = (-0.36, 0.36)
+SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
+SHIFTS = (0.5, 1.5)  # step and reach of the middle of an occluded outline, sizes
 HIDDEN_SHARE = (
-    0.05  # of the pixels around an outline that hide something, from which it is moved
+    0.05  # share of occluders around an outline from which it counts as occluded
 )
 
 
@@ -195,10 +190,12 @@ class ViewTemplates:
             np.zeros(count),
         )
         bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
+
         sizes = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
         first, last = (round(one / SIZE_STEP) for one in sizes)
         if not ((bins >= first) & (bins <= last)).any():
             bins = bins.clip(first, last)  # those of the next size are the likeliest
+
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
         grid = turned_grid(turns)
         for step in range(first, last + 1):
@@ -208,9 +205,11 @@ class ViewTemplates:
             size = view.size * np.exp(step * SIZE_STEP)
             pixels = size * view.focal / view.middle
             templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
+
             for shift in view.shifts:
                 seen = view.pictures(size, shift * pixels, grid)
                 costs, behind = mismatch(seen, templates)
+
                 turn = costs.argmin(0)
                 cost = costs[turn, np.arange(len(rows))]
                 better = cost < fit.cost[rows]
@@ -386,12 +385,19 @@ class SeenOutline:
         camera: PinholeCamera,
         pose: Float,
     ) -> "SeenOutline":
-        """That of some pixels, which are enough."""
+        """Return the outline of some pixels.
+
+        Args:
+            depth: of all pixels, (H, W) float32, metres.
+            shown: pixels that show the thing, FEWEST_OUTLINE_PIXELS at least, (H, W) bool.
+            known: pixels of which it is known whether they show it, (H, W) bool.
+            camera: of the image.
+            pose: camera-to-object, (4, 4).
+        """
         rows, columns = np.nonzero(shown)
         centre = np.array([columns.mean(), rows.mean()])
-        spread = float(
-            np.sqrt(columns.var() + rows.var() + 1 / 6)
-        )  # a pixel is a square
+        # a pixel is a square
+        spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))
         middle = float(np.median(depth[rows, columns]))
         size = spread * middle / np.sqrt(camera.fx * camera.fy)
         shifts = np.zeros((1, 2))
