@@ -14,6 +14,7 @@ import numpy as np
 import pipeline
 import pytest
 import trimesh
+from bop_datasets import write_dataset
 from filelock import FileLock
 from hypothesis import settings
 from small_tables import meshes_of
@@ -157,6 +158,12 @@ def household(shared) -> Path:
             )
 
     return shared("household", make)
+
+
+@pytest.fixture(scope="session")
+def bop(shared) -> Path:
+    """A dataset of two images in the layout of BOP."""
+    return shared("bop", write_dataset)
 
 
 @pytest.fixture(scope="session")

@@ -66,6 +66,11 @@ WRITES = {
         "folder",
         "--tables 1 --seed 11 --views 1 --policies random --samples 100 --workers 0",
     ),
+    "bop": (
+        "bop {bop}",
+        "b.csv",
+        "--models ycb --ids cracker_box=2 mug=14 --frames 1",
+    ),
     "report": ("report {results}/out", "r.html"),
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
@@ -99,6 +104,7 @@ def made(
     knobs,
     knobs_memory,
     household,
+    bop,
     tmp_path_factory,
 ):
     """What the commands work on; the store is a copy."""
@@ -124,6 +130,7 @@ def made(
         "knobs": knobs,
         "knobs_memory": knobs_memory,
         "household": household,
+        "bop": bop,
     }
 
 
