@@ -11,7 +11,6 @@ from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
-from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy
 from nextview.things.taught import TaughtThings
@@ -23,7 +22,6 @@ THING_POLICIES = (
     "furthest",
     "fixed",
     "ring",
-    "picture",
     "geometry",
     "pose",
     "ceiling",
@@ -33,7 +31,7 @@ CEILINGS = ("ceiling",)  # upper bound with access to the ground truth
 BLIND_RULES = ("random", "spread", "furthest", "fixed", "ring")
 BEST_BLIND = "best-blind"  # the blind rule that is best on other episodes
 # policies that use the hypotheses of a memory of taught things
-OF_MEMORIES = ("picture", "geometry", "pose")
+OF_MEMORIES = ("geometry", "pose")
 # azimuth steps of the fixed sequence, which reaches all 8 views of a ring
 TURN_AHEAD = 3
 # belief in the truth from which the upper bound accepts any view that keeps it
@@ -119,7 +117,7 @@ def policies_of(
     Args:
         names: of THING_POLICIES, or MODULE:CLASS for your own, which is created with the
             viewpoints.
-        things: the things, for the policy that uses stored images.
+        things: what the policies go by.
 
     Raises:
         UsageError: there is no policy with one of these names, or it needs the hypotheses of a
@@ -137,12 +135,6 @@ def policies_of(
         "pose": lambda _: replace(geometry, goal="pose"),
         "ceiling": TruthCeiling,
     }
-    if "picture" in names and isinstance(things, TaughtThings):
-        picture = Discriminate.from_card(
-            things.recogniser.card.card_path,
-            EPISODE_SPHERE,
-        )
-        known["picture"] = lambda _: picture
     for name in names:
         if name in OF_MEMORIES:
             _refuse_needs(name, ("outlook",), things)
@@ -170,6 +162,11 @@ def _refuse_needs(
         raise UsageError(
             f"the policy {name} goes by the hypotheses of a memory of taught things, which"
             f" recogniser {things.recogniser.name} does not have; leave it out"
+        )
+    if "joint" in needs and not things.recogniser.azimuth_bins:
+        raise UsageError(
+            f"the policy {name} goes by features of views, and the memory holds none: its things"
+            " are recognised by their geometry"
         )
 
 

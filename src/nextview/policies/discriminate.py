@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.errors import OtherUseError, PolicyError
+from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of
 from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
@@ -70,25 +70,23 @@ class Discriminate:
         cls,
         path: Path,
         viewpoints: Viewpoints,
-        classes: tuple[str, ...] | None = None,
     ) -> "Discriminate":
         """Create the policy for the things of a memory.
 
         Args:
             path: of the memory's card.
             viewpoints: the candidate views.
-            classes: of the recogniser in use; None to skip the check.
 
         Returns:
             The policy.
 
         Raises:
-            OtherUseError: the memory knows other classes.
+            PolicyError: the memory holds no views.
         """
         card, memory = open_memory(path)
-        if classes is not None and card.classes != tuple(classes):
-            raise OtherUseError(
-                f"{path}: discriminates other things ({', '.join(card.classes[:10])})"
+        if not memory.has_features:
+            raise PolicyError(
+                f"{path}: holds no views of its things, which are recognised by their geometry"
             )
         return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 

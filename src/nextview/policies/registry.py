@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from nextview.checks import did_you_mean, one_line, plugin, plugin_errors, plugins
-from nextview.errors import PolicyError
+from nextview.errors import OtherUseError, PolicyError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
 from nextview.policies.baselines import (
@@ -258,9 +258,13 @@ def _of_memory(
     classes: tuple[str, ...] | None,
 ) -> Policy:
     """Return the policy for a memory: by surfaces, or else by stored views."""
-    by_pictures = Discriminate.from_card(card, sphere, classes)
-    _, memory = open_memory(card)
-    return DiscriminateGeometry(sphere) if memory.surfaces.counts.any() else by_pictures
+    about, memory = open_memory(card)
+    if classes is not None and about.classes != classes:
+        known = ", ".join(about.classes[:10])
+        raise OtherUseError(f"{card}: discriminates other things ({known})")
+    if memory.surfaces.counts.any():
+        return DiscriminateGeometry(sphere)
+    return Discriminate.from_card(card, sphere)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:

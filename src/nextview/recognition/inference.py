@@ -118,12 +118,8 @@ class NetworkRecogniser:
 
         Views in which nothing is seen are marked, see ``Evidence.seen``.
         """
-        inputs = from_observations(self.card.input, observations)
-        elevations = np.array(
-            [elevation_of(direction_of(o.pose)) for o in observations]
-        )
         evidence = replace(
-            self.from_inputs(inputs, elevations),
+            self.by_shape(observations),
             seen=np.array([o.seen for o in observations]),
         )
 
@@ -139,6 +135,14 @@ class NetworkRecogniser:
             [np.nan if o.radius is None else o.radius for o in observations]
         )
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
+
+    def by_shape(self, observations: Sequence[Observation]) -> Evidence:
+        """Return the evidence of B views by shape alone, without their size."""
+        inputs = from_observations(self.card.input, observations)
+        elevations = np.array(
+            [elevation_of(direction_of(o.pose)) for o in observations]
+        )
+        return self.from_inputs(inputs, elevations)
 
     def from_inputs(
         self,

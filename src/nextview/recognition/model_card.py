@@ -117,6 +117,7 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         poses: In how many resting poses it was taught.
         symmetries: Of its surface; () for none, and where its geometry is not known.
         near_symmetries: Turns after which it hardly looks different; its symmetries are among them.
+        upright: Whether it is known only as it stands: it was taught so, or captured.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
@@ -124,6 +125,7 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_TAUGHT_POSES)]
     symmetries: tuple[Symmetry, ...] = ()
     near_symmetries: tuple[Symmetry, ...] = ()
+    upright: bool = False
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -131,8 +133,9 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         things: The things, in order.
-        features_sha256: The SHA-256 of the network whose features are remembered.
-        weight: Of a cosine, as a log-likelihood.
+        features_sha256: The SHA-256 of the network whose features are remembered; None if the
+            things are recognised by their geometry alone.
+        weight: Of a cosine of features, as a log-likelihood.
         attribution: Whose work the things are, in words.
         novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative
             log-likelihood of known things, given the class that explains them best; () if that was
@@ -142,8 +145,8 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
-    features_sha256: HashText
-    weight: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_WEIGHT)]
+    features_sha256: HashText | None = None
+    weight: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_WEIGHT)] = 1.0
     attribution: str = ""
     novelty: tuple[tuple[float, ...], ...] = ()
     usual: tuple[tuple[float, ...], ...] = ()
@@ -274,8 +277,9 @@ class ModelCard(
             raise ModelError(
                 f"its hypotheses are not of its {len(self.classes)} classes"
             )
-        if self.calibration.bin_correlation is None:
-            raise ModelError("a memory of things has a calibration of its azimuth bins")
+        has_features = memory.features_sha256 is not None
+        if has_features and self.calibration.bin_correlation is None:
+            raise ModelError("a memory of views has a calibration of its azimuth bins")
 
         poses = memory.poses
         if len(poses) != len(hypotheses):

@@ -30,6 +30,8 @@ from nextview.files import (
     sha256_of,
     unfinished,
 )
+from nextview.geometry.mesh import make_mesh
+from nextview.geometry.resting import resting_poses, rotated
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
@@ -47,7 +49,13 @@ from nextview.recognition.model_card import (
     write_card,
 )
 from nextview.teaching.learned_picture import draw_learned
-from nextview.teaching.memory_fit import VIEWS_FITTED, Fit, fit_memory, size_evidence
+from nextview.teaching.memory_fit import (
+    VIEWS_FITTED,
+    Fit,
+    fit_memory,
+    fit_without_features,
+    size_evidence,
+)
 from nextview.teaching.sizes import check_sizes
 from nextview.teaching.symmetries import named_symmetries
 from nextview.teaching.thing_sources import Found, ThingSource, find_things
@@ -56,11 +64,14 @@ from nextview.teaching.thing_views import (
     LEFT_OUT,
     NEAR_SYMMETRIES,
     SYMMETRIES,
+    UPRIGHT,
     VERTICES,
     Arrays,
     TeachingOptions,
+    features_of,
     rows_of,
     teach,
+    without_features,
 )
 from nextview.teaching.verification_fit import (
     GROWTH,
@@ -106,6 +117,7 @@ class Work:
         workers: see ``pool.each``.
         scheduler: see ``pool.each``.
         track: follows the work.
+        of_classes: whether some class has several things.
     """
 
     how: TeachingOptions
@@ -113,6 +125,7 @@ class Work:
     workers: int | None
     scheduler: str | None
     track: TrackProgress
+    of_classes: bool
 
 
 @dataclass(frozen=True)
@@ -312,7 +325,8 @@ def learn_things(
         taught = [] if old is None else _known(*old, remove)
         _check_names(found.things, taught)
 
-        work = Work(how, part, workers, scheduler, track)
+        of_classes = _of_classes([*found.things, *(source for source, _ in taught)])
+        work = Work(how, part, workers, scheduler, track, of_classes)
         track(_teach(found.things, work, taught, left_out), len(found.things), "things")
         if not taught and nothing_new:
             raise UsageError(
@@ -323,6 +337,7 @@ def learn_things(
                 f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
             )
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
+        taught = _with_features_where_they_count(taught, work)
         _name_symmetries(taught, how.symmetry)
         if not how.any_size:
             radii = np.concatenate([arrays["radii"] for _, arrays in taught])
@@ -354,7 +369,8 @@ def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
     if not keeps:
         return None
     card, memory = open_memory(out / CARD)
-    check_features(card, memory, Features(threads=1).size)
+    if memory.has_features:
+        check_features(card, memory, Features(threads=1).size)
     return card, memory
 
 
@@ -386,6 +402,7 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays = {name: getattr(memory, name)[own] for name in ("views", "rotations")}
         arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
         arrays["radii"] = arrays["radii"].reshape(1)
+        arrays[UPRIGHT] = np.array([thing.upright])
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
             arrays |= {
@@ -415,6 +432,70 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
         known[name][SYMMETRIES] = rows_of(symmetries)
 
 
+def _of_classes(sources: Sequence[ThingSource]) -> bool:
+    """Whether some class has several things."""
+    return len({source.label for source in sources}) < len(sources)
+
+
+def _with_features_where_they_count(
+    taught: Sequence[Pair],
+    work: Work,
+) -> list[Pair]:
+    """Bring all things to the same: all with features of their views, or none.
+
+    Geometry tells things apart whose surfaces are known. Features count where it does not: for
+    things of unknown size, and for classes of several things, which others of the class resemble
+    without being the same. Where they are missing, the stored surface is rendered.
+    """
+    sources = [source for source, _ in taught]
+    count = _of_classes(sources) or any(VERTICES not in each for _, each in taught)
+    if not count:
+        return [
+            (
+                source,
+                arrays | without_features(1) | {"rotations": arrays["rotations"][:1]},
+            )
+            for source, arrays in taught
+        ]
+
+    missing = [
+        (row, source.name, arrays)
+        for row, (source, arrays) in enumerate(taught)
+        if not arrays["views"].shape[-1]
+    ]
+    found = dict[int, Arrays]()
+
+    def watched() -> Iterator[int]:
+        render = partial(_features_again, work.how)
+        results = each(render, missing, work.workers, work.scheduler)
+        for number, ((row, name, _), result) in enumerate(results, 1):
+            if isinstance(result, WorkerDied):
+                raise DatasetError(
+                    f"{name}: its views could not be rendered ({result})"
+                )
+            found[row] = result
+            yield number
+
+    if missing:
+        work.track(watched(), len(missing), "things rendered")
+    return [
+        (source, arrays | found.get(row, {}))
+        for row, (source, arrays) in enumerate(taught)
+    ]
+
+
+def _features_again(how: TeachingOptions, item: tuple[int, str, Arrays]) -> Arrays:
+    """The features of views of a thing by its stored surface."""
+    _, name, arrays = item
+    in_file = make_mesh(arrays[VERTICES].astype(np.float64), arrays[FACES], name, "m")
+    to_mesh = arrays["rotations"][0].astype(np.float64)
+    mesh = rotated(in_file, to_mesh)
+    poses = np.eye(3)[None] if arrays[UPRIGHT][0] else resting_poses(mesh)
+    lying = [mesh, *(rotated(mesh, pose) for pose in poses[1:])]
+    rotations = (poses @ to_mesh).astype(np.float32)
+    return {"rotations": rotations, **features_of(lying, name, how)}
+
+
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
@@ -427,7 +508,7 @@ def _teach(
     """Teach things in parallel, each into its own file; finished ones are kept."""
     waiting = []
     for source in sources:
-        stamp = _stamp(source, work.how)
+        stamp = _stamp(source, work)
         arrays = _finished(_part_of(work.part, source), stamp)
         if arrays is not None:
             taught.append((source, _without_phrase(source, arrays, left_out)))
@@ -441,7 +522,7 @@ def _teach(
         if work.scheduler
         else max(1, count_workers(work.workers) // max(1, len(waiting)))
     )
-    teach_one = partial(_teach_one, work.how, work.part, threads)
+    teach_one = partial(_teach_one, work.how, work.part, work.of_classes, threads)
 
     before = len(sources) - len(waiting)
     yield before
@@ -462,7 +543,7 @@ def _without_phrase(source: ThingSource, arrays: Arrays, left_out: list[str]) ->
     return {name: values for name, values in arrays.items() if name != LEFT_OUT}
 
 
-def _stamp(source: ThingSource, how: TeachingOptions) -> str:
+def _stamp(source: ThingSource, work: Work) -> str:
     """What the part of a thing was made from: it is made anew if any of this has changed.
 
     That is its path, the name, size and time of its file or of each file in its folder, the
@@ -483,7 +564,8 @@ def _stamp(source: ThingSource, how: TeachingOptions) -> str:
         (
             str(source.path.resolve()),
             content.hexdigest(),
-            replace(how, any_size=False, symmetry=()),
+            replace(work.how, any_size=False, symmetry=()),
+            work.of_classes,
             features,
         )
     )
@@ -529,13 +611,14 @@ def _finished(file: Path, stamp: str) -> Arrays | None:
 def _teach_one(
     how: TeachingOptions,
     part: Path,
+    features: bool,
     threads: int,
     item: tuple[ThingSource, str],
 ) -> Arrays | str:
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how, threads)
+        arrays = teach(source.path, source.name, how, threads, features)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -599,7 +682,7 @@ def _write(
         len(classes),
         fit.accuracy,
         confused_names,
-        _notes(taught),
+        _notes(taught, _unseen(taught, verified)),
         tuple(left_out),
     )
     if verified is None:
@@ -641,28 +724,24 @@ def _verified(
     labels = class_of_things(recogniser, known)
     before = None if old is None or old.memory is None else old.memory.verification
     rng = np.random.default_rng(work.how.seed)
+    every = range(len(labels))
     if (
         old is None
         or old.memory is None
         or before is None
         or len(labels) >= GROWTH * before.things
     ):
-        return fit_verification(
-            _shown(folder, range(len(labels)), len(labels), rng, work),
-            labels,
+        shown, unseen = _shown(folder, every, len(labels), rng, work)
+        verified = fit_verification(shown, labels)
+    else:
+        names = [thing.name for thing in old.memory.things]
+        carried = np.array(
+            [names.index(name) if name in names else -1 for name in known.names]
         )
-
-    names = [thing.name for thing in old.memory.things]
-    carried = np.array(
-        [names.index(name) if name in names else -1 for name in known.names]
-    )
-    new = np.flatnonzero(carried < 0).tolist()
-    return with_new_things(
-        before,
-        _shown(folder, new, len(labels), rng, work),
-        labels,
-        carried,
-    )
+        new = np.flatnonzero(carried < 0).tolist()
+        shown, unseen = _shown(folder, new, len(labels), rng, work)
+        verified = with_new_things(before, shown, labels, carried)
+    return replace(verified, unseen=tuple(known.names[thing] for thing in unseen))
 
 
 def _shown(
@@ -671,8 +750,11 @@ def _shown(
     known: int,
     rng: np.random.Generator,
     work: Work,
-) -> list[Shown]:
-    """Show things to the memory in parallel; sorted, so that the order does not matter."""
+) -> tuple[list[Shown], list[int]]:
+    """Show things to the memory in parallel; sorted, so that the order does not matter.
+
+    Returns what was found, and the things of which nothing was seen.
+    """
     items = to_be_shown(things, known, rng)
     found = dict[tuple[int, int], list[Shown]]()
 
@@ -691,7 +773,9 @@ def _shown(
 
     if items:
         work.track(watched(), len(items), "things shown")
-    return [one for item in sorted(found) for one in found[item]]
+    shown = [one for item in sorted(found) for one in found[item]]
+    unseen = {thing for thing, _ in items} - {one.thing for one in shown}
+    return shown, sorted(unseen)
 
 
 def _with_verification(
@@ -731,7 +815,7 @@ def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
 
     ``label`` is the class of each thing.
     """
-    poses = [len(arrays["views"]) for _, arrays in taught]
+    poses = [len(arrays["rotations"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
     stacked = {
         name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING
@@ -741,12 +825,15 @@ def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
         name: np.concatenate([arrays[name] for _, arrays in taught])
         for name in ("views", "rotations")
     }
-    fit = fit_memory(
-        joint["views"],
-        thing,
-        label,
-        *(stacked[name] for name in PER_THING[:3]),
-    )
+    if joint["views"].shape[-1]:
+        fit = fit_memory(
+            joint["views"],
+            thing,
+            label,
+            *(stacked[name] for name in PER_THING[:3]),
+        )
+    else:
+        fit = fit_without_features(int(label.max()) + 1)
     surfaces = StoredSurfaces.of(
         [_surface_of(source, arrays) for source, arrays in taught]
     )
@@ -789,6 +876,7 @@ def _card(
             int(count),
             _symmetries_of(arrays, SYMMETRIES),
             _symmetries_of(arrays, NEAR_SYMMETRIES),
+            bool(arrays[UPRIGHT][0]),
         )
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
@@ -806,7 +894,7 @@ def _card(
         "0" * 64,
         network="memory of views",
         classes=classes,
-        azimuth_bins=AZIMUTHS,
+        azimuth_bins=AZIMUTHS if memory.has_features else 0,
         calibration=Calibration(
             1.0,
             1.0,
@@ -816,15 +904,10 @@ def _card(
         ),
         size=size_evidence(memory.radii, label),
         training=Training(f"{len(taught)} things", commands=commands),
-        scores={
-            "held-out views": {
-                str(k): round(a, 4)
-                for k, a in zip(VIEWS_FITTED, fit.accuracy, strict=True)
-            }
-        },
+        scores={"held-out views": _by_views(fit.accuracy)} if fit.accuracy else {},
         memory=Taught(
             things,
-            features.sha256,
+            features.sha256 if memory.has_features else None,
             fit.weight,
             novelty=novelty,
             usual=usual,
@@ -872,8 +955,21 @@ def _holds_views(file: Path) -> bool:
         return False
 
 
-def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
-    """What there is to know of what was learned, a sentence each."""
+def _unseen(taught: Sequence[Pair], verified: VerifiedFit | None) -> set[str]:
+    """Names of the things of which the sensor sees nothing."""
+    of_features = {
+        source.name
+        for source, arrays in taught
+        if arrays["held_out"].size and not arrays["held_out"].any()
+    }
+    return of_features if verified is None else of_features | set(verified.unseen)
+
+
+def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
+    """What there is to know of what was learned, a sentence each.
+
+    The sensor sees nothing of the things that are called ``unseen``.
+    """
     names = [source.name for source, _ in taught]
     notes = []
     if len(taught) == 1:
@@ -900,11 +996,11 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
             f"{source.name}: {doubt}"
             for doubt in doubts.tobytes().decode().splitlines()
         )
-    for source, arrays in taught:
-        if not arrays["held_out"].any():
-            notes.append(
-                f"{source.name}: the sensor sees nothing of it; is it in another unit?"
-            )
+    notes += [
+        f"{name}: the sensor sees nothing of it; is it in another unit?"
+        for name in names
+        if name in unseen
+    ]
     unknown = [
         source.name for source, arrays in taught if not np.isfinite(arrays["radii"])
     ]

@@ -31,6 +31,8 @@ NO_LIKENESS = -1e3
 class Fit:
     """What was fitted to a memory, with the accuracy on held-out views.
 
+    Without features there is nothing to fit, and the last four are empty.
+
     Attributes:
         weight: of the similarity of a view to what is remembered.
         correlation: of the evidence of two views.
@@ -43,7 +45,7 @@ class Fit:
     """
 
     weight: float
-    correlation: float
+    correlation: float | None
     head: Floats
     head_bias: Floats
     quantiles: Floats
@@ -141,6 +143,21 @@ def fit_memory(
         usual,
         accuracy,
         confused,
+    )
+
+
+def fit_without_features(classes: int) -> Fit:
+    """What a memory of so many classes without features has in the place of what is fitted."""
+    nothing = np.zeros(0)
+    return Fit(
+        1.0,
+        None,
+        np.zeros((0, classes), np.float32),
+        np.zeros(classes, np.float32),
+        quantiles=nothing,
+        usual=nothing,
+        accuracy=(),
+        confused=(),
     )
 
 

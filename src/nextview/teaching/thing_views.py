@@ -1,4 +1,4 @@
-"""Render a thing from everywhere, clean and through a sensor, and compute its features."""
+"""Look at one thing: its surface and symmetries, and the features of its views where they count."""
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,7 +59,8 @@ SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape
 )
 # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 LEFT_OUT = "left_out"
-# of a thing's arrays: the share of its throws that end in poses that are not taught, (1,) float64
+# of a thing's arrays: whether it is known only as it stands, (1,) bool
+UPRIGHT = "upright"
 # of a thing's arrays: its surface, if its size is known
 VERTICES = "vertices"
 FACES = "faces"
@@ -125,7 +126,13 @@ class TeachingOptions:
         one_of(self.turntable, (None, "ccw", "cw"), "the way that the turntable turned")
 
 
-def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arrays:
+def teach(
+    path: Path,
+    name: str,
+    how: TeachingOptions,
+    threads: int = 1,
+    features: bool = True,
+) -> Arrays:
     """Look at one thing, and note what is to be remembered of it.
 
     Args:
@@ -133,6 +140,7 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         name: of the thing; with the seed it decides all random draws.
         how: how it is looked at.
         threads: that work side by side.
+        features: whether the features of its views are remembered even if its geometry is known.
 
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
@@ -143,12 +151,63 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
     Raises:
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
-    rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     if path.is_dir() or is_bag(path):
-        return _of_capture(_captured(path, how), name)
+        return _of_capture(_captured(path, how), name, features)
+
     mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
-    rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
-    lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
+    rotations = np.eye(3)[None]
+    views = without_features(len(rotations))
+    if features or mesh.metres is None:
+        rotations = rotations if how.upright else resting_poses(mesh)
+        lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
+        views = features_of(lying, name, how, threads)
+
+    to_mesh = Y_UP if is_y_up(path, how.up) else np.eye(3)
+    return {
+        **views,
+        UPRIGHT: np.array([how.upright]),
+        "rotations": (rotations @ to_mesh).astype(np.float32),
+        "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
+        "doubts": np.frombuffer(
+            "\n".join([*mesh_warnings(mesh), *_flatness(mesh, how.upright)]).encode(),
+            np.uint8,
+        ),
+        "pictures": _picture(
+            SimulatedCamera(mesh, 64).observe(
+                look_at_origin(np.radians(25), np.radians(35))
+            )
+        ),
+        **_surface(mesh, to_mesh),
+    }
+
+
+def without_features(poses: int) -> Arrays:
+    """The arrays of a thing in so many resting poses of which no views are remembered."""
+    return {
+        "views": np.zeros((poses, len(RINGS), AZIMUTHS, 0), np.float16),
+        "held_out": np.zeros((0, 0), np.float16),
+        "held_out_views": np.zeros((0, 2), np.float32),
+    }
+
+
+def features_of(
+    lying: Sequence[Mesh],
+    name: str,
+    how: TeachingOptions,
+    threads: int = 1,
+) -> Arrays:
+    """Render a thing in its resting poses, and compute the features of its views.
+
+    Args:
+        lying: the mesh in each of them.
+        name: of the thing; with the seed it decides all random draws.
+        how: how it is looked at.
+        threads: that work side by side.
+
+    Returns:
+        The arrays views, held_out and held_out_views of ``things.memory.Memory``.
+    """
+    rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     directions = (
         np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)),
         rng.uniform(0, 2 * np.pi, HELD_OUT),
@@ -168,31 +227,21 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
         shown = np.concatenate(list(held_out))
-    to_mesh = Y_UP if is_y_up(path, how.up) else np.eye(3)
     return {
         "views": np.stack(around).astype(np.float16),
-        "rotations": (rotations @ to_mesh).astype(np.float32),
         "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
-        "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
-        "doubts": np.frombuffer(
-            "\n".join([*mesh_warnings(mesh), *_flatness(lying)]).encode(),
-            np.uint8,
-        ),
-        "pictures": _picture(
-            SimulatedCamera(mesh, 64).observe(
-                look_at_origin(np.radians(25), np.radians(35))
-            )
-        ),
-        **_surface(mesh, to_mesh),
     }
 
 
-def _flatness(lying: Sequence[Mesh]) -> Iterator[str]:
+def _flatness(mesh: Mesh, upright: bool) -> Iterator[str]:
     """A sentence where a thing can lie so flat that depth does not show it."""
-    if lying[0].metres is None:
+    if mesh.metres is None:
         return
-    height = min(float(np.ptp(mesh.vertices[:, 2])) * mesh.radius for mesh in lying)
+    down = np.linalg.eigh(np.cov(mesh.vertices.T))[1][:, 0]  # lies on its flattest side
+    if upright:
+        down = np.array([0.0, 0.0, 1.0])
+    height = float(np.ptp(mesh.vertices @ down)) * mesh.radius
     if height < LOWEST_TOP:
         yield (
             f"it is {1000 * height:.2g} mm high where it lies flat, and on a table nothing lower"
@@ -298,10 +347,8 @@ def _seen(camera: Camera, poses: Float) -> Float32:
     return embeddings([camera.observe(pose) for pose in poses])
 
 
-def _of_capture(capture: Capture, name: str) -> Arrays:
-    """Return what captured frames show, for each cell of the grid by its nearest frame.
-
-    Every fourth frame is held out.
+def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
+    """Return what captured frames show: the surface, and the features of the views if they count.
 
     Its surface, and its resting pose, are in the frame of the world in which it was captured.
     """
@@ -311,6 +358,28 @@ def _of_capture(capture: Capture, name: str) -> Arrays:
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")
 
+    found = camera.object.object_frame
+    surface = fuse(camera.object.sightings, found.radius, name)
+    views = without_features(1)
+    if features or surface is None:
+        views = _features_captured(seen)
+
+    return {
+        **views,
+        UPRIGHT: np.array([True]),
+        "rotations": found.axes[None].astype(np.float32),
+        "radii": np.array([found.radius], np.float32),
+        "pictures": _picture(seen[0]),
+        **({} if surface is None else of_surface(surface)),
+        **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
+    }
+
+
+def _features_captured(seen: list[Observation]) -> Arrays:
+    """Features of captured views, for each cell of the grid those of the nearest one.
+
+    Every fourth view is held out.
+    """
     directions = np.stack([direction_of(view.pose) for view in seen])
     each = embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
@@ -324,19 +393,10 @@ def _of_capture(capture: Capture, name: str) -> Arrays:
         [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])],
         1,
     )
-
-    found = camera.object.object_frame
-    surface = fuse(camera.object.sightings, found.radius, name)
-
     return {
         "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),
-        "rotations": found.axes[None].astype(np.float32),
         "held_out": each[held_out].astype(np.float16),
         "held_out_views": angles[held_out].astype(np.float32),
-        "radii": np.array([found.radius], np.float32),
-        "pictures": _picture(seen[0]),
-        **({} if surface is None else of_surface(surface)),
-        **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
     }
 
 

@@ -29,8 +29,8 @@ from nextview.types import Float, Index
 VIEWS_VERIFIED = (1, 2, 3)  # after so many views things are judged
 SHOWING_VIEWS_TRIED = 6  # views that are taken at most, until so many show the thing
 MOST_THINGS_VERIFIED = 150  # that are shown: a drawn part of more
-EPISODES_PER_THING = 2  # for each of many things
-ENOUGH_EPISODES = 16  # for each of few things as if all of them had so many together
+EPISODES_PER_THING = 1  # for each of many things
+ENOUGH_EPISODES = 40  # for each of few things as if all of them had so many together
 GROWTH = 2  # weights are fitted anew when there are so many times as many things
 # things that the default weights count for, beside those that others are fitted to
 DEFAULT_THINGS = 10.0
@@ -73,6 +73,7 @@ class VerifiedFit:
         confused: pairs of a class and the one that it was named, with the share of its cases, after
             two views.
         things: how many were shown.
+        unseen: names of those of which no view showed enough to be recognised.
     """
 
     verification: Verification
@@ -80,6 +81,7 @@ class VerifiedFit:
     by_outline: tuple[float, ...] = ()
     confused: tuple[tuple[int, int, float], ...] = ()
     things: int = 0
+    unseen: tuple[str, ...] = ()
 
 
 def to_be_shown(
@@ -179,8 +181,8 @@ def _views(
 ) -> list[Observation]:
     """Some random views of a thing that show it.
 
-    It lies as it falls, in any stable pose by its share of the throws; if it was taught in one
-    pose alone, in that one.
+    It lies as it falls, in any stable pose by its share of the throws; what is known only as it
+    stands, stands.
     """
     surface = known.verifier.caster.surfaces[thing]
     mesh = make_mesh(
@@ -189,9 +191,9 @@ def _views(
         surface.name,
         "m",
     )
-    lies = known.lies(thing)
+    lies = known.standing(thing)[None]
     shares = np.ones(1)
-    if len(lies) > 1:
+    if not known.upright[thing]:
         stable = stable_poses(mesh)
         lies = stable.rotations
         shares = stable.shares

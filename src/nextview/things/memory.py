@@ -1,6 +1,7 @@
 """The memory of taught things: what each looks like, and how likely a view is given each."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from safetensors.numpy import save
 from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
+from nextview.geometry.observation import Observation
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, NetworkRecogniser
 from nextview.recognition.model_card import FEATURE_NETWORK, ModelCard, find_card
@@ -34,6 +36,9 @@ LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no numb
 @dataclass(frozen=True)
 class Memory:
     """What T things look like, each in one or more resting poses: H of these, sorted by class.
+
+    Things whose geometry is known, each of a class of its own, are recognised by it alone: their
+    memory holds no embeddings, and F and K are 0.
 
     Attributes:
         views: Embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where
@@ -66,6 +71,11 @@ class Memory:
         self._check_shapes()
         self._check_values()
 
+    @property
+    def has_features(self) -> bool:
+        """Whether it holds embeddings of views."""
+        return self.views.shape[-1] > 0
+
     def _check_shapes(self) -> None:
         """See that all arrays are finite numbers of the right kinds, and that their shapes fit."""
         check_array("its thing", self.thing, np.integer, (None,))
@@ -78,12 +88,21 @@ class Memory:
             self.views,
             np.floating,
             (poses, len(RINGS), AZIMUTHS, None),
+            empty=True,
         )
         size = self.views.shape[-1]
         check_array("its rotations", self.rotations, np.floating, (poses, 3, 3))
 
-        check_array("its held_out", self.held_out, np.floating, (things, None, size))
+        check_array(
+            "its held_out",
+            self.held_out,
+            np.floating,
+            (things, None, size),
+            empty=True,
+        )
         held_out = self.held_out.shape[1]
+        if (held_out > 0) != self.has_features:
+            raise ModelError("its held_out are of other features than its views")
         check_array(
             "its held_out_views",
             self.held_out_views,
@@ -149,7 +168,12 @@ class Memory:
         if not turned:
             raise ModelError("its rotations are no rotations")
 
-        if np.abs(self.held_out_views[..., 0]).max() > np.pi / 2 + ROUNDED:
+        if not self.has_features and not (self.surfaces.counts[:, 0] > 0).all():
+            raise ModelError(
+                "it holds neither views nor the surface of one of its things"
+            )
+
+        if (np.abs(self.held_out_views[..., 0]) > np.pi / 2 + ROUNDED).any():
             raise ModelError("its held_out_views have elevations beyond 90 degrees")
 
     def save(self, path: Path, overwrite: bool = False) -> str:
@@ -245,7 +269,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
         raise ModelError(f"{card.card_path}: is no memory of things")
 
     features = find_card(FEATURE_NETWORK)
-    if card.memory.features_sha256 != features.sha256:
+    if card.memory.features_sha256 not in (None, features.sha256):
         raise ModelError(
             f"{card.card_path}: was taught with other features; teach it again with nextview learn"
         )
@@ -253,12 +277,19 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
         raise ModelError(
             f"{card.card_path}: takes other inputs than the features that it was taught with"
         )
-    if card.azimuth_bins != AZIMUTHS:
+    has_features = card.memory.features_sha256 is not None
+    bins = AZIMUTHS if has_features else 0
+    if card.azimuth_bins != bins:
         raise ModelError(
-            f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {AZIMUTHS}"
+            f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {bins}"
         )
 
     memory = read_memory(card.path, card.sha256)
+    if memory.has_features != has_features:
+        holds = "holds" if memory.has_features else "holds no"
+        raise ModelError(
+            f"{card.path}: {holds} features, and its card, {card.card_path}, says otherwise"
+        )
     if memory.thing.tolist() != list(card.memory.poses):
         raise ModelError(
             f"{card.path}: its resting poses are not those of the things on its card,"
@@ -273,7 +304,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
 
 
 def check_features(card: ModelCard, memory: Memory, size: int) -> None:
-    """Check that the embeddings of a memory have the size of the features.
+    """Check that the embeddings of a memory, if it holds any, have the size of the features.
 
     Args:
         card: of the memory, for messages.
@@ -283,7 +314,7 @@ def check_features(card: ModelCard, memory: Memory, size: int) -> None:
     Raises:
         ModelError: they have another size.
     """
-    if memory.views.shape[-1] != size:
+    if memory.has_features and memory.views.shape[-1] != size:
         raise ModelError(
             f"{card.path}: its views have {memory.views.shape[-1]} features, not {size}"
         )
@@ -334,10 +365,14 @@ class TaughtRecogniser(NetworkRecogniser):
         self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
 
-        self._features = Features(threads)
-        check_features(self.card, self.memory, self._features.size)
-        self._views = by_ring(self.memory.views)
-        self._nearest = NearestViews(self._views) if is_large(self._views) else None
+        self._features: Features | None = None
+        self._nearest: NearestViews | None = None
+        if self.memory.has_features:
+            self._features = Features(threads)
+            check_features(self.card, self.memory, self._features.size)
+            self._views = by_ring(self.memory.views)
+            if is_large(self._views):
+                self._nearest = NearestViews(self._views)
 
         about = self.card.memory
         assert about is not None
@@ -352,6 +387,12 @@ class TaughtRecogniser(NetworkRecogniser):
                 usual=usual,
             )
 
+    def by_shape(self, observations: Sequence[Observation]) -> Evidence:
+        """Return the evidence of B views by what is remembered of others; even without features."""
+        if self._features is None:
+            return self._even(len(observations))
+        return super().by_shape(observations)
+
     def from_inputs(
         self,
         inputs: NDArray[Any],
@@ -364,14 +405,20 @@ class TaughtRecogniser(NetworkRecogniser):
             elevations: Of the cameras, radians, (B,).
 
         Returns:
-            Their evidence.
+            Their evidence; even if the memory holds no features.
 
         Raises:
             ModelError: the elevations are missing.
         """
+        if self._features is None:
+            return self._even(len(inputs))
         if elevations is None:
             raise ModelError("a memory of things needs the elevations of the views")
         return self.evidence(self._features(inputs), elevations)
+
+    def _even(self, count: int) -> Evidence:
+        """Evidence of views that speaks for nothing."""
+        return Evidence(np.zeros((count, len(self.classes)), np.float32))
 
     def evidence(self, embeddings: Floats, elevations: Floats) -> Evidence:
         """Return the evidence of views by their embeddings.
@@ -391,10 +438,6 @@ class TaughtRecogniser(NetworkRecogniser):
             alike = alike.reshape(len(embeddings), -1, AZIMUTHS)
         logits = embeddings @ self.memory.head + self.memory.head_bias
         return Evidence(logits, azimuth_bins=self.card.memory.weight * alike)
-
-    def features(self, inputs: NDArray[Any]) -> Float32:
-        """The embeddings of views, (B, F)."""
-        return self._features(inputs)
 
 
 def by_ring(views: Floats) -> Float32:

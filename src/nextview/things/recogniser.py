@@ -111,36 +111,42 @@ class VerifiedRecogniser(TaughtRecogniser):
         classes = len(self.classes)
         alone = self.calibration.belief(total, counted, classes)
         if any(observation.radius is None for observation in observations):
-            return JointBelief(alone, why_no_pose=NO_SCALE)
+            return self._unexplained(alone, NO_SCALE)
 
-        joint = self.calibration.joint(total, counted, classes, np.zeros(()))
-        of_hypotheses = joint.sum(1)
-        share = float(of_hypotheses[self.things.rows].sum())
-        if share <= 0:
-            return JointBelief(alone, why_no_pose=self._no_geometry(alone))
+        of_things = None  # by features and size
+        others = np.zeros(classes)
+        if self.memory.has_features:
+            joint = self.calibration.joint(total, counted, classes, np.zeros(()))
+            of_hypotheses = joint.sum(1)
+            of_things = self.things.of_things(of_hypotheses)
+            of_hypotheses[self.things.rows] = 0
+            np.add.at(others, list(self.calibration.hypotheses), of_hypotheses)
+            if of_things.sum() <= 0:
+                return self._unexplained(alone, self._no_geometry(alone))
         try:
-            found = self.things.judge(observations, joint)
+            found = self.things.judge(observations, of_things)
         except ObservationError as error:
-            return JointBelief(alone, why_no_pose=str(error))
-        return self._believed(observations, found, of_hypotheses, share)
+            return self._unexplained(alone, str(error))
+        return self._believed(observations, found, others)
+
+    def _unexplained(self, belief: Float, why: str) -> JointBelief:
+        """A belief by features and size, which is not confident where there are no features."""
+        doubt = "" if self.memory.has_features else why
+        return JointBelief(belief, why_no_pose=why, doubt=doubt)
 
     def _believed(
         self,
         observations: Sequence[Observation],
         found: Verified,
-        of_hypotheses: Float,
-        share: float,
+        others: Float,
     ) -> JointBelief:
         """The belief in classes that follows from that in things.
 
         Geometry decides among the things whose surfaces are known. What features and size believe
-        of all others stays.
+        of all others, (classes,), stays.
         """
-        others = of_hypotheses.copy()
-        others[self.things.rows] = 0
-        belief = np.zeros(len(self.classes))
-        np.add.at(belief, list(self.calibration.hypotheses), others)
-        np.add.at(belief, self.labels, share * found.belief)
+        belief = others.copy()
+        np.add.at(belief, self.labels, (1 - others.sum()) * found.belief)
         belief /= belief.sum()
 
         best = int(belief.argmax())

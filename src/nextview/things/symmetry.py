@@ -9,8 +9,10 @@ workshops 2020) allows the larger of 15 mm and a tenth of the diameter everywher
 tolerance of people who look at pictures; a depth camera sees the holes of a flange.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -38,22 +40,30 @@ MOVED_SHARE = 0.0075  # hardly any: the walls of a keyway are twice as much of a
 # the same of near symmetries, after which a part of a thing is elsewhere
 NEAR_MEDIAN = 0.025
 NEAR_SHARE = 0.15
+MEDIAN_BOUNDS = {"same": SAME_MEDIAN, "nearly": NEAR_MEDIAN}
+BESIDE_BOUNDS = {"same": USUAL_SHARE, "nearly": NEAR_SHARE}
 HIGHEST_ORDER = 40  # of a symmetry: as many teeth as a gear has
-# powers of primes up to that
+# powers of primes up to the highest order
 POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
 # of a full turn, that are tried for a symmetry of any angle
 ANY_TURNS = np.arange(23, 0, -2) / 48
 # of the surface: what is near is looked for among the triangles that they are on
 SAMPLE_POINTS = 20_000
+COARSE_POINTS = 4000  # of these, to which a turned copy is fitted
 COPIED_POINTS = 3000  # of its turned copy
 GUESSED_POINTS = 400  # of it, that show quickly that a turn is no symmetry
 # of these, that lie near the surface however badly the axis is known
 GUESSED_SHARE = 0.9
 GUESSED_DISTANCE = 0.06  # of the diameter, that is near
+# times the bounds of a symmetry, from which the guessed points decide that it is none
+CLEARLY_BESIDE = 1.5
 NEAREST_TRIANGLES = 4  # among which the nearest one is looked for
 FITTED_STEPS = 5  # in which a turned copy is moved to where it fits
+REFINED_STEPS = 2  # the same of one whose few points were moved there already
 # share of the weights that holds a tilt of which the surface says nothing
 FREE_TILT = 1e-3
+# of a full turn: far from what a symmetry of order 2, 3 or 4 takes back to itself
+TELLING_TURN = 0.37
 LEAST_APART = 1e-9  # metres
 SEEN_FROM = 48  # directions from one of which a point has to be seen to count
 ABOVE = 1e-3  # of the diameter, that it is seen from above the surface
@@ -77,8 +87,8 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     Returns:
         Its symmetries: first those of any angle, then the others by their order.
     """
-    compared = _Compared(surface)
-    found = _found(compared, surface, "same")
+    compared = _compared(surface)
+    found = _found(compared, "same")
     if _is_ball([axis for axis, order in found if order == 0]):
         return tuple(_symmetry(axis, 0) for axis in np.eye(3))
     symmetries = _distinct(found)
@@ -98,7 +108,10 @@ def find_near_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     Returns:
         Axes and orders as those of symmetries, which are among them.
     """
-    return tuple(_distinct(_found(_Compared(surface), surface, "nearly")))
+    return tuple(_distinct(_found(_compared(surface), "nearly")))
+
+
+Kind = Literal["same", "nearly"]  # hardly any, or little, of the surface lies beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +120,35 @@ class _Turned:
 
     Attributes:
         median: distance of the points of the copy from the surface, metres.
-        same: whether hardly any of it lies beside.
-        nearly: whether little of it lies beside.
+        fits: whether the turn is a symmetry of the kind that was looked for.
         axis: about which it was turned, corrected to where it fits best, (3,).
     """
 
     median: float
-    same: bool
-    nearly: bool
+    fits: bool
     axis: Float
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess:
+    """A turned copy of few points, moved to where it fits best.
+
+    Attributes:
+        rotation: of the copy; None where it lies beside however it is tilted.
+        median: distance of the points from the surface, of the diameter.
+        beside: share of the points that lie farther from it than is usual.
+    """
+
+    rotation: Rotation | None
+    median: float
+    beside: float
 
 
 class _Compared:
     """What can be seen of a surface, which its turned copies are compared with.
 
-    Its centroid is the origin.
+    Its centroid is the origin. Comparisons are kept: orders share turns, and exact and near
+    symmetries share guesses.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -143,64 +170,97 @@ class _Compared:
         self._points = self._points[seen]
         self._normals = self._normals[seen]
         self._tree = cKDTree(self._points)
+        self._coarse = cKDTree(self._points[:COARSE_POINTS])
+        self.axes = _axes(surface)
+        self._known = dict[tuple[bytes, float], _Guess]()
+        self._exactly = dict[tuple[bytes, float], tuple[Float, Float]]()
 
     def _seen(self, surface: Surface) -> Mask:
         """Which of the points a camera can see from outside, (N,): not faces inside of a solid."""
         scene = embree_scene(
             [(self._corners.reshape(-1, 3), _each_on_its_own(surface))]
         )
-        seen = np.zeros(len(self._points), bool)
         above = ABOVE * self.diameter * self._normals
+        left = np.arange(len(self._points))  # not seen so far
+
         for direction in spread_directions(SEEN_FROM):
-            side = np.sign(self._normals @ direction)[:, None]
+            side = np.sign(self._normals[left] @ direction)[:, None]
             hidden = scene.run(
-                (self._points + side * above).astype(np.float32),
-                np.tile(direction.astype(np.float32), (len(self._points), 1)),
+                (self._points[left] + side * above[left]).astype(np.float32),
+                np.tile(direction.astype(np.float32), (len(left), 1)),
                 output=1,
             )["primID"]
-            seen |= hidden < 0
+            left = left[hidden >= 0]
+            if not len(left):
+                break
+
+        seen = np.ones(len(self._points), bool)
+        seen[left] = False
         return seen if seen.any() else ~seen
 
-    def turned(self, axis: Float, turn: float) -> _Turned:
+    def turned(self, axis: Float, turn: float, kind: Kind) -> _Turned:
         """Compare with the copy that is turned about an axis by a part of a full turn."""
-        rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
-        guess = self._tree.query(rotation.apply(self._points[:GUESSED_POINTS]))[0]
-        if np.quantile(guess, GUESSED_SHARE) > GUESSED_DISTANCE * self.diameter:
-            return _Turned(float(np.median(guess)), False, False, axis)
+        key = (axis.tobytes(), turn)
+        if key not in self._known:
+            self._known[key] = self._guessed(axis, turn)
+        guess = self._known[key]
 
-        rotation = self._fitted(rotation, axis)
-        distances = self._distances(rotation.apply(self._points[:COPIED_POINTS]))
-        distances /= self.diameter
+        beside = max(
+            guess.median / MEDIAN_BOUNDS[kind],
+            guess.beside / BESIDE_BOUNDS[kind],
+        )
+        if guess.rotation is None or beside > CLEARLY_BESIDE:
+            return _Turned(guess.median * self.diameter, False, axis)
+        if kind == "nearly" and beside * CLEARLY_BESIDE < 1:
+            return _Turned(guess.median * self.diameter, True, _axis_of(guess.rotation))
+
+        if key not in self._exactly:
+            some = self._points[: COPIED_POINTS // 3]
+            rotation = self._fitted(guess.rotation, axis, some, REFINED_STEPS)
+            copied = rotation.apply(self._points[:COPIED_POINTS])
+            self._exactly[key] = _axis_of(rotation), self._distances(copied)
+        fitted, distances = self._exactly[key]
         median = float(np.median(distances))
-        usual = SYMMETRY_TOLERANCE + USUAL_ERRORS * median
-        local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
-        beside = float((distances > usual).mean())
-        same = (
-            median < SAME_MEDIAN
-            and beside < USUAL_SHARE
-            and (distances > local).mean() < MOVED_SHARE
+        fits = (
+            median < MEDIAN_BOUNDS[kind]
+            and _beside(distances, median) < BESIDE_BOUNDS[kind]
         )
-        nearly = median < NEAR_MEDIAN and beside < NEAR_SHARE
-        vector = rotation.as_rotvec()
-        return _Turned(
-            median * self.diameter,
-            bool(same),
-            nearly,
-            vector / np.linalg.norm(vector),
-        )
+        if kind == "same":
+            local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
+            fits = fits and bool((distances > local).mean() < MOVED_SHARE)
+        return _Turned(median * self.diameter, fits, fitted)
 
-    def _fitted(self, rotation: Rotation, axis: Float) -> Rotation:
+    def _guessed(self, axis: Float, turn: float) -> _Guess:
+        """Turn few points about an axis, and tilt them to where they fit."""
+        rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
+        few = self._points[:GUESSED_POINTS]
+        apart = self._coarse.query(rotation.apply(few))[0] / self.diameter
+        if np.quantile(apart, GUESSED_SHARE) > GUESSED_DISTANCE:
+            return _Guess(None, float(np.median(apart)), 1.0)
+
+        rotation = self._fitted(rotation, axis, few)
+        distances = self._distances(rotation.apply(few))
+        median = float(np.median(distances))
+        return _Guess(rotation, median, _beside(distances, median))
+
+    def _fitted(
+        self,
+        rotation: Rotation,
+        axis: Float,
+        points: Float,
+        steps: int = FITTED_STEPS,
+    ) -> Rotation:
         """Tilt a turned copy to where it fits best, without turning it farther about the axis.
 
-        Point to plane, by the nearest sampled points; what lies beside hardly counts.
+        Point to plane, from some points, (N, 3), to the nearest sampled ones; what lies beside
+        hardly counts.
         """
-        points = self._points[: COPIED_POINTS // 3]
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
         across = np.stack([first, np.cross(axis, first)])
-        for _ in range(FITTED_STEPS):
+        for _ in range(steps):
             copy = rotation.apply(points)
-            apart, nearest = self._tree.query(copy)
+            apart, nearest = self._coarse.query(copy)
             normals = self._normals[nearest]
             along = np.einsum("ni,ni->n", self._points[nearest] - copy, normals)
             weights = np.asarray(
@@ -215,10 +275,27 @@ class _Compared:
         return rotation
 
     def _distances(self, points: Float) -> Float:
-        """Distances of points from the surface, (N,), metres."""
+        """Distances of points from the surface, (N,), of the diameter."""
         nearest = self._tree.query(points, k=NEAREST_TRIANGLES)[1]
         corners = self._corners[self._triangles[nearest]]
-        return _from_triangles(points[:, None], corners).min(1)
+        return _from_triangles(points[:, None], corners).min(1) / self.diameter
+
+
+@lru_cache(maxsize=1)
+def _compared(surface: Surface) -> _Compared:
+    """A surface, ready to be compared with its turned copies; the last one is kept."""
+    return _Compared(surface)
+
+
+def _beside(distances: Float, median: float) -> float:
+    """Share of distances that are larger than is usual, all of the diameter."""
+    return float((distances > SYMMETRY_TOLERANCE + USUAL_ERRORS * median).mean())
+
+
+def _axis_of(rotation: Rotation) -> Float:
+    """The axis of a rotation, (3,)."""
+    vector = rotation.as_rotvec()
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _each_on_its_own(surface: Surface) -> NDArray[np.int32]:
@@ -256,10 +333,10 @@ def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
     first /= np.linalg.norm(first)
     angles = np.arange(0, np.pi, STEP_ACROSS)[:, None]
     across = np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
-    turned = [compared.turned(direction, 0.5) for direction in across]
+    turned = [compared.turned(direction, 0.5, "same") for direction in across]
 
-    best = min(turned, key=lambda one: (not one.same, one.median))
-    return [_symmetry(best.axis, 2)] if best.same else []
+    best = min(turned, key=lambda one: (not one.fits, one.median))
+    return [_symmetry(best.axis, 2)] if best.fits else []
 
 
 def _is_ball(axes: Sequence[Float]) -> bool:
@@ -269,12 +346,11 @@ def _is_ball(axes: Sequence[Float]) -> bool:
 
 def _found(
     compared: _Compared,
-    surface: Surface,
-    kind: Literal["same", "nearly"],
+    kind: Kind,
 ) -> list[tuple[Float, int]]:
     """Axes and orders of a kind of symmetry: any angle first, then high orders, then exact ones."""
     found = []
-    for axis in _axes(surface):
+    for axis in compared.axes:
         order, deviation, fitted = _order(compared, axis, kind)
         if order != 1:
             found.append((order, deviation, fitted))
@@ -322,53 +398,68 @@ def _box_axes(surface: Surface) -> Float:
 def _order(
     compared: _Compared,
     axis: Float,
-    kind: Literal["same", "nearly"],
+    kind: Kind,
 ) -> tuple[int, float, Float]:
     """The highest order of a symmetry about an axis, how exact it is, metres, and the axis.
 
     The order is 0 for any angle, and 1 for none.
     """
-    worst = _all_same(compared, axis, ANY_TURNS, kind)
+    largest = compared.turned(axis, float(ANY_TURNS[0]), kind)
+    worst = _worst(compared, largest.axis, ANY_TURNS, kind) if largest.fits else None
     if worst is not None:
-        return 0, worst.median, worst.axis
+        return 0, worst, largest.axis
 
-    # Turns by 1/4 and 1/3 of a full one make one by 1/12: powers of primes are tried, and of what
-    # they make up the highest order first.
-    finest = {
-        power: getattr(compared.turned(axis, 1 / power), kind) for power in POWERS
-    }
-    for order in range(HIGHEST_ORDER, 1, -1):
-        if not all(same for power, same in finest.items() if _part(power, order)):
-            continue
+    # Turns by 1/4 and 1/3 of a full one make one by 1/12: powers of primes are tried, and what they
+    # make up.
+    tried = {power: compared.turned(axis, _telling(power), kind) for power in POWERS}
+    possible = {power: turned for power, turned in tried.items() if turned.fits}
+    if not possible:
+        return 1, np.inf, axis
+    fitted = min(possible.values(), key=lambda turned: turned.median).axis
+    for order in _orders(math.lcm(*possible)):
         # A turn back is as good as one forth.
-        worst = _all_same(compared, axis, np.arange(order // 2, 0, -1) / order, kind)
+        turns = _tellingly(np.arange(1, order // 2 + 1) / order)
+        worst = _worst(compared, fitted, turns, kind)
         if worst is not None:
-            return order, worst.median, worst.axis
+            return order, worst, fitted
     return 1, np.inf, axis
 
 
-def _part(power: int, order: int) -> bool:
-    """Whether a power of a prime is one of the factors of an order that have no part in common."""
-    return order % power == 0 and np.gcd(power, order // power) == 1
+def _telling(order: int) -> float:
+    """The turn of an order, and of no lower one, that a lower one is the least likely to allow."""
+    steps = [step for step in range(1, order) if np.gcd(step, order) == 1]
+    return float(_tellingly(np.array(steps) / order)[0])
 
 
-def _all_same(
+def _tellingly(turns: Float) -> Float:
+    """Turns, (N,), in the order in which they are likely to show that there is no symmetry."""
+    return turns[np.abs(turns - TELLING_TURN).argsort(kind="stable")]
+
+
+def _orders(whole: int) -> Sequence[int]:
+    """Orders that may be the highest one, this first, where all symmetries together make up one.
+
+    What is round but for details, such as teeth, seems to have more than there can be.
+    """
+    if whole > HIGHEST_ORDER:
+        return range(HIGHEST_ORDER, 1, -1)
+    return [order for order in range(whole, 1, -1) if whole % order == 0]
+
+
+def _worst(
     compared: _Compared,
     axis: Float,
     turns: Float,
-    kind: Literal["same", "nearly"],
-) -> _Turned | None:
-    """The largest of some turns, with the worst median, where all are symmetries; else None."""
-    largest = compared.turned(axis, float(turns[0]))
-    if not getattr(largest, kind):
-        return None
-    worst = largest.median
-    for turn in turns[1:]:
-        other = compared.turned(largest.axis, float(turn))
-        if not getattr(other, kind):
+    kind: Kind,
+) -> float | None:
+    """The largest median distance of some turns, metres; None if one of them is no symmetry."""
+    worst = 0.0
+    for turn in turns.tolist():
+        turned = compared.turned(axis, turn, kind)
+        if not turned.fits:
             return None
-        worst = max(worst, other.median)
-    return _Turned(worst, largest.same, largest.nearly, largest.axis)
+        worst = max(worst, turned.median)
+    return worst
 
 
 def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:

@@ -33,6 +33,7 @@ class TaughtThings:
         residuals: how badly known things are explained, in the same order; None if that was not
             fitted.
         symmetries: of each thing, in the same order.
+        upright: whether each thing is known only as it stands, in the same order.
         any_orientation: whether they need not rest: all orientations are equally likely.
         rows: resting poses of the memory that are of these things, (R,) int64.
         owners: which of the things each of these is of, (R,) int64.
@@ -82,6 +83,7 @@ class TaughtThings:
         self.symmetries = tuple(
             about.things[known[name]].symmetries for name in self.names
         )
+        self.upright = tuple(about.things[known[name]].upright for name in self.names)
         self.verifier = Verifier(surfaces, weights)
         self.verifier.rivals = tuple(
             rival_turns(about.things[known[name]].near_symmetries)
@@ -142,15 +144,24 @@ class TaughtThings:
                 "no view shows the thing, so nothing can be recognised"
             )
         if not self.of_classes:
-            return self.verifier(seen, self.any_orientation)
+            return self.judge(seen)
         calibration = self.recogniser.calibration
         classes = len(self.recogniser.classes)
         total = self.log_evidence(seen).sum(0)
-        return self.judge(
-            seen, calibration.joint(total, len(seen), classes, np.zeros(()))
-        )
+        joint = calibration.joint(total, len(seen), classes, np.zeros(()))
+        return self.judge(seen, self.of_things(joint.sum(1)))
 
-    def judge(self, observations: Sequence[Observation], joint: Float) -> Verified:
+    def of_things(self, of_hypotheses: Float) -> Float:
+        """The belief in each thing, (T,), from that in each resting pose of the memory, (H,)."""
+        belief = np.zeros(len(self.names))
+        np.add.at(belief, self.owners, of_hypotheses[self.rows])
+        return belief
+
+    def judge(
+        self,
+        observations: Sequence[Observation],
+        by_features: Float | None = None,
+    ) -> Verified:
         """Recognise the thing that some views show, of which the features have been looked at.
 
         Features count where a class has several things: others of it differ from those that were
@@ -158,22 +169,20 @@ class TaughtThings:
 
         Args:
             observations: views that show one thing, all in one object frame.
-            joint: belief in each resting pose of the memory and azimuth bin by features and size,
-                (H, bins), see ``Calibration.joint``.
+            by_features: belief in each thing by features and size, (T,); None if there are none.
 
         Returns:
             The belief in each thing, and the poses.
         """
         prior = None
-        if self.of_classes:
-            of_things = np.zeros(len(self.names))
-            np.add.at(of_things, self.owners, joint[self.rows].sum(1))
-            prior = np.log(of_things / of_things.sum() + TINY)
+        if self.of_classes and by_features is not None:
+            prior = np.log(by_features / by_features.sum() + TINY)
         return self.verifier(observations, self.any_orientation, prior)
 
-    def lies(self, thing: int) -> Floats:
-        """Rotations of a thing into the resting poses that it was taught in, (P, 3, 3)."""
-        return self.recogniser.memory.rotations[self.rows[self.owners == thing]]
+    def standing(self, thing: int) -> Floats:
+        """Rotation of a thing from the axes of its file to how it stands there, (3, 3)."""
+        first = self.rows[self.owners == thing][0]
+        return self.recogniser.memory.rotations[first]
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
         """What features and size say of each view, (V, D): it can be summed over views."""

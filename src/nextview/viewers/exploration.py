@@ -175,11 +175,13 @@ class Walk:
     def rivals(self) -> Rivals | None:
         """The two most likely taught things, and their differences in each view.
 
-        None before the first view, and for models without a memory.
+        None before the first view, and for models that remember no views.
         """
         recogniser = self.session.models.recogniser
         seen = [view for view in self.views if view.observation.seen]
         if not isinstance(recogniser, TaughtRecogniser) or not seen:
+            return None
+        if not recogniser.memory.has_features:
             return None
 
         evidence = recogniser([view.observation for view in seen])
