@@ -134,6 +134,20 @@ def knobs_memory(shared, knobs) -> Path:
 
 
 @pytest.fixture(scope="session")
+def mixed_memory(shared, knobs_memory) -> Path:
+    """A memory of them and of a block of unknown size: with features, and with their geometry."""
+
+    def make(folder: Path) -> None:
+        shutil.copytree(knobs_memory, folder / "mine")
+        (folder / "unsized").mkdir()
+        block = pipeline.box((3, 2, 1), (0, 0, 0.5))
+        block.export(folder / "unsized" / "block.ply")
+        learn(folder / "unsized", folder / "mine", add=True, upright=True, workers=0)
+
+    return shared("mixed_memory", make) / "mine"
+
+
+@pytest.fixture(scope="session")
 def ycb():
     """The system that knows the bundled household things."""
     return nextview.load("ycb", threads=1)

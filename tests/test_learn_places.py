@@ -28,7 +28,7 @@ def looked_at(monkeypatch):
     """The names of things that were looked at: by random numbers, as a network takes longer."""
     names = []
 
-    def teach(path, name, how, threads):
+    def teach(path, name, how, threads, features):
         names.append(name)
         rng = np.random.default_rng([*name.encode()])
         return {
@@ -39,6 +39,7 @@ def looked_at(monkeypatch):
             "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
             "held_out_views": np.zeros((4, 2), np.float32),
             "radii": np.array([0.1], np.float32),
+            "upright": np.array([False]),
             "pictures": np.zeros((64, 64), np.uint8),
         }
 

@@ -39,9 +39,9 @@ ARRAYS = (*FLOATS, "thing", "pictures", "places", "faces", "counts")
 
 
 @pytest.fixture
-def models(knobs_memory, tmp_path):
-    """A copy of a memory of three things whose sizes are known."""
-    return shutil.copytree(knobs_memory, tmp_path / "mine")
+def models(mixed_memory, tmp_path):
+    """A copy of a memory of a thing of unknown size and three whose sizes are known."""
+    return shutil.copytree(mixed_memory, tmp_path / "mine")
 
 
 @pytest.fixture(scope="module")
@@ -241,8 +241,8 @@ def fewer_things(arrays):
     ("change", "sentence"),
     [
         (fewer_features, "its views have 255 features, not 256"),
-        (fewer_classes, "is of 2 classes, and its card of 3"),
-        (more_classes, "is of 4 classes, and its card of 3"),
+        (fewer_classes, "is of 3 classes, and its card of 4"),
+        (more_classes, "is of 5 classes, and its card of 4"),
         (fewer_things, "its resting poses are not those of the things on its card"),
     ],
 )
@@ -285,8 +285,8 @@ def set_at(path, value):
 
 VERIFIED = {
     "weights": {"geometry": 20.0},
-    "things": 3,
-    "usual": [0.1, 0.1, 0.2],
+    "things": 4,
+    "usual": [0.0, 0.1, 0.1, 0.2],
     "excess": [[-0.1, 0.2]],
 }
 REFUSED = {
@@ -369,7 +369,7 @@ REFUSED = {
     "half of the residuals": set_at("memory/verification", VERIFIED | {"excess": []}),
     "residuals of one thing less": set_at(
         "memory/verification",
-        VERIFIED | {"usual": [0.1, 0.2]},
+        VERIFIED | {"usual": [0.1, 0.1, 0.2]},
     ),
     "an unknown field": set_at("memory/things/0/colour", "red"),
 }
@@ -459,7 +459,7 @@ def test_any_other_field_is_refused_by_name_or_the_memory_works(
         assert np.isfinite(evidence.logits).all(), path
         assert np.isfinite(evidence.azimuth_bins).all(), path
         if recogniser.novelty is not None:
-            score = recogniser.novelty.of_belief(np.zeros(3), 1)
+            score = recogniser.novelty.of_belief(np.zeros(4), 1)
             assert 0 <= recogniser.novelty.of_views([score]) <= 1, path
     assert refused > 20
 
@@ -480,6 +480,47 @@ def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
         step = np.ptp(in_file, axis=0).max() / 65535
         np.testing.assert_allclose(surface.vertices, in_file, atol=step)
         np.testing.assert_array_equal(surface.faces, mesh.faces)
+
+
+def test_things_of_known_geometry_hold_no_features(knobs_memory):
+    card, memory = open_memory(knobs_memory / "memory.json")
+    assert card.memory.features_sha256 is None
+    assert not memory.has_features
+    assert memory.views.size == memory.held_out.size == 0
+
+
+def test_a_card_says_whether_there_are_features(knobs_memory, mixed_memory, tmp_path):
+    features = read_card(mixed_memory / "memory.json").memory.features_sha256
+    said = shutil.copytree(knobs_memory, tmp_path / "said")
+    set_features = set_at("memory/features_sha256", features)
+    card = changed_card(said, set_features)
+    with pytest.raises(ModelError, match="a memory of views has a calibration"):
+        open_memory(card)
+    denied = shutil.copytree(mixed_memory, tmp_path / "denied")
+    card = changed_card(denied, set_at("memory/features_sha256", None))
+    with pytest.raises(ModelError, match="has 16 azimuth bins, not 0"):
+        open_memory(card)
+    card = changed_card(denied, set_at("azimuth_bins", 0))
+    with pytest.raises(ModelError, match="holds features, and its card"):
+        open_memory(card)
+
+
+def test_things_get_features_when_one_is_added_that_needs_them(
+    knobs_memory, mixed_memory
+):
+    before = open_memory(knobs_memory / "memory.json")[1]
+    card, memory = open_memory(mixed_memory / "memory.json")
+    assert [thing.name for thing in card.memory.things] == [
+        "block",
+        "can",
+        "knob",
+        "plain",
+    ]
+    assert np.isnan(memory.radii).tolist() == [True, False, False, False]
+    lengths = np.linalg.norm(memory.views.astype(np.float32), axis=-1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-2)
+    # of the things themselves, as learned from their files
+    assert memory.surfaces.counts[1:].tolist() == before.surfaces.counts.tolist()
 
 
 def test_things_of_unknown_size_hold_no_geometry(taught):
@@ -505,7 +546,7 @@ def test_weights_and_residuals_are_those_on_the_card(models):
     card = changed_card(models, set_at("memory/verification", VERIFIED))
     things = TaughtThings.of(open_recogniser(card))
     assert things.verifier.weights == replace(EvidenceWeights(), geometry=20.0)
-    np.testing.assert_array_equal(things.residuals.usual, VERIFIED["usual"])
+    np.testing.assert_array_equal(things.residuals.usual, VERIFIED["usual"][1:])
     assert things.residuals.p_value(0.1, 0, 1) == pytest.approx(2 / 3)
 
 

@@ -5,6 +5,7 @@ them.
 import json
 import pickle
 import re
+import shutil
 from copy import deepcopy
 from dataclasses import replace
 
@@ -33,7 +34,6 @@ from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
-from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 
 ORIGIN = np.array([0.3, -0.1, 0.2])  # of the scans, far from the things
@@ -218,9 +218,9 @@ def test_views_are_judged_together_once_an_update(known, monkeypatch):
     asked = []
     judge = type(recogniser.things).judge
 
-    def counted(self, observations, joint):
+    def counted(self, observations, by_features):
         asked.append(len(observations))
-        return judge(self, observations, joint)
+        return judge(self, observations, by_features)
 
     monkeypatch.setattr(type(recogniser.things), "judge", counted)
     system = nextview.load(models=known, threads=1, recogniser=recogniser)
@@ -250,15 +250,18 @@ def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     )
 
 
-def test_things_without_geometry_are_recognised_by_features(known, meshes):
-    recogniser = recogniser_of(known)
-    surfaces = [
-        each
-        for each in recogniser.things.verifier.caster.surfaces
-        if each.name != "mug"
-    ]
-    recogniser.things = TaughtThings(recogniser, surfaces)
-    system = nextview.load(models=known, threads=1, recogniser=recogniser)
+def test_things_without_geometry_are_recognised_by_features(
+    known,
+    meshes,
+    metric_scans,
+    tmp_path,
+):
+    models = shutil.copytree(known, tmp_path / "mine")
+    nextview.learn(models, models, remove=("mug",), workers=0)
+    (tmp_path / "unsized").mkdir()
+    shutil.copy(metric_scans / "mug.ply", tmp_path / "unsized")
+    nextview.learn(tmp_path / "unsized", models, add=True, upright=True, workers=0)
+    system = nextview.load(models=models, threads=1)
     result = system.recognise(meshes["mug"], seed=2)
     assert result.answer == "mug"
     assert result.pose is None
