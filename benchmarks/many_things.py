@@ -2,25 +2,19 @@
 is right.
 
     python benchmarks/many_things.py make YCB THINGS [--count 1000] [--seed 0]
-    python benchmarks/many_things.py teach THINGS MEMORY [--first 1000]
+    nextview learn THINGS MEMORY --unit m --upright
     python benchmarks/many_things.py measure THINGS MEMORY [--frames 100] [--seed 1]
         [--save FOLDER]
 
 ``make`` writes a PLY file a thing, metres. The first ones are the scans of the folder YCB
 themselves. All others are scans in turn, each stretched along its x, y and z by factors of its own,
 drawn between 0.7 and 1.4, evenly in the logarithm. The seed decides them. A thing is called by the
-number of its round and its scan, as 03_mug, so the first N of the files by name are N things made
-by the same rule.
-
-``teach`` looks at each thing coarsely, as ``nextview learn`` would take three seconds for it: in
-the pose of its file alone, from 40 viewpoints without errors of a sensor, at half the resolution.
-Between these the features are interpolated. The weights of features and geometry are those of the
-bundled memory of the scans. A run that was stopped goes on where it was.
+number of its round and its scan, as 03_mug.
 
 ``measure`` shows things drawn from those that the memory knows, each in the pose that it was taught
 in, at its true size, with an azimuth, a viewpoint and errors of the sensor of their own. It prints
 the seconds that the memory takes to load and the peak of memory, and after one and two views: the
-share that is named right by features and size alone and with the geometry, the share that is wrong
+share that is named right by outline and size alone and with the geometry, the share that is wrong
 with a belief of 0.97 and more, the share of the right ones whose pose is right (ADD-S below a tenth
 of the diameter), and the seconds of CPU from a frame to the decision. A first frame of all is not
 counted.
@@ -39,41 +33,21 @@ import trimesh
 import tyro
 from numpy.typing import NDArray
 from rich.progress import track
-from safetensors.numpy import load_file, save_file
 from scipy.spatial import cKDTree
 from tyro.extras import subcommand_cli_from_dict
 
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
-from nextview.files import new_file, new_folder, read_record, write_record
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.files import new_folder, read_record, write_record
+from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
-from nextview.recognition.model_card import (
-    FEATURE_NETWORK,
-    ModelCard,
-    Thing,
-    Training,
-    find_card,
-    memory_path,
-    write_card,
-)
-from nextview.recognition.model_card import Taught as MemoryCard
-from nextview.recognition.novelty import unit
+from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.simulation.simulated import SimulatedCamera
-from nextview.teaching.memory_fit import size_evidence
-from nextview.teaching.thing_views import COARSER, embeddings
 from nextview.things.memory import (
-    AZIMUTHS,
-    RINGS,
-    THING_PICTURE,
-    Memory,
     TaughtRecogniser,
 )
-from nextview.things.stored_surfaces import StoredSurfaces
-from nextview.things.surface import FINEST_ERROR, Surface
+from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 
@@ -82,16 +56,13 @@ Float = NDArray[np.float64]
 LEAST_STRETCH = 0.7
 MOST_STRETCH = 1.4
 
-LOOKED_AT = ViewSphere(RINGS, AZIMUTHS // 2)  # viewpoints that things are taught from
-PICTURE_SIDE = 112  # pixels, as the features take them
-
 VIEWS = (1, 2)
 HIGHEST = np.radians(72.0)  # elevation of a view
 CONFIDENT = 0.97
 POINTS = 1000  # of a surface, for ADD-S
 COLUMNS = (
     "views",
-    "by features and size",
+    "by outline and size",
     "verified",
     "sure and wrong",
     "ADD-S < 0.1 d",
@@ -134,113 +105,13 @@ def make(
     print(f"{count} things in {out}")
 
 
-def teach(
-    things: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    first: int = 1000,
-) -> None:
-    """Teach the things coarsely.
-
-    Args:
-        things: folder that ``make`` wrote.
-        out: folder of the memory.
-        first: how many of the things, by name.
-    """
-    files = sorted(things.glob("*.ply"))[:first]
-    parts = out / "parts"
-    parts.mkdir(parents=True, exist_ok=True)
-    begun = time.process_time()
-    new = [file for file in files if not (parts / f"{file.stem}.safetensors").exists()]
-    for file in track(new, "things taught"):
-        with new_file(parts / f"{file.stem}.safetensors", overwrite=True) as part:
-            save_file(taught(load_mesh(file, unit="m")), part)
-    if new:
-        print(f"{(time.process_time() - begun) / len(new):.2f} s of CPU a thing")
-
-    found = [load_file(parts / f"{file.stem}.safetensors") for file in files]
-    join(out, [file.stem for file in files], found)
-    print(f"{len(files)} things taught: --models {out}")
-
-
-def taught(mesh: Mesh) -> dict[str, NDArray]:
-    """What is to be remembered of one thing."""
-    camera = SimulatedCamera(mesh, PICTURE_SIDE)
-    seen = embeddings([camera.observe(pose) for pose in LOOKED_AT.poses])
-    views = np.zeros((len(RINGS), AZIMUTHS, seen.shape[1]), np.float32)
-    views[:, ::2] = seen.reshape(len(RINGS), AZIMUTHS // 2, -1)
-    views[:, 1::2] = unit(views[:, ::2] + np.roll(views[:, ::2], -1, 1))
-
-    whole = Surface.from_mesh(mesh, mesh.name)
-    surface = whole.simplified(max(FINEST_ERROR, COARSER * whole.radius))
-    return {
-        "views": views.astype(np.float16),
-        "radius": np.array([mesh.metres], np.float32),
-        "vertices": surface.vertices,
-        "faces": surface.faces,
-    }
-
-
-def join(out: Path, names: Sequence[str], found: Sequence[dict[str, NDArray]]) -> None:
-    """Write the memory of all things, and its card."""
-    count = len(names)
-    views = np.stack([arrays["views"] for arrays in found])
-    radii = np.concatenate([arrays["radius"] for arrays in found])
-    surfaces = [
-        Surface(name, arrays["vertices"], arrays["faces"])
-        for name, arrays in zip(names, found, strict=True)
-    ]
-    memory = Memory(
-        views=views,
-        thing=np.arange(count),
-        rotations=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-        held_out=np.zeros((count, 1, views.shape[-1]), np.float16),
-        held_out_views=np.zeros((count, 1, 2), np.float32),
-        radii=radii,
-        pictures=np.zeros((count, THING_PICTURE, THING_PICTURE), np.uint8),
-        head=np.zeros((views.shape[-1], count), np.float32),
-        head_bias=np.zeros(count, np.float32),
-        surfaces=StoredSurfaces.of(surfaces),
-    )
-
-    bundled = find_card("ycb")
-    features = find_card(FEATURE_NETWORK)
-    assert bundled.memory is not None
-    assert bundled.memory.verification is not None
-    sha256 = memory.save(out / "memory.safetensors", overwrite=True)
-    (out / "memory.safetensors").rename(memory_path(out / "memory.json", sha256))
-    card = ModelCard(
-        "memory",
-        "recogniser",
-        features.input,
-        sha256,
-        network="memory of views",
-        classes=tuple(names),
-        azimuth_bins=AZIMUTHS,
-        calibration=bundled.calibration.__class__(
-            1.0,
-            1.0,
-            None,
-            bundled.calibration.bin_correlation,
-            tuple(range(count)),
-        ),
-        size=size_evidence(radii, np.arange(count)),
-        training=Training(f"{count} things"),
-        memory=MemoryCard(
-            tuple(Thing(name, f"{name}.ply", 1) for name in names),
-            features.sha256,
-            bundled.memory.weight,
-        ),
-    )
-    write_card(out / "memory.json", card)
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What was found of a thing after some views.
 
     Attributes:
         views: after how many.
-        by_outline: whether features and size alone name it right.
+        by_outline: whether outline and size alone name it right.
         right: whether it is named right with its geometry.
         confidence: belief in the answer.
         add_s: mean distance of the surface's points, diameters; None where the name is wrong.
@@ -404,7 +275,7 @@ def table(outcomes: Sequence[Outcome]) -> Iterator[str]:
 
 def main() -> None:
     """Run one of the stages."""
-    subcommand_cli_from_dict({"make": make, "teach": teach, "measure": measure})
+    subcommand_cli_from_dict({"make": make, "measure": measure})
 
 
 if __name__ == "__main__":

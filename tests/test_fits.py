@@ -30,7 +30,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import values_of
-from nextview.teaching.thing_views import embeddings
+from nextview.teaching.view_features import embeddings
 from nextview.training import card_fits as calibration
 from nextview.training.card_fits import (
     error_bound,

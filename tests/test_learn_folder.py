@@ -31,7 +31,7 @@ FEATURES = 256
 def quickly(monkeypatch):
     """Teaching without looking: what is remembered is drawn."""
 
-    def drawn(path, name, how, threads=1):
+    def drawn(path, name, how, threads, features):
         assert path.is_file()
         rng = np.random.default_rng(len(name))
         views = unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, FEATURES)))
@@ -41,6 +41,7 @@ def quickly(monkeypatch):
             "held_out": views[0, :2, ::4].reshape(8, FEATURES).astype(np.float16),
             "held_out_views": np.zeros((8, 2), np.float32),
             "radii": np.array([0.1], np.float32),
+            "upright": np.array([False]),
             "pictures": rng.integers(0, 255, (64, 64)).astype(np.uint8),
         }
 

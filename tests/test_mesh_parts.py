@@ -341,13 +341,7 @@ def test_recognise_warns_and_takes_the_largest_part(tmp_path):
     )
 
 
-def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatch):
-    def no_embeddings(
-        observations,
-    ):  # what they are does not matter here, and they take time
-        return np.zeros((len(observations), 4), np.float32)
-
-    monkeypatch.setattr(thing_views, "embeddings", no_embeddings)
+def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
     path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
     radii = []
     for largest, sentence in (
@@ -358,6 +352,7 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatc
             path,
             "egg",
             thing_views.TeachingOptions(unit="m", upright=True, largest_part=largest),
+            features=False,
         )
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))

@@ -52,14 +52,14 @@ SETTINGS = ThingSettings(
 class FarAzimuth:
     """A policy of a user: goes to the free view that is farthest round, and looks at its inputs."""
 
-    needs = ("joint", "outlook")
+    needs = ("outlook",)
     seen = []  # noqa: RUF012  # what it was given, for the test
 
     def __init__(self, viewpoints):
         self.viewpoints = viewpoints
 
     def next_views(self, state, rng):
-        self.seen.append((state.joint, state.outlook[0].hypotheses))
+        self.seen.append(state.outlook[0].hypotheses)
         far = np.where(state.free[0], self.viewpoints.arc[state.current[0]], -1)
         return np.array([far.argmax()])
 
@@ -164,9 +164,7 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
     )
     assert len(sensed) <= 3  # the second view of each episode
     assert list(tables.measures["policy"].unique()) == ["random", "geometry", own]
-    joint, hypotheses = FarAzimuth.seen[0]
-    assert joint.ndim == 3
-    assert joint.sum() == pytest.approx(1)
+    hypotheses = FarAzimuth.seen[0]
     assert hypotheses.belief.sum() == pytest.approx(1)
     assert hypotheses.poses.shape == (len(hypotheses.things), 4, 4)
     away = EPISODE_SPHERE.arc.max(1)

@@ -172,7 +172,7 @@ def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_thei
 
 @pytest.mark.parametrize(
     ("things", "of", "each"),
-    [(1, 1, 16), (3, 3, 5), (1, 78, 2), (78, 78, 2), (1000, 1000, 2)],
+    [(1, 1, 20), (3, 3, 6), (1, 78, 1), (78, 78, 1), (1000, 1000, 1)],
 )
 def test_a_bounded_number_of_episodes_is_shown(things, of, each):
     items = to_be_shown(range(things), of, np.random.default_rng(0))

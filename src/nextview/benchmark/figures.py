@@ -49,7 +49,6 @@ POLICY_COLOURS = {
     "oracle-gain-all": "#777777",
     "fixed": "#7a6fd0",
     "ring": "#b3a000",
-    "picture": "#5bb98c",
     "geometry": ACCENT,
     "pose": BLUE,
     "ceiling": "#111111",

@@ -61,8 +61,7 @@ def benchmark_things(
     an interrupted run resumes, and a further policy is replayed in seconds.
 
     A policy of your own, MODULE:CLASS, is created with the viewpoints. With needs = ("outlook",) it
-    receives the leading hypotheses (things in poses), their beliefs and their surfaces; with
-    "joint", the belief from features over things and azimuths.
+    receives the leading hypotheses (things in poses), their beliefs and their surfaces.
 
     Args:
         scans: folder of the scans.

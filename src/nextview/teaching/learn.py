@@ -66,12 +66,9 @@ from nextview.teaching.thing_views import (
     SYMMETRIES,
     UPRIGHT,
     VERTICES,
-    Arrays,
     TeachingOptions,
-    features_of,
     rows_of,
     teach,
-    without_features,
 )
 from nextview.teaching.verification_fit import (
     GROWTH,
@@ -83,6 +80,7 @@ from nextview.teaching.verification_fit import (
     to_be_shown,
     with_new_things,
 )
+from nextview.teaching.view_features import Arrays, features_of, without_features
 from nextview.things.memory import (
     AZIMUTHS,
     Memory,
@@ -493,7 +491,7 @@ def _features_again(how: TeachingOptions, item: tuple[int, str, Arrays]) -> Arra
     poses = np.eye(3)[None] if arrays[UPRIGHT][0] else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, pose) for pose in poses[1:])]
     rotations = (poses @ to_mesh).astype(np.float32)
-    return {"rotations": rotations, **features_of(lying, name, how)}
+    return {"rotations": rotations, **features_of(lying, name, how.sensor, how.seed)}
 
 
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")

@@ -1,15 +1,11 @@
 """Look at one thing: its surface and symmetries, and the features of its views where they count."""
 
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.random import Generator
 from numpy.typing import NDArray
 
 from nextview.captured.bag import is_bag
@@ -21,42 +17,28 @@ from nextview.captured.turntable import read_turntable
 from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
-from nextview.geometry.observation import Camera, Observation
+from nextview.geometry.observation import Observation
 from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import (
-    ViewSphere,
-    angle_between,
-    direction_of,
     look_at_origin,
 )
-from nextview.recognition.inference import Features
 from nextview.recognition.model_card import Symmetry
-from nextview.recognition.network_input import from_observations
-from nextview.recognition.novelty import unit
 from nextview.sensing.tabletop import LOWEST_TOP
-from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.symmetries import named_symmetries
+from nextview.teaching.view_features import (
+    MEMORY_GRID,
+    Arrays,
+    features_captured,
+    features_of,
+    without_features,
+)
 from nextview.things.fusion import fuse
-from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
-from nextview.types import Float, Float32
+from nextview.types import Float
 
-Arrays = dict[str, NDArray]
-HELD_OUT = 8  # views of each thing that are not remembered
-SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
-VIEWS_PER_BATCH = 20
-# a captured view teaches what the thing looks like from no farther than this
-NEAR_CAPTURED = np.radians(30)
-MEMORY_GRID = ViewSphere(RINGS, AZIMUTHS)
-# poses of views through the sensor
-SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(
-    -1,
-    4,
-    4,
-)
 # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 LEFT_OUT = "left_out"
 # of a thing's arrays: whether it is known only as it stands, (1,) bool
@@ -68,7 +50,6 @@ SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (
 NEAR_SYMMETRIES = "near_symmetries"  # and of each near symmetry
 # of the radius: a camera stands farther from a large thing, and measures it less exactly
 COARSER = 0.002
-EmbeddingParts = Iterator[Float32]  # of embeddings, (.., F) each, in order
 
 
 @dataclass(frozen=True)
@@ -160,7 +141,7 @@ def teach(
     if features or mesh.metres is None:
         rotations = rotations if how.upright else resting_poses(mesh)
         lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
-        views = features_of(lying, name, how, threads)
+        views = features_of(lying, name, how.sensor, how.seed, threads)
 
     to_mesh = Y_UP if is_y_up(path, how.up) else np.eye(3)
     return {
@@ -178,59 +159,6 @@ def teach(
             )
         ),
         **_surface(mesh, to_mesh),
-    }
-
-
-def without_features(poses: int) -> Arrays:
-    """The arrays of a thing in so many resting poses of which no views are remembered."""
-    return {
-        "views": np.zeros((poses, len(RINGS), AZIMUTHS, 0), np.float16),
-        "held_out": np.zeros((0, 0), np.float16),
-        "held_out_views": np.zeros((0, 2), np.float32),
-    }
-
-
-def features_of(
-    lying: Sequence[Mesh],
-    name: str,
-    how: TeachingOptions,
-    threads: int = 1,
-) -> Arrays:
-    """Render a thing in its resting poses, and compute the features of its views.
-
-    Args:
-        lying: the mesh in each of them.
-        name: of the thing; with the seed it decides all random draws.
-        how: how it is looked at.
-        threads: that work side by side.
-
-    Returns:
-        The arrays views, held_out and held_out_views of ``things.memory.Memory``.
-    """
-    rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
-    directions = (
-        np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)),
-        rng.uniform(0, 2 * np.pi, HELD_OUT),
-    )
-    with ThreadPoolExecutor(threads) as pool:
-        # Of any of its resting poses: things lie in practice, and calibration and the rate of
-        # strangers follow these.
-        shown_pose = lying[int(rng.integers(len(lying)))]
-        held_out = _sensed(
-            pool,
-            shown_pose,
-            look_at_origin(*directions),
-            how.sensor,
-            rng,
-        )
-        clean = [_clean(pool, each) for each in lying]
-        sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
-        around = [_around(*both) for both in zip(clean, sensed, strict=True)]
-        shown = np.concatenate(list(held_out))
-    return {
-        "views": np.stack(around).astype(np.float16),
-        "held_out": shown.astype(np.float16),
-        "held_out_views": np.stack(directions, 1).astype(np.float32),
     }
 
 
@@ -300,53 +228,6 @@ def rows_of(symmetries: Sequence[Symmetry]) -> Float:
     return np.array(rows, np.float64).reshape(-1, 4)
 
 
-def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:
-    """Return embeddings of the grid of views, (rings, azimuths, F).
-
-    They are the mean of clean and sensed views.
-    """
-    ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
-    through = np.zeros_like(ideal)
-    # Between the rings and azimuths that are looked at through the sensor the embeddings are
-    # interpolated.
-    through[::2, ::2] = np.concatenate(list(sensed)).reshape(
-        len(RINGS[::2]),
-        AZIMUTHS // 2,
-        -1,
-    )
-    through[::2, 1::2] = unit(through[::2, ::2] + np.roll(through[::2, ::2], -1, 1))
-    through[1::2] = unit(through[:-1:2] + through[2::2])
-    return joined(ideal, through)
-
-
-def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> EmbeddingParts:
-    """Embeddings of the views of the grid without errors."""
-    camera = SimulatedCamera(mesh)
-    return pool.map(
-        partial(_seen, camera),
-        np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // VIEWS_PER_BATCH),
-    )
-
-
-def _sensed(
-    pool: ThreadPoolExecutor,
-    mesh: Mesh,
-    poses: Float,
-    sensor: str,
-    rng: Generator,
-) -> EmbeddingParts:
-    """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
-    parts = np.split(poses, range(SETUP, len(poses), SETUP))
-    cameras = (
-        partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts))
-    )
-    return pool.map(lambda camera, part: _seen(camera(), part), cameras, parts)
-
-
-def _seen(camera: Camera, poses: Float) -> Float32:
-    return embeddings([camera.observe(pose) for pose in poses])
-
-
 def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
     """Return what captured frames show: the surface, and the features of the views if they count.
 
@@ -362,7 +243,7 @@ def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
     surface = fuse(camera.object.sightings, found.radius, name)
     views = without_features(1)
     if features or surface is None:
-        views = _features_captured(seen)
+        views = features_captured(seen)
 
     return {
         **views,
@@ -372,31 +253,6 @@ def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
         "pictures": _picture(seen[0]),
         **({} if surface is None else of_surface(surface)),
         **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
-    }
-
-
-def _features_captured(seen: list[Observation]) -> Arrays:
-    """Features of captured views, for each cell of the grid those of the nearest one.
-
-    Every fourth view is held out.
-    """
-    directions = np.stack([direction_of(view.pose) for view in seen])
-    each = embeddings(seen)
-    kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
-    arc = angle_between(MEMORY_GRID.directions[:, None], directions[kept][None])
-    views = np.where(arc.min(1)[:, None] < NEAR_CAPTURED, each[kept][arc.argmin(1)], 0)
-
-    # the views that are held out
-    rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
-    held_out = np.resize(rest, HELD_OUT)
-    angles = np.stack(
-        [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])],
-        1,
-    )
-    return {
-        "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),
-        "held_out": each[held_out].astype(np.float16),
-        "held_out_views": angles[held_out].astype(np.float32),
     }
 
 
@@ -413,24 +269,3 @@ def _picture(view: Observation) -> NDArray[np.uint8]:
     from PIL import Image
 
     return np.asarray(Image.fromarray(view.picture).resize((64, 64)))
-
-
-@lru_cache(maxsize=1)
-def _features() -> Features:
-    return Features(threads=1)
-
-
-def embeddings(observations: list[Observation]) -> Float32:
-    """Return embeddings of views from one camera, unit vectors, (B, F) float32.
-
-    They are zero where nothing is seen.
-    """
-    network = _features()
-    inputs = from_observations(network.card.input, observations)
-    parts = [
-        network(inputs[start : start + VIEWS_PER_BATCH])
-        for start in range(0, len(inputs), VIEWS_PER_BATCH)
-    ]
-    return (
-        np.concatenate(parts) * np.array([view.seen for view in observations])[:, None]
-    )

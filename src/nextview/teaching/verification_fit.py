@@ -30,7 +30,7 @@ VIEWS_VERIFIED = (1, 2, 3)  # after so many views things are judged
 SHOWING_VIEWS_TRIED = 6  # views that are taken at most, until so many show the thing
 MOST_THINGS_VERIFIED = 150  # that are shown: a drawn part of more
 EPISODES_PER_THING = 1  # for each of many things
-ENOUGH_EPISODES = 40  # for each of few things as if all of them had so many together
+ENOUGH_EPISODES = 20  # for each of few things as if all of them had so many together
 GROWTH = 2  # weights are fitted anew when there are so many times as many things
 # things that the default weights count for, beside those that others are fitted to
 DEFAULT_THINGS = 10.0

@@ -22,7 +22,7 @@ from nextview.recognition.novelty import Novelty, as_stored, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.teaching.thing_views import embeddings
+from nextview.teaching.view_features import embeddings
 from nextview.training.fitting_set import card_to_fit
 from nextview.types import Float, Float32, Index
 
