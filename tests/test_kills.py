@@ -78,7 +78,7 @@ from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.recognition.novelty import unit
 
 
-def teach(path, name, how, threads):  # as a network would, but at once
+def teach(path, name, how, threads, features):  # as a network would, but at once
     rng = np.random.default_rng([*path.read_bytes(), *name.encode()])
     return {
         "views": unit(rng.normal(size=(2, len(RINGS), AZIMUTHS, 256))).astype(np.float16),
@@ -86,6 +86,7 @@ def teach(path, name, how, threads):  # as a network would, but at once
         "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
         "held_out_views": np.zeros((4, 2), np.float32),
         "radii": np.array([0.1], np.float32),
+        "upright": np.array([False]),
         "pictures": np.zeros((64, 64), np.uint8),
     }
 

@@ -890,7 +890,7 @@ def _card(
         "recogniser",
         features.input,
         "0" * 64,
-        network="memory of views",
+        network=f"memory of {'views' if memory.has_features else 'surfaces'}",
         classes=classes,
         azimuth_bins=AZIMUTHS if memory.has_features else 0,
         calibration=Calibration(
