@@ -10,7 +10,7 @@ What is partly hidden is also compared displaced to what hides it. Depths are co
 squared difference where both show. All of it is a few matrix products.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,8 @@ MOST_ORIENTATIONS = 16  # of one thing that are proposed
 THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
 NO_FIT = 12.0  # cost of a template of another size than what is seen
+# of the middle of an outline, root mean squares of it, beyond which depths do not differ
+FARTHEST_BEHIND = 3.0
 SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 
 OUTLINE_WEIGHT = 8.0
@@ -118,17 +120,17 @@ class ViewTemplates:
             caster: of the things.
         """
         looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
-        found = [
-            (thing, *rendered)
-            for thing in range(len(caster.surfaces))
-            for rendered in _rendered(caster, thing, looks)
+        each = [
+            _rendered(caster, thing, looks) for thing in range(len(caster.surfaces))
         ]
-        things, rotations, offsets, sizes, outlines, depths = zip(*found, strict=True)
-        self.things = np.array(things)
-        self.rotations = np.array(rotations)
-        self.offsets = np.array(offsets)
-        self.sizes = np.array(sizes)
-        self.pictures = Pictures(np.stack(outlines), np.stack(depths))
+        self.things = np.repeat(np.arange(len(each)), [len(one.sizes) for one in each])
+        self.rotations = np.concatenate([one.rotations for one in each])
+        self.offsets = np.concatenate([one.offsets for one in each])
+        self.sizes = np.concatenate([one.sizes for one in each])
+        self.pictures = Pictures(
+            np.concatenate([one.pictures.outline for one in each]),
+            np.concatenate([one.pictures.depth for one in each]),
+        )
 
     def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
         """Orientations of the likeliest things, given what some views show.
@@ -287,21 +289,24 @@ def looking_from(directions: Float) -> Float:
     return np.stack([right, np.cross(forward, right), forward], 1)
 
 
-def _rendered(
-    caster: SurfaceCaster,
-    thing: int,
-    looks: Float,
-) -> Iterator[tuple[Float, Float, float, Float32, Float32]]:
-    """The pictures of one thing from cameras with these axes, (N, 3, 3).
+@dataclass(frozen=True, eq=False)
+class _Rendered:
+    """The templates of one thing: see ``ViewTemplates``."""
 
-    Rotation, offset, size, outline and depth of each: see ``ViewTemplates``.
-    """
+    rotations: Float
+    offsets: Float
+    sizes: Float
+    pictures: Pictures
+
+
+def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
+    """Render one thing by cameras with these axes, (N, 3, 3), all at once."""
     radius = float(caster.radii[thing])
     focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
     camera = PinholeCamera.centred(focal, (RENDERING_PIXELS, RENDERING_PIXELS))
-    slopes = camera.slopes(np.arange(RENDERING_PIXELS), np.arange(RENDERING_PIXELS))
-    ones = np.ones((RENDERING_PIXELS, RENDERING_PIXELS))
-    rays = np.stack([*np.meshgrid(*slopes), ones], -1).reshape(-1, 3)
+    lines = np.arange(RENDERING_PIXELS)
+    row, column = (each.ravel() for each in np.meshgrid(lines, lines, indexing="ij"))
+    rays = np.stack([*camera.slopes(row, column), np.ones(len(row))], -1)
 
     origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
     depth, _ = caster.cast(
@@ -309,21 +314,46 @@ def _rendered(
         origins.astype(np.float32),
         (rays @ looks).astype(np.float32),
     )
-    grid = turned_grid(np.zeros(1))
-    for look, image in zip(
-        looks,
-        depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS),
-        strict=True,
-    ):
-        shown = np.isfinite(image)
-        if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
-            continue
-        outline = SeenOutline.of_depth(image, shown, shown | True, camera, np.eye(4))
-        seen = outline.pictures(outline.size, np.zeros(2), grid)
-        axes = outline.axes.T
-        middle = outline.middle * outline.ahead
-        offset = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle
-        yield axes @ look, axes @ offset, outline.size, seen.outline[0], seen.depth[0]
+    shown = np.isfinite(depth)
+    kept = shown.sum(1) >= FEWEST_OUTLINE_PIXELS
+    looks, depth, shown = looks[kept], depth[kept], shown[kept]
+
+    # middle and spread of each outline, and its median depth
+    count = shown.sum(1)
+    pixels = np.stack([column, row], -1).astype(np.float64)
+    centre = shown @ pixels / count[:, None]
+    squares = shown @ pixels**2 / count[:, None]
+    spread = np.sqrt((squares - centre**2).sum(1) + 1 / 6)  # a pixel is a square
+    by_depth = np.sort(depth, axis=1)
+    half = np.stack([(count - 1) // 2, count // 2], 1)
+    middle = np.take_along_axis(by_depth, half, 1).mean(1).astype(np.float64)
+    sizes = spread * middle / focal
+
+    x, y = camera.slopes(centre[:, 1], centre[:, 0])
+    ahead = np.stack([x, y, np.ones(len(x))], -1)
+    towards = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+    turns = np.array([_from_z_to(direction).T for direction in towards]).reshape(
+        -1, 3, 3
+    )
+    offsets = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle[:, None] * ahead
+
+    # what the cells of the grid show
+    cells = turned_grid(np.zeros(1))[0] * spread[:, None, None] + centre[:, None]
+    at = np.rint(cells).astype(np.int64)
+    inside = ((at >= 0) & (at < RENDERING_PIXELS)).all(2)
+    index = np.where(inside, at[..., 1] * RENDERING_PIXELS + at[..., 0], 0)
+    outline = inside & np.take_along_axis(shown, index, 1)
+    there = np.where(outline, np.take_along_axis(depth, index, 1), middle[:, None])
+    behind = (there - middle[:, None]) / sizes[:, None]
+    return _Rendered(
+        turns @ looks,
+        np.einsum("nij,nj->ni", turns, offsets),
+        sizes,
+        Pictures(
+            outline.astype(np.float32),
+            behind.clip(-FARTHEST_BEHIND, FARTHEST_BEHIND).astype(np.float32),
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,7 +472,7 @@ class SeenOutline:
         return SeenPictures(
             outline.astype(np.float32),
             known.astype(np.float32),
-            np.clip(behind, -3, 3).astype(np.float32),
+            np.clip(behind, -FARTHEST_BEHIND, FARTHEST_BEHIND).astype(np.float32),
             np.count_nonzero(self.shown) / cell**2,
         )
 
