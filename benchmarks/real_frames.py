@@ -10,7 +10,7 @@ is the card of a network of ``nextview train segmentation`` in place of the bund
 label of each pixel) and names.txt, a line for each label, the first for the background. SCANS holds
 the scans of the things that the memory knows, in metres, by their names. Each thing is selected
 once by a point, the median of the positions under its label, and once by its label as a mask.
-Printed are the answer by features and size alone and with the geometry, whether the thing is among
+Printed are the answer by outline and size alone and with the geometry, whether the thing is among
 the first three, the belief in the answer, its residual, and the intersection over union of the
 label with the outline of the posed scan (of the true thing, if it is among the hypotheses; what
 stands before it is not taken off). Labels of few pixels are left out. Then a scene looks at each
@@ -63,7 +63,7 @@ class Named:
         frame: name of the frame.
         thing: its label.
         by: how it was given: by a point or by a mask.
-        by_outline: the answer by features and size alone.
+        by_outline: the answer by outline and size alone.
         answer: the answer with the geometry.
         among_three: whether the thing is among the first three.
         confidence: belief in the answer.
@@ -302,7 +302,7 @@ def taught(
     found: list[Named] = []
     paths = sorted(folder.glob("*.depth.png"))
     print(
-        "| frame | thing | given by | features | verified | belief | residual | overlap |"
+        "| frame | thing | given by | by outline | verified | belief | residual | overlap |"
     )
     print("|---|---|---|---|---|---|---|---|")
     for path in paths:
@@ -317,13 +317,13 @@ def taught(
     print()
     for by in ("point", "mask"):
         some = [each for each in found if each.by == by]
-        features = sum(each.by_outline == each.thing for each in some)
+        by_outline = sum(each.by_outline == each.thing for each in some)
         right = sum(each.answer == each.thing for each in some)
         three = sum(each.among_three for each in some)
         overlap = np.mean([each.overlap for each in some])
         slowest = 1000 * max(each.seconds for each in some)
         print(
-            f"by {by}: of {len(some)} things {features} named right by features, {right} with the"
+            f"by {by}: of {len(some)} things {by_outline} named right by outline, {right} with the"
             f" geometry, {three} among the first three; mean overlap {overlap:.2f}; at most"
             f" {slowest:.0f} ms of CPU for the geometry"
         )

@@ -1,4 +1,4 @@
-"""Taught things recognised by features alone and verified by their geometry, at true size.
+"""Taught things recognised by outline and size, and verified by their geometry, at true size.
 
     python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3]
         [--poses thrown] [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
@@ -14,14 +14,14 @@ parts of it. With ``--any-orientation`` they hang in the middle of a round
 room, turned at random about all axes, and are recognised as such; the error of the rotation, modulo
 the symmetries of the thing, stands in the place of those of azimuth and resting pose.
 
-Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
+Prints after 1, 2, 3 and 5 random views: the share that is named right by outline and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
 belief of 0.97 and more; of the things that are named right the error of the azimuth (things without
 a symmetry about the vertical; a box counts modulo half a turn), of the place of the centre in the
 camera's frame, ADD-S below a tenth of the diameter in the same frame (Hinterstoisser et al. 2012;
 the definitions of the BOP toolkit), and the share in the right resting pose, or one that looks the
-same; and the milliseconds of one core from a further frame to the decision: its features, and the
-verification of all frames. The last line says how much memory all of this took.
+same; and the milliseconds of one core from a further frame to the decision. The last line says how
+much memory all of this took.
 
 With ``--save`` each draw that is done is kept in a folder, and not run again. With ``--known even``
 or ``odd`` every other thing is known, as if the others had been removed from the memory, and all
@@ -77,7 +77,7 @@ SYMMETRIC = 0.1
 UPRIGHT = 20.0
 COLUMNS = (
     "views",
-    "features",
+    "by outline",
     "verified",
     "calibration error",
     "sure and wrong",
@@ -124,18 +124,14 @@ class Episode:
     Attributes:
         thing: number of the thing.
         observations: the views.
-        log_evidence: what the features say of each, see ``log_evidence_of``, (V, D).
         true_pose: of the scan file's frame in the object frame, (4, 4), metres.
         in_cameras: of the scan file's frame in the frame of each camera, (V, 4, 4), metres.
-        seconds: of CPU that the features of a view took, in the mean.
     """
 
     thing: int
     observations: list[Observation]
-    log_evidence: NDArray[np.floating]
     true_pose: Float
     in_cameras: Float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -145,7 +141,7 @@ class Outcome:
     Attributes:
         thing: number of the thing.
         views: after how many.
-        by_outline: whether the features alone name it right.
+        by_outline: whether outline and size alone name it right.
         answer: the thing believed most.
         confidence: belief in it.
         seconds: of CPU from the last frame to the decision.
@@ -288,7 +284,6 @@ def symmetry_order(surface: Surface, points: Float) -> int:
 
 def shown(
     taught: Taught,
-    things: TaughtThings,
     thing: int,
     draw: int,
     setting: Setting,
@@ -298,7 +293,6 @@ def shown(
 
     Args:
         taught: the things.
-        things: recognises them; its features are part of the episode.
         thing: number of the one that is shown.
         draw: number of the draw.
         setting: how it is shown.
@@ -349,17 +343,7 @@ def shown(
     to_object[:3, :3] = frame.axes
     to_object[:3, 3] = -frame.axes @ frame.centre
     in_cameras = np.linalg.inv(np.stack(cameras)) @ in_truth
-    begun = time.process_time()  # one thread; others on the machine do not count
-    evidence = things.log_evidence(observations)
-    seconds = (time.process_time() - begun) / len(observations)
-    return Episode(
-        thing,
-        observations,
-        evidence,
-        to_object @ in_truth,
-        in_cameras,
-        seconds,
-    )
+    return Episode(thing, observations, to_object @ in_truth, in_cameras)
 
 
 def lying(mesh: Mesh, poses: Poses, rng: np.random.Generator) -> Float:
@@ -393,7 +377,7 @@ def judged(
     """Recognise the thing of an episode after some views, among some things."""
     begun = time.process_time()
     found = things(episode.observations[:views])
-    seconds = episode.seconds + time.process_time() - begun
+    seconds = time.process_time() - begun
 
     answer = int(some[found.belief.argmax()])
     truth = int(np.searchsorted(some, episode.thing)) if episode.thing in some else -1
@@ -668,7 +652,7 @@ def main(
 
         here: list[Outcome] = []
         for thing in track(everything[draw % every :: every], f"draw {draw}"):
-            episode = shown(taught, things, int(thing), draw, setting)
+            episode = shown(taught, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
             here += [judged(things, taught, some, episode, k) for k in counts]
         outcomes.append(here)
