@@ -354,7 +354,7 @@ def main(
     results = []
     for draw in draws:
         for thing in track(some[draw % every :: every], f"draw {draw}"):
-            episode = shown(taught, known, int(thing), draw, setting)
+            episode = shown(taught, int(thing), draw, setting)
             results.append(compared(pairs, known, taught, some, episode))
 
     print(

@@ -126,7 +126,7 @@ def beside(taught: Taught, episodes: Sequence[Episode], draw: int) -> list[Outco
     outcomes = []
     for number, episode in enumerate(track(episodes, "nextview")):
         thing = taught.names.index(episode.name)
-        seen = shown(taught, things, thing, 1000 * draw + number, setting, episode.turn)
+        seen = shown(taught, thing, 1000 * draw + number, setting, episode.turn)
         outcomes += [judged(things, taught, some, seen, k) for k in range(1, VIEWS + 1)]
     return outcomes
 
