@@ -265,6 +265,24 @@ class SurfaceCaster:
             self._scenes[thing] = embree_scene([(surface.vertices, surface.faces)])
         return self._scenes[thing]
 
+    def depths(self, thing: int, origins: Float32, directions: Float32) -> Float32:
+        """Cast the same number of rays from each of some places at one surface.
+
+        Args:
+            thing: number of the surface.
+            origins: the places, in the frame of the surface, (N, 3) float32, metres.
+            directions: of the rays, of any length, (N, P, 3) float32.
+
+        Returns:
+            How many times its length each ray goes, (N, P) float32, infinity where it meets
+            nothing.
+        """
+        rays = np.ascontiguousarray(directions.reshape(-1, 3))
+        starts = np.repeat(origins, directions.shape[1], 0)
+        hits = self._scene(thing).run(starts, rays, output=1)
+        depth = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
+        return depth.reshape(directions.shape[:2]).astype(np.float32)
+
     def cast(
         self,
         things: NDArray[np.integer],

@@ -309,8 +309,8 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     rays = np.stack([*camera.slopes(row, column), np.ones(len(row))], -1)
 
     origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
-    depth, _ = caster.cast(
-        np.full(len(looks), thing),
+    depth = caster.depths(
+        thing,
         origins.astype(np.float32),
         (rays @ looks).astype(np.float32),
     )
