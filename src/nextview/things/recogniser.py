@@ -46,9 +46,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         """
         super().__init__(model, threads)
         self.prior = RegistrationPrior()
-        assert len(
-            self.things.names
-        )  # made now: what is wrong with it is said when it is opened
+        # now: what is wrong with it is said when it is opened, and the first frame does not wait
+        self.things.verifier.prepare(threads)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is made of the memory, and leads back to it."""
@@ -71,9 +70,9 @@ class VerifiedRecogniser(TaughtRecogniser):
             aim: of the direction in which it looks, radians.
         """
         other = copy(self)
-        for made in MADE:
-            vars(other).pop(made, None)
+        vars(other).pop("in_any_orientation", None)
         other.prior = self.prior.for_cameras(place, aim)
+        other.things = self.things.with_prior(other.prior)
         return other
 
     @cached_property

@@ -11,6 +11,7 @@ from nextview.geometry.observation import Observation
 from nextview.recognition.model_card import Verification
 from nextview.recognition.protocol import log_evidence_of_views
 from nextview.things.memory import TaughtRecogniser
+from nextview.things.registration import RegistrationPrior
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import UNUSUAL, Verified, Verifier, rival_turns
@@ -118,6 +119,13 @@ class TaughtThings:
         where = str(recogniser.card.card_path)
         weights = weights_of(about.verification, where)
         return cls(recogniser, some, weights, residuals_of(about.verification, known))
+
+    def with_prior(self, prior: RegistrationPrior) -> "TaughtThings":
+        """The same things, looked at by cameras whose errors have another prior."""
+        other = copy(self)
+        other.verifier = copy(self.verifier)
+        other.verifier.prior = prior
+        return other
 
     def in_any_orientation(self) -> "TaughtThings":
         """The same things, which may be held, lean or fly: they need not rest."""

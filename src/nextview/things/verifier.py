@@ -322,6 +322,15 @@ class Verifier:
         """Pictures of the things from all around, which propose orientations."""
         return ViewTemplates(self.caster)
 
+    def prepare(self, threads: int = 0) -> None:
+        """Render the pictures now, so that the first frame takes as long as all others.
+
+        Args:
+            threads: that work side by side; 0 for one on each core.
+        """
+        if "templates" not in vars(self):
+            self.templates = ViewTemplates(self.caster, threads)
+
     def _started(
         self,
         proposed: _Proposed,

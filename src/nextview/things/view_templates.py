@@ -10,8 +10,11 @@ What is partly hidden is also compared displaced to what hides it. Depths are co
 squared difference where both show. All of it is a few matrix products.
 """
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -113,16 +116,17 @@ class ViewTemplates:
         pictures: what the camera sees.
     """
 
-    def __init__(self, caster: SurfaceCaster) -> None:
+    def __init__(self, caster: SurfaceCaster, threads: int = 1) -> None:
         """Render all surfaces of a caster from all around.
 
         Args:
             caster: of the things.
+            threads: that work side by side; 0 for one on each core.
         """
         looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
-        each = [
-            _rendered(caster, thing, looks) for thing in range(len(caster.surfaces))
-        ]
+        with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+            render = partial(_rendered, caster, looks=looks)
+            each = list(pool.map(render, range(len(caster.surfaces))))
         self.things = np.repeat(np.arange(len(each)), [len(one.sizes) for one in each])
         self.rotations = np.concatenate([one.rotations for one in each])
         self.offsets = np.concatenate([one.offsets for one in each])
