@@ -31,7 +31,7 @@ PLANE_THICKNESS = 0.07
 CELLS_FOLLOWED = 8  # of directions, in search of the one that most of a surface faces
 # share of the largest spread of points below which they do not spread at all
 LEAST_SPREAD = 1e-9
-CORNERS_AT_ONCE = 500  # of a hull, whose distances from all others are taken together
+FARTHEST_AT_ONCE = 500  # of a hull, whose distances from all others are taken together
 PLANE_FACES = 100_000  # that are looked at in search of a plane
 PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
 # object radii between two numbers of single precision, from where on a shape is lost
@@ -123,8 +123,8 @@ def _size(points: Float) -> float:
         return 0.0
     corners = hull_corners(points)
     farthest = max(
-        float(cdist(corners[at : at + CORNERS_AT_ONCE], corners[at:]).max())
-        for at in range(0, len(corners), CORNERS_AT_ONCE)
+        float(cdist(corners[at : at + FARTHEST_AT_ONCE], corners[at:]).max())
+        for at in range(0, len(corners), FARTHEST_AT_ONCE)
     )
     return farthest / 2
 
