@@ -4,11 +4,11 @@ import glob
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from msgspec.structs import replace as replace_record
@@ -103,6 +103,8 @@ JUDGED = "judged"
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 PARTS = "things"
 Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -461,21 +463,9 @@ def _with_features_where_they_count(
         for row, (source, arrays) in enumerate(taught)
         if not arrays["views"].shape[-1]
     ]
-    found = dict[int, Arrays]()
-
-    def watched() -> Iterator[int]:
-        render = partial(_features_again, work.how)
-        results = each(render, missing, work.workers, work.scheduler)
-        for number, ((row, name, _), result) in enumerate(results, 1):
-            if isinstance(result, WorkerDied):
-                raise DatasetError(
-                    f"{name}: its views could not be rendered ({result})"
-                )
-            found[row] = result
-            yield number
-
-    if missing:
-        work.track(watched(), len(missing), "things rendered")
+    render = partial(_features_again, work.how)
+    results = _all_done(render, missing, work, "things rendered")
+    found = {row: arrays for (row, _, _), arrays in results}
     return [
         (source, arrays | found.get(row, {}))
         for row, (source, arrays) in enumerate(taught)
@@ -754,26 +744,38 @@ def _shown(
     Returns what was found, and the things of which nothing was seen.
     """
     items = to_be_shown(things, known, rng)
-    found = dict[tuple[int, int], list[Shown]]()
+    show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
+    found = dict(_all_done(show_one, items, work, "things shown"))
 
-    def watched() -> Iterator[int]:
-        show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
-        for count, (item, result) in enumerate(
-            each(show_one, items, work.workers, work.scheduler),
-            1,
-        ):
-            if isinstance(result, WorkerDied):
-                raise DatasetError(
-                    f"{folder}: its things could not be shown ({result})"
-                )
-            found[item] = result
-            yield count
-
-    if items:
-        work.track(watched(), len(items), "things shown")
     shown = [one for item in sorted(found) for one in found[item]]
     unseen = {thing for thing, _ in items} - {one.thing for one in shown}
     return shown, sorted(unseen)
+
+
+def _all_done(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    work: Work,
+    what: str,
+) -> list[tuple[Item, Result]]:
+    """Each of some items with what a function returns for it, in parallel, in any order.
+
+    Raises:
+        DatasetError: a process died.
+    """
+    found = list[tuple[Item, Result]]()
+
+    def watched() -> Iterator[int]:
+        results = each(function, items, work.workers, work.scheduler)
+        for count, (item, result) in enumerate(results, 1):
+            if isinstance(result, WorkerDied):
+                raise DatasetError(f"not all {what} ({result})")
+            found.append((item, result))
+            yield count
+
+    if items:
+        work.track(watched(), len(items), what)
+    return found
 
 
 def _with_verification(
