@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 from msgspec.structs import replace as replace_record
@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from nextview.checks import one_line
-from nextview.data.pool import WorkerDied, each
+from nextview.data.pool import GivenItem, Result, WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, in_lines, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
@@ -103,8 +103,6 @@ JUDGED = "judged"
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 PARTS = "things"
 Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -753,17 +751,17 @@ def _shown(
 
 
 def _all_done(
-    function: Callable[[Item], Result],
-    items: Sequence[Item],
+    function: Callable[[GivenItem], Result],
+    items: Sequence[GivenItem],
     work: Work,
     what: str,
-) -> list[tuple[Item, Result]]:
+) -> list[tuple[GivenItem, Result]]:
     """Each of some items with what a function returns for it, in parallel, in any order.
 
     Raises:
         DatasetError: a process died.
     """
-    found = list[tuple[Item, Result]]()
+    found = list[tuple[GivenItem, Result]]()
 
     def watched() -> Iterator[int]:
         results = each(function, items, work.workers, work.scheduler)
