@@ -176,7 +176,7 @@ def read_pcd_header(path: Path) -> PcdHeader:
     regular_file(path, "a PCD file", DatasetError, LARGEST_CLOUD)
     try:
         with path.open("rb") as file:
-            lines, start = _header_lines(file.read(LONGEST_HEADER), path)
+            lines, start = _header_lines(file.read(LONGEST_HEADER))
         width, height, count = (int(lines[name][0]) for name in _COUNTS)
         point = _point_type(lines)
         said = lines.get("VIEWPOINT", ORIGIN)
@@ -290,15 +290,17 @@ def decompress_lzf(packed: bytes, size: int) -> bytes:
             out += packed[at : at + control + 1]
             at += control + 1
             continue
-        length = control >> 5
-        if length == 7:
+        length = (control >> 5) + 2
+        long = length == 9  # another byte of it follows, then one of the distance
+        if at + long >= len(packed):
+            raise ValueError("damaged LZF data")
+        if long:
             length += packed[at]
             at += 1
         begin = len(out) - ((control & 31) << 8) - packed[at] - 1
         at += 1
         if begin < 0:
             raise ValueError("damaged LZF data")
-        length += 2
         chunk = out[begin : begin + length]
         # what is copied may overlap with the copy
         out += (chunk * (length // len(chunk) + 1))[:length]
@@ -310,14 +312,14 @@ def decompress_lzf(packed: bytes, size: int) -> bytes:
 _COUNTS = ("WIDTH", "HEIGHT", "POINTS")
 
 
-def _header_lines(begin: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+def _header_lines(begin: bytes) -> tuple[dict[str, list[str]], int]:
     """Return the words of each line of a header by its first word, and where the points begin."""
     lines: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in lines:
         end = begin.find(b"\n", at)
         if end < 0:
-            raise DatasetError(f"{path}: {NOT_PCD}: there is no line DATA")
+            raise ValueError("there is no line DATA")
         words = begin[at:end].decode("ascii").split()
         at = end + 1
         if words and not words[0].startswith("#"):
@@ -326,10 +328,10 @@ def _header_lines(begin: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
         lines["FIELDS"] = lines["COLUMNS"]
     for name in ("FIELDS", *_COUNTS):
         if not lines.get(name):
-            raise DatasetError(f"{path}: {NOT_PCD}: there is no line {name}")
+            raise ValueError(f"there is no line {name}")
     missing = sorted({"x", "y", "z"} - set(lines["FIELDS"]))
     if missing:
-        raise DatasetError(f"{path}: its points have no {', '.join(missing)}")
+        raise ValueError(f"its points have no {', '.join(missing)}")
     return lines, at
 
 
@@ -378,13 +380,19 @@ def _binary_points(header: PcdHeader) -> Float:
     """Return the points of a file with one point after the other, (N, 3)."""
     count = header.width * header.height
     size = count * header.point.itemsize
+    _check_left(header, size)
     with header.path.open("rb") as file:
         file.seek(header.start)
         content = file.read(size)
-    if len(content) < size:
-        raise ValueError(f"{len(content)} bytes where {size} are expected")
     points = np.frombuffer(content, header.point, count)
     return np.concatenate([points[name] for name in ("x", "y", "z")], 1).astype(float)
+
+
+def _check_left(header: PcdHeader, size: int) -> None:
+    """Check that a file has so many bytes after its header, before memory is spent on them."""
+    left = header.path.stat().st_size - header.start
+    if left < size:
+        raise ValueError(f"{left} bytes where {size} are expected")
 
 
 def _packed_points(header: PcdHeader) -> Float:
@@ -396,9 +404,8 @@ def _packed_points(header: PcdHeader) -> Float:
         packed_size, said = struct.unpack("<II", file.read(8))
         if said != size:
             raise ValueError(f"{said} bytes where {size} are expected")
+        _check_left(header, 8 + packed_size)
         packed = file.read(packed_size)
-    if len(packed) < packed_size:
-        raise ValueError(f"{len(packed)} bytes where {packed_size} are expected")
     content = decompress_lzf(packed, size)
     assert header.point.fields is not None
     found = []
