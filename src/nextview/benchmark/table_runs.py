@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -26,21 +25,22 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import resting_poses
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
+from nextview.scene.view_policies import (
+    SCENE_POLICIES,
+    VIEW_ELEVATIONS,
+    NamedPolicy,
+    ScenePolicy,
+)
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.types import Float, Index
 
-TablePolicy = Literal["target", "random", "fixed"]
-TABLE_POLICIES: tuple[TablePolicy, ...] = ("target", "random", "fixed")
-"""Next views: ``Scene.target``; a random candidate view; the view a quarter turn ahead, at the same
-elevation."""
 FEWEST_THINGS = 6
 MOST_THINGS = 10
 MOST_DRAWN = 20  # attempts to draw a table on which all objects fit
 CAMERA_FROM_TABLE = 0.6  # metres from the centre of the table
-VIEW_ELEVATIONS = (30.0, 60.0)  # degrees
 TABLE_CENTRE = np.array([0, 0, 0.03])  # metres
 STRANGER_RADII = (0.04, 0.10)  # metres
 STRANGER = "stranger"
@@ -83,8 +83,11 @@ class TableSettings:
         tables: number of tables.
         views: numbers of frames after which the policies are compared; the last one is the number
             of frames taken.
-        policies: target uses the next view of the scene, random any candidate view, and fixed moves
-            a quarter turn ahead. Only missing results are computed.
+        policies: target uses the view with the most expected information, random any candidate view
+            at 30 to 60 degrees elevation, and fixed the candidate nearest to a quarter turn ahead.
+            Your own policy, MODULE:NAME, is a function of what may be looked at and what the scene
+            knows; see docs/add_a_policy.md. Only missing results are computed; your own policies
+            always run again.
         reference: policy with which the others are compared; it is always included.
         samples: number of bootstrap samples.
         seed: seed of the tables, the first views and the camera errors.
@@ -94,8 +97,8 @@ class TableSettings:
     network: Path | None = None
     tables: int = 100
     views: tuple[int, ...] = (1, 2, 4)
-    policies: tuple[TablePolicy, ...] = TABLE_POLICIES
-    reference: TablePolicy = "random"
+    policies: tuple[str, ...] = tuple(SCENE_POLICIES)
+    reference: str = "random"
     samples: int = 10_000
     seed: int = 0
 
@@ -104,7 +107,10 @@ class TableSettings:
 
         Raises:
             UsageError: a number is invalid.
+            PolicyError: there is no such policy, or it cannot be made.
         """
+        for name in (self.reference, *self.policies):
+            NamedPolicy.of(name)
         whole(self.tables, "the number of tables", 1)
         whole(self.samples, "the samples of the bootstrap", 100)
         if not self.views or list(self.views) != sorted(set(self.views)):
@@ -163,7 +169,7 @@ def work_at_table(job: TableJob) -> None:
     table = draw_table(meshes_in(job.scans), meshes_in(job.strangers), drawn)
     for policy in job.policies:
         runs[policy] = look_at_table(job, table, policy)
-    job.write(TableRuns(job.table, runs))
+        job.write(TableRuns(job.table, runs))
 
 
 @lru_cache(maxsize=512)
@@ -260,6 +266,8 @@ class Looking:
         camera: TableCamera,
         system: System,
         segmentation: Segmenter | None = None,
+        policy: str | ScenePolicy = "random",
+        rng: np.random.Generator | None = None,
     ) -> None:
         """Start without frames.
 
@@ -267,8 +275,10 @@ class Looking:
             camera: over the table.
             system: with the taught things.
             segmentation: of the frames; None for the bundled network.
+            policy: of the scene.
+            rng: source of the policy's random numbers; seed 0 by default.
         """
-        self.scene = Scene(system, segmentation=segmentation)
+        self.scene = Scene(system, segmentation=segmentation, policy=policy, rng=rng)
         self.camera = camera
         self.owners: list[Index] = []
         self.cameras: list[tuple[Float, Float]] = []
@@ -364,16 +374,20 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
     Args:
         job: seeds and views of all policies.
         table: with the objects.
-        policy: one of TABLE_POLICIES.
+        policy: of the scene, a name of SCENE_POLICIES or MODULE:NAME.
+
+    Raises:
+        PolicyError: a policy of one's own failed.
     """
     how: TableSettings = job.settings
     rng = np.random.default_rng([how.seed, job.table, 1])
     camera = TableCamera(table, SENSORS["wrist"], rng)
-    looking = Looking(camera, *opened_models(how.models, how.network))
     choose = np.random.default_rng([how.seed, job.table, 2])
     azimuth = choose.uniform(0, 2 * np.pi)
     elevation = np.radians(choose.uniform(*VIEW_ELEVATIONS))
     pose = _view(azimuth, elevation)
+    system, segmentation = opened_models(how.models, how.network)
+    looking = Looking(camera, system, segmentation, policy, choose)
 
     counts = []
     done = how.views[-1] + 1
@@ -383,14 +397,8 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
             done = min(done, number)
         if number in how.views:
             counts.append(looking.count())
-        if policy == "fixed":
-            pose = _view(azimuth + number * np.pi / 2, elevation)
-        elif policy == "random":
-            around = choose.uniform(0, 2 * np.pi, 1)[0]
-            pose = _view(around, np.radians(choose.uniform(*VIEW_ELEVATIONS)))
-        else:
-            target = looking.scene.target
-            pose = pose if target is None else target
+        target = looking.scene.target if number < how.views[-1] else None
+        pose = pose if target is None else target
     return TableRun(counts, done)
 
 

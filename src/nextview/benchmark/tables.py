@@ -17,7 +17,6 @@ from nextview.benchmark.results import (
 from nextview.benchmark.statistics import resample
 from nextview.benchmark.table_runs import (
     MOST_THINGS,
-    TABLE_POLICIES,
     TableJob,
     TableRuns,
     TableSettings,
@@ -28,6 +27,7 @@ from nextview.data import pool
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import UsageError
 from nextview.files import command, only_one
+from nextview.scene.view_policies import SCENE_POLICIES
 from nextview.things.memory import open_memory
 
 # by measure: numerator, denominator, and heading in narrow tables
@@ -59,6 +59,9 @@ def benchmark_tables(
     a good pose (ADD-S below a tenth of the diameter), in the world and in the frame of the last
     camera; and the share of strangers called unknown. An interrupted run resumes.
 
+    All policies choose among the same candidate views, all around the scene at the distance of the
+    last camera.
+
     Args:
         scans: folder of the scans of things that the memory was taught, metres, with the same
             names.
@@ -69,6 +72,7 @@ def benchmark_tables(
 
     Raises:
         UsageError: settings are invalid, or a folder has no meshes.
+        PolicyError: there is no such policy, or one of your own fails.
         ResultsError: OUT contains the results of other settings.
     """
     settings.check()
@@ -89,6 +93,7 @@ def benchmark_tables(
         "network": str(settings.network or ""),
         "scans": len(meshes_in(scans)),
         "strangers": len(meshes_in(strangers)),
+        "kind of views": "candidates of the scene",  # earlier: on a circle, by two policies
         "views": list(settings.views),
         "seed": settings.seed,
     }
@@ -99,7 +104,8 @@ def benchmark_tables(
     with only_one(out):
         check_same(out, shown)
         runs = run_jobs(work_at_table, jobs, TableRuns, workers, track)
-        there = [name for name in TABLE_POLICIES if all(name in e.runs for e in runs)]
+        names = dict.fromkeys([*SCENE_POLICIES, *policies])
+        there = [name for name in names if all(name in e.runs for e in runs)]
         tables = summarise_tables(runs, there, settings)
         made = asdict(settings) | {
             "network": shown["network"],

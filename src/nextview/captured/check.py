@@ -35,6 +35,9 @@ DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
     "TUM RGB-D": "this layout, 5000 per metre",
     "7-Scenes": "this layout, 1000 per metre",
+    "YCB-Video": "factor_depth in the files -meta.mat",
+    "GraspNet": "factor_depth in the files of meta",
+    "PCD": "the clouds, in metres",
     "ROS 2 bag": "as REP 118 has it: 16UC1 millimetres, 32FC1 metres",
 }
 

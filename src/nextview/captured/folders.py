@@ -1,7 +1,7 @@
 """Read captures: depth images with poses, in folders of several layouts and in ROS 2 bags.
 
 BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shotton et al., CVPR
-2013.
+2013. OCID: Suchi et al., ICRA 2019.
 """
 
 import os
@@ -34,6 +34,8 @@ from nextview.captured.frames import (
     read_table,
     rigid,
 )
+from nextview.captured.mat_scenes import META_ENDING, read_graspnet, read_ycb_video
+from nextview.captured.pcd import is_organised, read_clouds, read_pcd_header
 from nextview.checks import number
 from nextview.errors import DatasetError, UsageError
 from nextview.files import read_record
@@ -93,7 +95,7 @@ def read_capture(
 
     Args:
         path: a folder of one of ``FOLDER_LAYOUTS``, a ROS 2 bag (a folder, or its .mcap or .db3
-            file), or a single depth image (.png).
+            file), a single depth image (.png), or a single organised cloud (.pcd).
         intrinsics: see ``Reading``, like all others.
         object_id: of a BOP scene.
         depth_scale: metres.
@@ -153,7 +155,8 @@ def _check_sizes(camera: CameraFile, views: LayoutViews) -> None:
 def is_capture(path: Path) -> bool:
     """Return True if a folder or a bag file contains captured frames in one of the layouts."""
     if path.is_dir():
-        return bool(_layouts_in(path)) or is_bag(path) or is_depth_folder(path)
+        marked = bool(_layouts_in(path)) or is_bag(path) or is_depth_folder(path)
+        return marked or bool(_cloud_files(path))
     return is_bag(path)
 
 
@@ -163,9 +166,12 @@ def _layout_of(path: Path) -> str:
         return BAG
     if path.is_file() and path.suffix.lower() == ".png":
         return ONE_IMAGE
+    if path.is_file() and path.suffix.lower() == ".pcd":
+        return CLOUDS
     if not path.is_dir():
         raise DatasetError(
-            f"{path}: is neither a ROS 2 bag (.mcap, .db3) nor a depth image (.png)"
+            f"{path}: is neither a ROS 2 bag (.mcap, .db3) nor a depth image (.png) nor a cloud"
+            " (.pcd)"
             if path.exists()
             else f"{path}: there is no such file or folder"
         )
@@ -179,8 +185,13 @@ def _layout_of(path: Path) -> str:
     if found:
         return found[0]
 
+    # a sequence of OCID has depth images, too, but no intrinsics
+    if (path / "pcd").is_dir() and _cloud_files(path):
+        return CLOUDS
     if is_depth_folder(path):
         return DEPTH_FOLDER
+    if _cloud_files(path):
+        return CLOUDS
     raise DatasetError(_no_capture(path))
 
 
@@ -191,6 +202,13 @@ def _layouts_in(folder: Path) -> list[str]:
         for layout, files in LAYOUT_MARKS.items()
         if next(folder.glob(files), None)
     ]
+
+
+def _cloud_files(folder: Path) -> list[Path]:
+    """Return the PCD files of a folder, or of a sequence of OCID; empty if none is organised."""
+    inside = "pcd/*.pcd" if (folder / "label").is_dir() else "*.pcd"
+    files = sorted(folder.glob(inside))
+    return files if any(map(is_organised, files[:1])) else []
 
 
 def _check_scale(scale: float) -> None:
@@ -262,10 +280,12 @@ def _no_capture(folder: Path) -> str:
     ):
         look = f"recognise one of them ({mesh}), or teach it them: nextview learn {folder} OUT"
         return f"{folder}: is a folder of meshes, not of captured views; {look}"
+    if cloud := next(islice(folder.rglob("*.pcd"), 1), None):
+        read_pcd_header(cloud)  # raises an error that says why it is no depth image
     known = ", ".join(f"{files} ({layout})" for layout, files in LAYOUT_MARKS.items())
     return (
         f"{folder}: no captured views are found; there is none of {known}, depth/*.png"
-        f" ({DEPTH_FOLDER}), metadata.yaml or *.mcap ({BAG})"
+        f" ({DEPTH_FOLDER}), *.pcd ({CLOUDS}), metadata.yaml or *.mcap ({BAG})"
     )
 
 
@@ -385,9 +405,12 @@ LAYOUT_MARKS = {  # a file that identifies each layout
     "BOP": "scene_camera.json",
     "TUM RGB-D": "depth.txt",
     "7-Scenes": "frame-*.depth.png",
+    "YCB-Video": f"*{META_ENDING}",
+    "GraspNet": "meta/*.mat",
 }
 DEPTH_FOLDER = "depth folder"
 ONE_IMAGE = "depth image"
+CLOUDS = "PCD"
 BAG = "ROS 2 bag"
 
 
@@ -442,6 +465,11 @@ FOLDER_LAYOUTS: dict[
     ),
     "TUM RGB-D": _read_tum,
     "7-Scenes": _read_seven_scenes,
+    "YCB-Video": lambda path, camera, how: read_ycb_video(path, camera),
+    "GraspNet": lambda path, camera, how: read_graspnet(path, camera),
+    CLOUDS: lambda path, camera, how: read_clouds(
+        _cloud_files(path) if path.is_dir() else [path], camera
+    ),
     DEPTH_FOLDER: lambda path, camera, how: read_depth_folder(
         path,
         camera,

@@ -97,8 +97,9 @@ def look(
     listed as unknown, with size and position. Frames that contradict the others are left out.
 
     Args:
-        path: folder of captured depth images with poses (BOP, TUM RGB-D, 7-Scenes, or depth images
-            with camera intrinsics), a ROS 2 bag, or a single depth image (.png).
+        path: folder of captured depth images with poses (BOP, TUM RGB-D, 7-Scenes, YCB-Video,
+            GraspNet, organised PCD clouds, or depth images with camera intrinsics), a ROS 2 bag, or
+            a single depth image (.png) or cloud (.pcd).
     """
     check_file(output.figure, output.overwrite)
     check_file(output.explorer, output.overwrite, (".html",))

@@ -51,14 +51,15 @@ def recognise(
     """Recognise an object from as few views as needed, and print the views and the beliefs.
 
     The input is a mesh file, which is rendered, or captured depth images with poses: a ROS 2 bag,
-    or a folder in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. For each
+    or a folder in the layout of BOP, TUM RGB-D, 7-Scenes, YCB-Video, GraspNet or a RealSense
+    recorder, or of organised PCD clouds. For each
     requested view the nearest captured view is used. The masks of the frames select the object; if
     there are none, --box does. Otherwise it is the object on the support plane nearest to --point,
     or nearest to the optical axis of the first camera.
 
     Args:
         path: OFF, OBJ, PLY, STL or GLB file of one upright object; or a folder or bag of captured
-            views, or a single depth image (.png).
+            views, or a single depth image (.png) or cloud (.pcd).
         more: further objects; with --json each is printed on its own line.
         start: index of the first view, 0 to 39 for the 40 views (ring * 8 + azimuth step); by
             default random.

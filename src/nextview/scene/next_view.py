@@ -1,9 +1,10 @@
-"""Choose the next view of a scene: most information on uncertain objects and hidden areas.
+"""What the next views of a scene may show: information on uncertain objects and hidden areas.
 
 The expected information of a view is summed over the objects. Each object is rendered from each
 candidate view in its likeliest hypotheses, behind everything known to stand in front of it; see
 ``things.expected_views``. Occluded areas may contain further objects. The part of the table that no
 frame has shown therefore counts too, weighted with the density of objects on the visible part.
+``view_policies`` chooses by these values.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from scipy import ndimage
 
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
-from nextview.policies.discriminate_geometry import NEAR_TIE
 from nextview.recognition.protocol import LooksAhead
 from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
@@ -38,7 +38,6 @@ UNKNOWN_WORTH = (
 )
 SURE_WORTH = 0.1  # the same for a settled object, which may be two or hide another one
 SOME_POINTS = 60  # sampled points of an object for the occlusion test
-ENOUGH_VIEWS = 2  # after which an unknown object is settled
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,30 +204,26 @@ def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
     return inside, np.asarray(inside & (depth > away - HIDDEN_STEP))
 
 
-def is_sure(track: Track) -> bool:
-    """Return True if another view would hardly change the recognition of an object."""
-    result = track.result
-    if result is None:
-        return False
-    if track.confident:
-        return True
-    settled = not track.lately_named and len(track.frames) >= ENOUGH_VIEWS
-    return bool(result.unknown and settled)
-
-
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """Candidate views of a whole scene.
 
     Attributes:
         poses: camera-to-world, (V, 4, 4), OpenCV axes, metres.
-        directions: from the centre of the scene to each view, (V, 3), upright axes.
-        free: views that may be taken, (V,) bool.
+        directions: from the centre of the scene to each view, unit vectors, (V, 3), upright axes
+            (z against gravity).
+        free: views that may be chosen: above the plane, within reach, and not close to an earlier
+            view, (V,) bool.
+        travel: straight way from the last camera to each view, (V,), metres.
+        current: direction from the centre of the scene to the last camera, unit vector, (3,),
+            upright axes.
     """
 
     poses: Float
     directions: Float
     free: Mask
+    travel: Float
+    current: Float
 
 
 def candidates(
@@ -255,50 +250,77 @@ def candidates(
     free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_SCENE_CAMERA
     for place in places:
         towards = (place - middle) @ axes.T
-        towards = towards / np.linalg.norm(towards)
+        towards = towards / np.linalg.norm(towards)  # at the end, of the last camera
         free &= np.array(
             [angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions]
         )
-    return Candidates(poses, directions, free)
+    travel = np.linalg.norm(poses[:, :3, 3] - places[-1], axis=1)
+    return Candidates(poses, directions, free, travel, towards)
 
 
-def values(
+def object_value(
     system: System,
+    track: Track,
     tops: Sequence[TableTop],
-    tracks: Sequence[Track],
+    ground: TableGround,
     views: Candidates,
 ) -> Float:
-    """Return the expected information of each candidate view about the whole scene, nats, (V,).
+    """Return the expected information of each view about one object, nats, (V,).
+
+    Where no hypothesis can be rendered, and for a settled object, the value of a view is its
+    distance from the views of the object, times the share of the object that it shows.
 
     Args:
         system: with the taught things.
-        tops: support surfaces of the frames, at least one.
-        tracks: the objects, already judged. If there are none, the value of a view is its distance
-            from the other views.
+        track: the object, already judged.
+        tops: support surfaces of the frames.
+        ground: with everything that may occlude the object.
+        views: the candidates; values of views that are not free have no meaning.
+    """
+    told = None if track.settled else _information(system, track, views)
+    if told is None:
+        told = _from_another_side(track, tops, views)
+        for row in np.flatnonzero(views.free):
+            told[row] *= ground.share_visible(views.poses[row, :3, 3], track)
+    return told
+
+
+def ground_value(
+    ground: TableGround,
+    objects: int,
+    things: int,
+    views: Candidates,
+) -> Float:
+    """Return the expected information of each view about objects on the hidden ground, nats, (V,).
+
+    Args:
+        ground: the table.
+        objects: number of objects that are found on it.
+        things: number of things that are known.
+        views: the candidates; the value of a view that is not free is 0.
+    """
+    value = np.zeros(len(views.poses))
+    if ground.largest_hidden < FEWEST_HIDDEN:
+        return value
+    each = objects * np.log(max(things, 2)) / max(len(ground.hidden), 1)
+    for row in np.flatnonzero(views.free):
+        seen = ground.visible(views.poses[row, :3, 3]) & ground.hidden
+        value[row] = each * np.count_nonzero(seen)
+    return value
+
+
+def elsewhere_value(tops: Sequence[TableTop], views: Candidates) -> Float:
+    """Return the value of each view by its distance from the views of all frames, nats, (V,).
+
+    Args:
+        tops: support surfaces of the frames.
         views: the candidates.
     """
-    if not tracks:
-        return _from_elsewhere(tops, views)
-    worth = np.zeros(len(views.poses))
-    ground = TableGround.of(tops, tracks)
-    for track in tracks:
-        told = None if is_sure(track) else _information(system, track, views)
-        if told is None:  # no hypothesis predicts the other sides
-            told = _from_another_side(track, tops, views)
-            for row in np.flatnonzero(views.free):
-                told[row] *= ground.share_visible(views.poses[row, :3, 3], track)
-        worth += told
-
-    if ground.largest_hidden >= FEWEST_HIDDEN:
-        each = (
-            len(tracks)
-            * np.log(max(len(system.classes), 2))
-            / max(len(ground.hidden), 1)
-        )
-        for row in np.flatnonzero(views.free):
-            seen = ground.visible(views.poses[row, :3, 3]) & ground.hidden
-            worth[row] += each * np.count_nonzero(seen)
-    return worth
+    turned = np.full(len(views.poses), np.pi)
+    for top in tops:
+        ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
+        turned = np.minimum(turned, np.arccos(np.clip(ahead, -1, 1)))
+    return UNKNOWN_WORTH * turned / np.pi
 
 
 def _information(system: System, track: Track, views: Candidates) -> Float | None:
@@ -326,15 +348,6 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     return np.asarray(outlook.expect(inside).information("thing"))
 
 
-def _from_elsewhere(tops: Sequence[TableTop], views: Candidates) -> Float:
-    """Return the value of each view by its distance from the views of all frames, nats, (V,)."""
-    turned = np.full(len(views.poses), np.pi)
-    for top in tops:
-        ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
-        turned = np.minimum(turned, np.arccos(np.clip(ahead, -1, 1)))
-    return UNKNOWN_WORTH * turned / np.pi
-
-
 def _from_another_side(
     track: Track,
     tops: Sequence[TableTop],
@@ -352,24 +365,3 @@ def _from_another_side(
 
     known = track.result is not None and not track.result.unknown
     return (SURE_WORTH if known else UNKNOWN_WORTH) * turned / np.pi
-
-
-def best(views: Candidates, worth: Float, here: Float) -> int | None:
-    """Choose the free view with the most information; of two similar ones, the nearer.
-
-    Args:
-        views: the candidates.
-        worth: expected information of each view, (V,), nats.
-        here: position of the camera, (3,), world, metres.
-
-    Returns:
-        Its row; None without a free view.
-    """
-    if not views.free.any():
-        return None
-    way = np.linalg.norm(views.poses[:, :3, 3] - here, axis=1)
-    value = worth - NEAR_TIE * float(worth[views.free].max()) * way / max(
-        way.max(),
-        1e-9,
-    )
-    return int(np.where(views.free, value, -np.inf).argmax())

@@ -26,6 +26,8 @@ class SceneObject:
         name: of the known thing; "unknown" if it matches none.
         confidence: belief in the name, 0 to 1; 0 for an unknown object.
         confident: whether the belief is high enough to act on.
+        settled: whether another view would hardly change its name: it is confident, or was unknown
+            in two frames at least.
         place: centre of the object, (3,), metres, in the world frame; for a single frame without a
             pose, in the camera frame.
         size: extents of the visible part, (3,), metres: two sides and the height.
@@ -39,6 +41,7 @@ class SceneObject:
     name: str
     confidence: float
     confident: bool
+    settled: bool
     place: Float
     size: Float
     pixels: dict[int, Mask] = field(repr=False)
@@ -67,6 +70,7 @@ class SceneObject:
             name=result.answer or UNKNOWN_NAME,
             confidence=result.confidence,
             confident=track.confident,
+            settled=track.settled,
             place=frame.centre if result.place is None else result.place,
             size=np.ptp(seen @ frame.axes.T, axis=0),
             pixels=track.pixels,

@@ -22,11 +22,17 @@ from nextview.scene.following import (
     contradicted,
 )
 from nextview.scene.judging import Judge
-from nextview.scene.next_view import best, candidates, is_sure, values
+from nextview.scene.next_view import candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
+from nextview.scene.view_policies import (
+    INFORMATION_POLICY,
+    NamedPolicy,
+    SceneChoice,
+    ScenePolicy,
+)
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
@@ -103,6 +109,13 @@ class Scene:
             (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. With None
             the bundled network is used; it also provides the support surfaces if your own
             segmentation does not. Objects that stand on no surface are ignored.
+        policy: chooses ``target``: "target" by expected information, "random", "fixed" for a
+            quarter turn ahead, or your own: a function of a ``SceneChoice`` and a random generator,
+            or MODULE:NAME of one; see ``scene.view_policies``.
+        rng: source of the random numbers of the policy; seed 0 by default.
+
+    Raises:
+        PolicyError: there is no such policy, or it cannot be made.
     """
 
     def __init__(
@@ -113,7 +126,11 @@ class Scene:
         distance: float | None = None,
         reachable: Callable[[Float], bool] | None = None,
         segmentation: Segmenter | None = None,
+        policy: str | ScenePolicy | type = INFORMATION_POLICY,
+        rng: np.random.Generator | None = None,
     ) -> None:
+        self._policy = NamedPolicy.of(policy)
+        self._rng = rng or np.random.default_rng(0)
         self.distance = (
             None if distance is None else number(distance, "the distance", above=0)
         )
@@ -139,9 +156,7 @@ class Scene:
     @property
     def objects(self) -> tuple[SceneObject, ...]:
         """Objects on the table, in the order in which they were found."""
-        state = self._state
-        tracks = sorted(state.tracks, key=lambda track: track.number)
-        return tuple(SceneObject.of(track, state.touching) for track in tracks)
+        return self._state.objects
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
@@ -176,8 +191,12 @@ class Scene:
         """Next view that is expected to settle all objects soonest, camera-to-world, (4, 4).
 
         It maximises the expected information about uncertain objects and about the part of the
-        table that is hidden in all frames, minus a small cost of travel. None before the first
-        frame, if nothing was found, or if no view is left.
+        table that is hidden in all frames, minus a small cost of travel; or it is the choice of
+        another ``policy``, which is asked once after each frame. None before the first frame, if
+        nothing was found, or if no view is left.
+
+        Raises:
+            PolicyError: a policy of your own failed.
         """
         with self._lock:
             state = self._state
@@ -189,9 +208,10 @@ class Scene:
                 if self.reachable is not None:
                     can = [bool(self.reachable(pose)) for pose in views.poses]
                     views = replace(views, free=views.free & np.array(can))
-                worth = values(self.system, state.tops, state.tracks, views)
-                row = best(views, worth, state.tops[-1].frame.camera_to_world[:3, 3])
-                self._target = None if row is None else views.poses[row]
+                if not views.free.any():
+                    return None
+                choice = SceneChoice(views, state, self.system)
+                self._target = views.poses[self._policy.choose(choice, self._rng)]
             return self._target
 
     def update(self, frame: Frame) -> Look:
@@ -352,7 +372,7 @@ class Scene:
 
         A settled object that is visible at its known place is not judged again.
         """
-        if is_sure(track) and len(track.frames) >= ENOUGH_FRAMES:
+        if track.settled and len(track.frames) >= ENOUGH_FRAMES:
             rendered = render_track(track, top, number, track.posed)
             if rendered is not None:
                 explained, every = rendered.fit(mask)

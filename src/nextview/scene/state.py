@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from nextview.checks import number_of
-from nextview.scene.next_view import FEWEST_HIDDEN, TableGround, is_sure
+from nextview.scene.next_view import FEWEST_HIDDEN, TableGround
+from nextview.scene.objects import SceneObject
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box
@@ -45,6 +46,17 @@ class SceneState:
     next_number: int = 1
     left_unknown: int = 0
 
+    @property
+    def objects(self) -> tuple[SceneObject, ...]:
+        """The objects as users see them, in the order in which they were found."""
+        tracks = sorted(self.tracks, key=lambda track: track.number)
+        return tuple(SceneObject.of(track, self.touching) for track in tracks)
+
+    @cached_property
+    def ground(self) -> TableGround | None:
+        """Top view of the table, and what of it is hidden; None without an object."""
+        return TableGround.of(self.tops, self.tracks) if self.tracks else None
+
     @cached_property
     def unexplained(self) -> list[UnexplainedPatch]:
         """Points that are neither ground nor an object."""
@@ -58,12 +70,11 @@ class SceneState:
     @cached_property
     def settled(self) -> bool:
         """True if there is at least one frame and further views would add little."""
-        if self.unexplained or not all(is_sure(track) for track in self.tracks):
+        if self.unexplained or not all(track.settled for track in self.tracks):
             return False
-        if not self.tracks:
+        if self.ground is None:
             return self.ground_seen
-        ground = TableGround.of(self.tops, self.tracks)
-        return ground.largest_hidden < FEWEST_HIDDEN
+        return self.ground.largest_hidden < FEWEST_HIDDEN
 
     @property
     def around(self) -> Float:

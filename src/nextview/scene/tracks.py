@@ -28,6 +28,7 @@ AGREES = 0.006  # metres, tolerance of the depth of a scan in addition to the no
 AGREES_NOISE = 3.0  # tolerance in standard deviations of the noise
 # metres, additional tolerance in frames that were not used for the registration
 OTHER_VIEW = 0.008
+ENOUGH_VIEWS = 2  # frames after which an unknown object is settled
 EDGE_WIDTH = 4  # pixels around the outline of a scan in which depth is unreliable
 WINDOW_EDGE = 12  # pixels, margin of a window around an outline
 
@@ -61,6 +62,16 @@ class Track:
     def confident(self) -> bool:
         """True if its name is confident enough to act on."""
         return self.result is not None and self.result.confident
+
+    @property
+    def settled(self) -> bool:
+        """True if another view would hardly change the recognition of the object."""
+        if self.result is None:
+            return False
+        if self.confident:
+            return True
+        looked_at = not self.lately_named and len(self.frames) >= ENOUGH_VIEWS
+        return bool(self.result.unknown and looked_at)
 
     @property
     def posed(self) -> PoseCandidate | None:

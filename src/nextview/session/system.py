@@ -56,7 +56,7 @@ MOST_THREADS = 1024
 DEFAULT_MODELS = "modelnet10"
 UNKNOWN_ALPHA = 0.02
 # suffixes of captured frames, as opposed to meshes
-FRAME_FILES = (".mcap", ".db3", ".bag", ".png")
+FRAME_FILES = (".mcap", ".db3", ".bag", ".png", ".pcd")
 
 
 @dataclass(frozen=True, repr=False)
