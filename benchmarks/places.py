@@ -22,11 +22,11 @@ nothing. The poses of the camera are wrong by ``--arm-error``, along and about e
 OUT.jsonl gets a line for each episode; episodes that it holds are not run again. Printed is for
 each place how many are named right after 1, 2 and 3 views, and after the third how many are
 confident and wrong, and unknown, with 95 % Wilson intervals; the median distance of the true
-surface from the posed one, in the world (with the error of the arm) and in the last camera's frame,
-each as median and 90 % quantile of the things that are named right; and the CPU time of a view. A
-view that shows fewer than 350 pixels of the thing is taken from elsewhere, up to 6 times, and then
-not judged. Confident is what the default rule of ``nextview.load`` would stop at. MuJoCo draws with
-``MUJOCO_GL=egl`` unless another is named.
+surface from the posed one in the world, with the error of the arm, as median and 90 % quantile of
+the things that are named right; and the CPU time of a view. A view that shows fewer than 350 pixels
+of the thing is taken from elsewhere, up to 6 times, and then not judged. Confident is what the
+default rule of ``nextview.load`` would stop at. MuJoCo draws with ``MUJOCO_GL=egl`` unless another
+is named. The things come in a random order, so what is there of a run that was ended is a sample.
 """
 
 from __future__ import annotations
@@ -138,9 +138,8 @@ class AfterView:
         belief: in the answer.
         doubt: why the answer is not confident whatever the belief is.
         refused: why the frame was refused.
-        world_mm: median and 90 % quantile of the distances of the true surface from that of the
+        off_mm: median and 90 % quantile of the distances of the true surface from that of the
             posed scan, millimetres, in the world; None unless the name is right.
-        camera_mm: the same in the frame of this view's camera.
         seconds: of CPU for the view.
     """
 
@@ -151,8 +150,7 @@ class AfterView:
     belief: float
     doubt: str
     refused: str
-    world_mm: tuple[float, float] | None
-    camera_mm: tuple[float, float] | None
+    off_mm: tuple[float, float] | None
     seconds: float
 
 
@@ -598,10 +596,18 @@ def field(rng: np.random.Generator) -> Float:
     return noise / noise.std()
 
 
+def slope_along(values: Float, axis: int) -> Float:
+    """Steps to the next pixel or from the last, (H, W), whichever are smaller: edges have none."""
+    steps = np.diff(values, axis=axis)
+    before = np.insert(steps, 0, np.inf, axis)
+    after = np.insert(steps, steps.shape[axis], np.inf, axis)
+    return np.where(np.abs(before) < np.abs(after), before, after)
+
+
 def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
     """What a stereo camera makes of depth: (H, W), metres, in; millimetres, 0 for holes, out."""
     true = FOCAL * STEREO_BASE / depth  # disparities, pixels
-    slopes = np.gradient(true)
+    slopes = [slope_along(true, axis) for axis in (0, 1)]
     rows, columns = np.indices(IMAGE)
     x, y = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]
     # The disparity of a plane is linear in the image.
@@ -786,9 +792,6 @@ def recognised(
         belief = np.array([result.confidence])
         enough = bool(rule.reached(belief, max(len(result.views), 1)))
         pose = result.pose if answer == name else None
-        seen_pose = (
-            None if pose is None else shot.pose @ np.linalg.inv(shot.told) @ pose
-        )
         found.append(
             AfterView(
                 pixels=shot.pixels,
@@ -798,8 +801,7 @@ def recognised(
                 belief=round(result.confidence, 4),
                 doubt=result.doubt if result.views else "",
                 refused=refused,
-                world_mm=None if pose is None else apart(scan, true, pose),
-                camera_mm=None if seen_pose is None else apart(scan, true, seen_pose),
+                off_mm=None if pose is None else apart(scan, true, pose),
                 seconds=round(seconds, 3),
             )
         )
@@ -825,6 +827,7 @@ def episode(place: Place, name: str, terms: Terms) -> dict[str, Any]:
     true[:3, 3] = thing.xpos
     shots, distance = shots_of(place, scene, scan_of(terms.scans, name), terms, rng)
     found = recognised(place, name, shots, distance, true, terms)
+    line["tries"] = tries + 1
     return {**line, "views": [None if view is None else asdict(view) for view in found]}
 
 
@@ -836,9 +839,9 @@ def share(count: int, total: int) -> str:
     return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"
 
 
-def distances(views: Sequence[dict[str, Any]], frame: str) -> str:
+def distances(views: Sequence[dict[str, Any]]) -> str:
     """Median and 90 % quantile of the median distances of surfaces, mm."""
-    medians = [view[frame][0] for view in views if view[frame] is not None]
+    medians = [view["off_mm"][0] for view in views if view["off_mm"] is not None]
     if not medians:
         return "-"
     low, high = np.quantile(medians, (0.5, 0.9))
@@ -872,7 +875,7 @@ def table(lines: Sequence[dict[str, Any]]) -> Iterator[str]:
         cells.append(share(sum(v["answer"] is None for v in end), len(end)))
         views = [view for some in after for view in some]
         cells.append(f"{sum(bool(view['refused']) for view in views)} of {len(views)}")
-        cells += [distances(end, "world_mm"), distances(end, "camera_mm")]
+        cells.append(distances(end))
         cells.append(
             f"{np.median([view['seconds'] for view in views]):.2f}" if views else "-"
         )
@@ -906,9 +909,8 @@ def main(
     names = sorted(path.stem for path in scans.glob("*.ply"))
     if not names:
         raise UsageError(f"{scans}: holds no scan, NAME.ply")
-    if things:
-        drawn = np.random.default_rng(seed).permutation(len(names))[:things]
-        names = sorted(names[index] for index in drawn)
+    names = np.random.default_rng(seed).permutation(names).tolist()
+    names = names[: things or None]
 
     terms = Terms(str(scans), models, seed, arm_error, any_orientation)
     # as JSON gives it back
