@@ -250,11 +250,7 @@ def table(lines: Sequence[dict[str, Any]]) -> Iterator[str]:
     last = f"after {VIEW_COUNT}"
     heads += [f"confident and right {last}", f"confident and wrong {last}"]
     heads += [f"unknown {last}", "refused frames"]
-    heads += [
-        "mm in the world: median, 90 %",
-        "mm in the camera: median, 90 %",
-        "s a view",
-    ]
+    heads += [f"off {last}, mm: median, 90 %", "s a view"]
     yield f"| place | shown | {' | '.join(heads)} |"
     yield "|---" * (len(heads) + 2) + "|"
     for place in (*PLACES, "all"):
