@@ -90,6 +90,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
+    r"benchmarks\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
         "needs the YCB scans, and minutes"
     ),
