@@ -1,8 +1,6 @@
 """Teach things: from scans or captured frames to a memory, without PyTorch."""
 
 import glob
-import hashlib
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ from typing import Any, Literal, TypedDict, Unpack
 import numpy as np
 from msgspec.structs import replace as replace_record
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from nextview.checks import one_line
 from nextview.data.pool import GivenItem, Result, WorkerDied, each
@@ -23,7 +21,6 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import (
     OVERWRITE,
     check_new,
-    command,
     new_file,
     new_folder,
     only_one,
@@ -32,29 +29,26 @@ from nextview.files import (
 )
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.resting import resting_poses, rotated
-from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
-    FEATURE_NETWORK,
     MEMORY_SUFFIX,
     SHORT_HASH,
     ModelCard,
-    Symmetry,
-    Taught,
-    Thing,
-    Training,
-    find_card,
     memory_path,
     read_card,
     write_card,
 )
 from nextview.teaching.learned_picture import draw_learned
+from nextview.teaching.memory_card import (
+    MEMORY_NAME,
+    PER_THING,
+    Pair,
+    card_of,
+    fitted,
+    with_verification,
+)
 from nextview.teaching.memory_fit import (
     VIEWS_FITTED,
-    Fit,
-    fit_memory,
-    fit_without_features,
-    size_evidence,
 )
 from nextview.teaching.sizes import check_sizes
 from nextview.teaching.symmetries import named_symmetries
@@ -70,6 +64,7 @@ from nextview.teaching.thing_views import (
     rows_of,
     teach,
 )
+from nextview.teaching.unfinished_things import finished, part_of, stamp_of
 from nextview.teaching.verification_fit import (
     GROWTH,
     Shown,
@@ -82,19 +77,13 @@ from nextview.teaching.verification_fit import (
 )
 from nextview.teaching.view_features import Arrays, features_of, without_features
 from nextview.things.memory import (
-    AZIMUTHS,
     Memory,
     TaughtRecogniser,
     check_features,
     open_memory,
 )
-from nextview.things.stored_surfaces import StoredSurfaces
-from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
-from nextview.types import Index
 
-# of the card in a folder of taught things, and of the file beside it
-MEMORY_NAME = "memory"
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"
@@ -102,7 +91,6 @@ LEARNED_PICTURE = "learned.png"
 JUDGED = "judged"
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 PARTS = "things"
-Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
 
 
 @dataclass(frozen=True)
@@ -482,9 +470,6 @@ def _features_again(how: TeachingOptions, item: tuple[int, str, Arrays]) -> Arra
     return {"rotations": rotations, **features_of(lying, name, how.sensor, how.seed)}
 
 
-PER_THING = ("held_out", "held_out_views", "radii", "pictures")
-
-
 def _teach(
     sources: Sequence[ThingSource],
     work: Work,
@@ -494,8 +479,8 @@ def _teach(
     """Teach things in parallel, each into its own file; finished ones are kept."""
     waiting = []
     for source in sources:
-        stamp = _stamp(source, work)
-        arrays = _finished(_part_of(work.part, source), stamp)
+        stamp = stamp_of(source, work.how, work.of_classes)
+        arrays = finished(part_of(work.part, source), stamp)
         if arrays is not None:
             taught.append((source, _without_phrase(source, arrays, left_out)))
         else:
@@ -529,71 +514,6 @@ def _without_phrase(source: ThingSource, arrays: Arrays, left_out: list[str]) ->
     return {name: values for name, values in arrays.items() if name != LEFT_OUT}
 
 
-def _stamp(source: ThingSource, work: Work) -> str:
-    """What the part of a thing was made from: it is made anew if any of this has changed.
-
-    That is its path, the name, size and time of its file or of each file in its folder, the
-    options, and the features. The time of the folder itself does not tell: copying over its files
-    leaves it as it was.
-    """
-    content = hashlib.sha256()
-    for file in _files_of(source.path):
-        try:
-            status = file.stat()
-            seen = f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0"
-        except OSError as error:  # a broken link: what reads the thing says so
-            seen = f"{file}\0{error.errno}\0"
-        content.update(seen.encode(errors="surrogateescape"))
-
-    features = find_card(FEATURE_NETWORK).sha256
-    return repr(
-        (
-            str(source.path.resolve()),
-            content.hexdigest(),
-            replace(work.how, any_size=False, symmetry=()),
-            work.of_classes,
-            features,
-        )
-    )
-
-
-def _files_of(path: Path) -> Iterator[Path]:
-    """A file itself, or all files in a folder, also behind links to folders, in order."""
-    if not path.is_dir():
-        yield path
-        return
-
-    for place, folders, names in os.walk(path, followlinks=True):
-        real = Path(place).resolve()
-        above = {real, *real.parents}
-        # A link to a folder above would be walked for ever.
-        folders[:] = [
-            name for name in sorted(folders) if Path(place, name).resolve() not in above
-        ]
-        yield from (Path(place, name) for name in sorted(names))
-
-
-def _part_of(part: Path, source: ThingSource) -> Path:
-    """Return the file of an unfinished run in which a thing is kept.
-
-    Its name has a limited length.
-    """
-    name = source.name.encode(errors="surrogateescape")
-    return part / f"{hashlib.sha256(name).hexdigest()[:32]}.safetensors"
-
-
-def _finished(file: Path, stamp: str) -> Arrays | None:
-    """Return a thing that an interrupted run has taught; None if it cannot be used."""
-    try:
-        arrays = load_file(file)
-    except (OSError, SafetensorError):  # missing, or damaged: it is made again
-        return None
-    found = arrays.pop("stamp", None)
-    if found is None or found.tobytes() != stamp.encode(errors="surrogateescape"):
-        return None
-    return arrays
-
-
 def _teach_one(
     how: TeachingOptions,
     part: Path,
@@ -609,7 +529,7 @@ def _teach_one(
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
     noted = np.frombuffer(stamp.encode(errors="surrogateescape"), np.uint8)
-    with new_file(_part_of(part, source), overwrite=True) as file:
+    with new_file(part_of(part, source), overwrite=True) as file:
         save_file(arrays | {"stamp": noted}, file)
     return arrays
 
@@ -629,8 +549,8 @@ def _write(
     """
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
-    memory, fit = _fitted(taught, label)
-    card = _card(
+    memory, fit = fitted(taught, label)
+    card = card_of(
         taught,
         classes,
         label,
@@ -640,7 +560,7 @@ def _write(
     )
     verified = _verified(card, memory, old, work)
     if verified is not None:
-        card = _with_verification(card, memory, verified)
+        card = with_verification(card, memory, verified)
         if verified.accuracy:
             first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
             confused = tuple(
@@ -774,149 +694,6 @@ def _all_done(
     if items:
         work.track(watched(), len(items), what)
     return found
-
-
-def _with_verification(
-    card: ModelCard,
-    memory: Memory,
-    verified: VerifiedFit,
-) -> ModelCard:
-    """Return a card with the fits to the surfaces; residuals are 0 without geometry."""
-    about = card.memory
-    assert about is not None
-    verification = verified.verification
-    if verification.usual:
-        usual = np.zeros(len(about.things))
-        usual[memory.surfaces.counts[:, 0] > 0] = verification.usual
-        verification = replace_record(verification, usual=tuple(usual.tolist()))
-
-    scores = dict(card.scores)
-    if verified.accuracy:
-        scores["verified by geometry"] = _by_views(verified.accuracy)
-        scores["the same by outline"] = _by_views(verified.by_outline)
-    return replace_record(
-        card,
-        memory=replace_record(about, verification=verification),
-        scores=scores,
-    )
-
-
-def _by_views(shares: Sequence[float]) -> dict[str, float]:
-    """Shares after 1, 2, ... views, as a card holds them."""
-    return {
-        str(k): round(share, 4) for k, share in zip(VIEWS_FITTED, shares, strict=False)
-    }
-
-
-def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
-    """Return the memory of all things, and what is fitted to them together.
-
-    ``label`` is the class of each thing.
-    """
-    poses = [len(arrays["rotations"]) for _, arrays in taught]
-    thing = np.repeat(np.arange(len(taught)), poses)
-    stacked = {
-        name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING
-    }
-    stacked["radii"] = stacked["radii"][:, 0]
-    joint = {
-        name: np.concatenate([arrays[name] for _, arrays in taught])
-        for name in ("views", "rotations")
-    }
-    if joint["views"].shape[-1]:
-        fit = fit_memory(
-            joint["views"],
-            thing,
-            label,
-            *(stacked[name] for name in PER_THING[:3]),
-        )
-    else:
-        fit = fit_without_features(int(label.max()) + 1)
-    surfaces = StoredSurfaces.of(
-        [_surface_of(source, arrays) for source, arrays in taught]
-    )
-    memory = Memory(
-        thing=thing,
-        head=fit.head,
-        head_bias=fit.head_bias,
-        surfaces=surfaces,
-        **joint,
-        **stacked,
-    )
-
-    return memory, fit
-
-
-def _surface_of(source: ThingSource, arrays: Arrays) -> Surface | None:
-    """The surface of a thing; None if its size is not known."""
-    if VERTICES not in arrays:
-        return None
-    return Surface(source.name, arrays[VERTICES], arrays[FACES])
-
-
-def _card(
-    taught: Sequence[Pair],
-    classes: tuple[str, ...],
-    label: Index,
-    memory: Memory,
-    fit: Fit,
-    commands: tuple[str, ...],
-) -> ModelCard:
-    """Return the card of a memory, without the hash of its file.
-
-    ``commands`` produced the earlier content of the memory.
-    """
-    poses = np.bincount(memory.thing)
-    things = tuple(
-        Thing(
-            source.name,
-            str(source.path),
-            int(count),
-            _symmetries_of(arrays, SYMMETRIES),
-            _symmetries_of(arrays, NEAR_SYMMETRIES),
-            bool(arrays[UPRIGHT][0]),
-        )
-        for (source, arrays), count in zip(taught, poses, strict=True)
-    )
-
-    features = find_card(FEATURE_NETWORK)
-    novelty, usual = (
-        tuple(map(tuple, np.round(rows, 4).tolist()))
-        for rows in (fit.quantiles, fit.usual)
-    )
-
-    return ModelCard(
-        MEMORY_NAME,
-        "recogniser",
-        features.input,
-        "0" * 64,
-        network=f"memory of {'views' if memory.has_features else 'surfaces'}",
-        classes=classes,
-        azimuth_bins=AZIMUTHS if memory.has_features else 0,
-        calibration=Calibration(
-            1.0,
-            1.0,
-            None,
-            fit.correlation,
-            tuple(label[memory.thing].tolist()),
-        ),
-        size=size_evidence(memory.radii, label),
-        training=Training(f"{len(taught)} things", commands=commands),
-        scores={"held-out views": _by_views(fit.accuracy)} if fit.accuracy else {},
-        memory=Taught(
-            things,
-            features.sha256 if memory.has_features else None,
-            fit.weight,
-            novelty=novelty,
-            usual=usual,
-        ),
-    ).made_by(command())
-
-
-def _symmetries_of(arrays: Arrays, name: str) -> tuple[Symmetry, ...]:
-    """The symmetries of a thing under this name; () where its geometry is not known."""
-    rows = arrays.get(name, np.zeros((0, 4))).tolist()
-    return tuple(Symmetry((x, y, z), int(order)) for x, y, z, order in rows)
 
 
 def _is_intact(weights: Path, sha256: str) -> bool:
