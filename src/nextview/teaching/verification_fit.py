@@ -152,6 +152,7 @@ def _opened(card: Path) -> tuple[TaughtThings, Index]:
     recogniser = TaughtRecogniser(card, threads=1)
     known = TaughtThings.of(recogniser)
     assert known is not None
+    known.verifier.prepare()
     return known, class_of_things(recogniser, known)
 
 
