@@ -489,6 +489,16 @@ def test_things_of_known_geometry_hold_no_features(knobs_memory):
     assert memory.views.size == memory.held_out.size == 0
 
 
+def test_removing_from_a_memory_without_features_shows_nothing_and_says_so(
+    knobs_memory, tmp_path
+):
+    mine = shutil.copytree(knobs_memory, tmp_path / "mine")
+    learned = nextview.learn(mine, mine, remove=("can",), workers=0)
+    assert learned.accuracy == ()
+    assert str(learned).splitlines()[0] == "2 things learned"
+    assert (mine / "learned.png").stat().st_size > 0
+
+
 def test_a_card_says_whether_there_are_features(knobs_memory, mixed_memory, tmp_path):
     features = read_card(mixed_memory / "memory.json").memory.features_sha256
     said = shutil.copytree(knobs_memory, tmp_path / "said")

@@ -17,6 +17,7 @@ from test_verification import (
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
@@ -24,6 +25,9 @@ from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
 from nextview.things.stability import is_stable
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
+    RENDERING_PIXELS,
+    TEMPLATE_DIRECTIONS,
+    TEMPLATE_DISTANCE,
     TEMPLATE_SIDE,
     Pictures,
     SeenOutline,
@@ -47,6 +51,45 @@ def verifier():
 @pytest.fixture(scope="module")
 def templates(verifier):
     return verifier.templates
+
+
+def test_a_template_is_what_a_camera_that_looks_from_there_sees(verifier, templates):
+    """By the code that computes the outline of a single view."""
+    looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
+    camera = PinholeCamera.centred(
+        RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1),
+        (RENDERING_PIXELS, RENDERING_PIXELS),
+    )
+    caster = verifier.caster
+    own = np.flatnonzero(templates.things == 1)
+    assert len(own) == len(looks)  # something shows from everywhere
+    away = TEMPLATE_DISTANCE * float(caster.radii[1])
+    for at in (0, 70, 161):
+        origin = caster.centres[1] - away * looks[at, 2]
+        rays = camera.rays.reshape(-1, 3) @ looks[at]
+        depth, _ = caster.cast(
+            np.array([1]),
+            origin[None].astype(np.float32),
+            rays[None].astype(np.float32),
+        )
+        image = depth.reshape(RENDERING_PIXELS, RENDERING_PIXELS)
+        shown = np.isfinite(image)
+        seen = SeenOutline.of_depth(image, shown, shown | True, camera, np.eye(4))
+        pictures = seen.pictures(seen.size, np.zeros(2), turned_grid(np.zeros(1)))
+
+        row = own[at]
+        assert templates.sizes[row] == pytest.approx(seen.size)
+        np.testing.assert_array_equal(
+            templates.pictures.outline[row], pictures.outline[0]
+        )
+        np.testing.assert_allclose(
+            templates.pictures.depth[row], pictures.depth[0], atol=1e-5
+        )
+        np.testing.assert_allclose(templates.rotations[row], seen.axes.T @ looks[at])
+        middle = np.array([0, 0, away]) - seen.middle * seen.ahead
+        np.testing.assert_allclose(
+            templates.offsets[row], seen.axes.T @ middle, atol=1e-9
+        )
 
 
 def turned_views(mesh: Mesh, turn: np.ndarray):

@@ -49,6 +49,7 @@ def read_ycb_video(folder: Path, given: CameraFile | None) -> LayoutViews:
     views = LayoutViews([], [], z_is_up=False)
     if given is None:
         views.notes.append(f"intrinsics of the *{META_ENDING} files")
+
     metas = sorted(folder.glob(f"*{META_ENDING}"))
     for path in metas:
         name = path.name.removesuffix(META_ENDING)
@@ -59,6 +60,7 @@ def read_ycb_video(folder: Path, given: CameraFile | None) -> LayoutViews:
         except DatasetError as error:
             views.unreadable[name] = str(error)
             continue
+
         pictures = (folder / f"{name}-color{ending}" for ending in (".png", ".jpg"))
         views.frames.append(
             CapturedFrame(
@@ -89,12 +91,14 @@ def read_graspnet(folder: Path, given: CameraFile | None) -> LayoutViews:
     to_table = np.eye(4)
     if table.exists():
         to_table = rigid(_matrices(table, (4, 4)), str(table))
+
     views = LayoutViews([], [], z_is_up=table.exists())
     views.notes.append(
         "poses of camera_poses.npy on the table of cam0_wrt_table.npy"
         if table.exists()
         else "poses of camera_poses.npy: the first camera is the world"
     )
+
     for path in images:
         meta_file = folder / f"meta/{path.stem}.mat"
         try:
@@ -109,6 +113,7 @@ def read_graspnet(folder: Path, given: CameraFile | None) -> LayoutViews:
         except DatasetError as error:
             views.unreadable[path.stem] = str(error)
             continue
+
         picture = folder / f"rgb/{path.name}"
         views.frames.append(
             CapturedFrame(
@@ -158,6 +163,7 @@ def _small_variables(content: bytes) -> bytes:
     kept = [content[:MAT_HEADER]]
     order = {b"IM": "<", b"MI": ">"}[content[MAT_HEADER - 2 : MAT_HEADER]]
     at = MAT_HEADER
+
     while at < len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
         element = content[at : at + 8 + size]

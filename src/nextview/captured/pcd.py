@@ -135,7 +135,7 @@ def read_clouds(paths: Sequence[Path], given: CameraFile | None) -> LayoutViews:
             header = read_pcd_header(path)
             if intrinsics is None:
                 intrinsics = _fitted(header)
-                fx, fy = intrinsics[0, 0], intrinsics[1, 1]
+                fx, fy = intrinsics.diagonal()[:2]
                 cx, cy = intrinsics[:2, 2]
                 views.notes.append(
                     f"intrinsics fitted to {path.name}: {fx:.1f} {fy:.1f} {cx:.1f} {cy:.1f}"
@@ -256,6 +256,7 @@ def fitted_intrinsics(points: Float) -> tuple[Float, float]:
     rows, columns = np.nonzero(measured)
     if len(rows) < FEWEST_POINTS:
         return np.eye(3), np.inf
+
     x, y, z = points[measured].T
     fitted = []
     for across, at in ((x / z, columns), (y / z, rows)):
@@ -264,6 +265,7 @@ def fitted_intrinsics(points: Float) -> tuple[Float, float]:
             return np.eye(3), np.inf
         focal = float(spread @ (at - at.mean()) / (spread @ spread))
         fitted += [focal, float(at.mean() - focal * across.mean())]
+
     fx, cx, fy, cy = fitted
     intrinsics = pinhole_matrix(fx, fy, cx, cy)
     if not (np.isfinite(fitted).all() and fx > 0 and fy > 0):
@@ -324,6 +326,7 @@ def _header_lines(begin: bytes) -> tuple[dict[str, list[str]], int]:
         at = end + 1
         if words and not words[0].startswith("#"):
             lines[words[0]] = words[1:]
+
     if "FIELDS" not in lines and "COLUMNS" in lines:  # before version 0.6
         lines["FIELDS"] = lines["COLUMNS"]
     for name in ("FIELDS", *_COUNTS):
@@ -341,6 +344,7 @@ def _point_type(lines: dict[str, list[str]]) -> np.dtype:
     sizes = [int(word) for word in lines.get("SIZE", ["4"] * len(names))]
     types = lines.get("TYPE", ["F"] * len(names))
     counts = [int(word) for word in lines.get("COUNT", ["1"] * len(names))]
+
     fields = []
     for n, (name, size, letter, count) in enumerate(
         zip(names, sizes, types, counts, strict=True)
@@ -361,6 +365,7 @@ def _ascii_points(header: PcdHeader) -> Float:
     lengths = [header.point[name].shape[0] for name in names]
     before = dict(zip(names, np.cumsum([0, *lengths]).tolist(), strict=False))
     count = header.width * header.height
+
     with header.path.open("rb") as file:
         file.seek(header.start)
         found = np.loadtxt(
@@ -406,6 +411,7 @@ def _packed_points(header: PcdHeader) -> Float:
             raise ValueError(f"{said} bytes where {size} are expected")
         _check_left(header, 8 + packed_size)
         packed = file.read(packed_size)
+
     content = decompress_lzf(packed, size)
     assert header.point.fields is not None
     found = []

@@ -245,14 +245,14 @@ class NamedPolicy:
                 or chooses a view that is not free.
         """
         if self.values in SCENE_POLICIES.values():
-            said: Any = self.values(choice, rng)
+            said = np.asarray(self.values(choice, rng))
         else:
             with plugin_errors(
                 lambda raised: PolicyError(f"policy {self.name} raised {raised}")
             ):
                 said = np.asarray(self.values(choice, rng))
+
         free = choice.views.free
-        said = np.asarray(said)
         if said.ndim == 0 and np.issubdtype(said.dtype, np.integer):
             return self._row(said.item(), free)
         if said.shape != free.shape or said.dtype.kind not in "fiu":
@@ -260,6 +260,7 @@ class NamedPolicy:
                 f"policy {self.name} has to return {len(free)} numbers, one for each view, or the"
                 f" row of a view, not {said.dtype} of the shape {said.shape}"
             )
+
         valued = free & ~np.isnan(said)
         if not valued.any():
             raise PolicyError(f"policy {self.name} values every free view as NaN")

@@ -125,7 +125,7 @@ class Learned:
         accuracy: share of the cases in which views are named right after 1, 2 and 3 of them, by
             geometry where it is known, with weights that were fitted to other things, else after 1,
             2, 3 and 5 held-out views by features and size; things of a class of several by the
-            others of that class.
+            others of that class. () if nothing was shown, as when things were only removed.
         confused: pairs of things that are most often taken for each other, with the share of the
             cases.
         notes: what there is to know, a sentence each.
@@ -148,7 +148,8 @@ class Learned:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         thing = "thing" if self.things == 1 else "things"
-        lines = [f"{self.things} {thing}{classes} learned; {self._how_often()}"]
+        told = f"; {self._how_often()}" if self.accuracy else ""
+        lines = [f"{self.things} {thing}{classes} learned{told}"]
         lines += [
             f"confused: {a} and {b} ({share:.0%} of the cases)"
             for a, b, share in self.confused[:5]

@@ -59,8 +59,9 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     page.set_axis_off()
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0))  # inches from the top left corner
     _draw_things(page, pictures, shown)
-    _draw_bars(figure, fit, height)
-    _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
+    if fit.accuracy:
+        _draw_bars(figure, fit, height)
+        _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
     # a picture sets them anew
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")
     figure.savefig(path)

@@ -199,7 +199,13 @@ class _Compared:
         return seen if seen.any() else ~seen
 
     def turned(self, axis: Float, turn: float, kind: Kind) -> _Turned:
-        """Compare with the copy that is turned about an axis by a part of a full turn."""
+        """Compare with the copy that is turned about an axis.
+
+        Args:
+            axis: unit vector, (3,).
+            turn: of a full turn.
+            kind: of symmetry that is looked for.
+        """
         key = (axis.tobytes(), turn)
         if key not in self._known:
             self._known[key] = self._guessed(axis, turn)

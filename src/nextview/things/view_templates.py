@@ -304,7 +304,10 @@ class _Rendered:
 
 
 def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
-    """Render one thing by cameras with these axes, (N, 3, 3), all at once."""
+    """Render one thing by cameras with these axes, (N, 3, 3), all at once.
+
+    What ``SeenOutline`` computes of a view is computed for all of them in the same way.
+    """
     radius = float(caster.radii[thing])
     focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
     camera = PinholeCamera.centred(focal, (RENDERING_PIXELS, RENDERING_PIXELS))
@@ -320,7 +323,9 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     )
     shown = np.isfinite(depth)
     kept = shown.sum(1) >= FEWEST_OUTLINE_PIXELS
-    looks, depth, shown = looks[kept], depth[kept], shown[kept]
+    looks = looks[kept]
+    depth = depth[kept]
+    shown = shown[kept]
 
     # middle and spread of each outline, and its median depth
     count = shown.sum(1)
