@@ -72,6 +72,7 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import ObservationError, UsageError
 from nextview.recognition.belief import Stopping
 from nextview.sensing import Frame, ObservedObject
+from research.extras import extras
 
 STAGINGS_TRIED = 12  # of a thing in a place
 
@@ -298,6 +299,9 @@ def main(
         any_orientation: places in which the things are recognised in any orientation.
         workers: processes.
     """
+    with extras():
+        import mujoco  # noqa: F401  # staged_things needs it
+
     names = sorted(path.stem for path in scans.glob("*.ply"))
     if not names:
         raise UsageError(f"{scans}: holds no scan, NAME.ply")

@@ -18,7 +18,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import mujoco
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -133,6 +132,8 @@ def add_scan(
     scale: float = 1.0,
 ) -> None:
     """Add a scan to a scene, free to fall unless its place and rotation are given."""
+    import mujoco
+
     body = spec.worldbody.add_body(name=body_name)
     if pose is None:
         body.add_freejoint()
@@ -160,6 +161,8 @@ def add_box(
     body: Any, low: Sequence[float], high: Sequence[float], turn: Float | None = None
 ) -> None:
     """Add a box to a body by two opposite corners, (3,), metres, and its rotation, (3, 3)."""
+    import mujoco
+
     corners = np.array([low, high], float)
     box = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX)
     box.pos = corners.mean(0)
@@ -170,6 +173,8 @@ def add_box(
 
 def room(rng: np.random.Generator, table: bool = True) -> Any:
     """A floor and four walls, with a table of uneven planks whose top is near 0."""
+    import mujoco
+
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -253,6 +258,8 @@ def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
 
 def touching(model: Any, data: Any) -> dict[str, float]:
     """What the thing touches, by names of bodies, and the normal force of each, newtons."""
+    import mujoco
+
     forces: dict[str, float] = {}
     for number, contact in enumerate(data.contact):
         names = [
@@ -485,6 +492,8 @@ STAGES: dict[Place, Callable[[Actor, np.random.Generator], Staging]] = {
 
 def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     """Let all things fall: MuJoCo's model and data; None if one still moves after 6 seconds."""
+    import mujoco
+
     model = staging.spec.compile()
     data = mujoco.MjData(model)
     for name, (place, turn) in staging.starts.items():
@@ -572,6 +581,8 @@ def looked(
     renderer: Any, model: Any, data: Any, pose: Float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint16], Bools]:
     """Measured depth, (H, W), millimetres, and the pixels of the thing, (H, W)."""
+    import mujoco
+
     model.cam_pos[0] = pose[:3, 3]
     turn = pose[:3, :3] * (1, -1, -1)
     model.cam_quat[0] = Rotation.from_matrix(turn).as_quat(scalar_first=True)
@@ -619,6 +630,8 @@ def shots_of(
     rng: np.random.Generator,
 ) -> tuple[list[Shot], float]:
     """Three views around a thing, the best found of each, and the cameras' distance, metres."""
+    import mujoco
+
     model, data = scene
     thing = data.body("thing")
     middle = thing.xmat.reshape(3, 3) @ scan.bounds.mean(0) + thing.xpos
