@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 from test_verification import (
     VIEWS,
@@ -22,7 +21,6 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
-from nextview.things.stability import is_stable
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
     RENDERING_PIXELS,
@@ -291,12 +289,3 @@ def test_several_views_share_the_orientations_of_a_thing(templates):
     assert set(found.things.tolist()) == {0, 1, 2}
     assert np.bincount(found.things).max() <= MOST_ORIENTATIONS
     assert np.bincount(found.things[found.ranks == 0]).tolist() == [len(images)] * 3
-
-
-def test_a_body_stands_where_its_centroid_lies_above_what_touches_the_ground():
-    corners = np.array(trimesh.creation.box((0.1, 0.06, 0.04)).vertices)
-    assert is_stable(corners.T, 0.001)
-    on_an_edge = Rotation.from_euler("x", 30, degrees=True).apply(corners)
-    assert not is_stable(on_an_edge.T, 0.001)
-    off_centre = corners - (0.08, 0, 0)  # its weight is far out on one side
-    assert not is_stable(off_centre.T, 0.001)

@@ -1,6 +1,7 @@
 """Several things in one Embree scene: how far rays go, and which thing they end on."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ def embree_scene(things: Sequence[Triangles]) -> Any:
     )  # only who casts rays pays for the import
     from embreex.rtcore_scene import EmbreeScene
 
-    scene = EmbreeScene()
+    scene = EmbreeScene(_device())
     for vertices, faces in things:
         TriangleMesh(
             scene,
@@ -26,6 +27,14 @@ def embree_scene(things: Sequence[Triangles]) -> Any:
             np.ascontiguousarray(faces, np.int32),
         )
     return scene
+
+
+@cache
+def _device() -> Any:
+    """The one Embree device of this process: embreex does not notice if another one fails."""
+    from embreex.rtcore import EmbreeDevice
+
+    return EmbreeDevice()
 
 
 class RayCaster:

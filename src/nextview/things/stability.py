@@ -1,18 +1,28 @@
-"""How hypotheses stand on the ground: none reaches through it, and few float or would fall over."""
+"""How hypotheses stand: none reaches through the ground, and few float or would fall over.
+
+A thing at rest touches what carries it, and its centroid lies above what it touches. It touches the
+ground, or other things: measured points beside its outline that are not its own lie on its surface.
+Where no view shows whether the space below it is empty, something may carry it there too.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.things.depth_view import DepthView
-from nextview.things.registration import SUNK, Alignment, scan_errors
+from nextview.things.depth_view import ELSEWHERE, HIDING, HIDING_NOISE, DepthView
+from nextview.things.registration import SUNK, Alignment, Rendered, scan_errors
 from nextview.things.surface import SurfaceCaster
-from nextview.types import Float, Mask
+from nextview.types import Float, Index, Mask
 
 # radians beyond a half turn in which nothing supports a thing that stands: its centroid lies on an
 # edge of what touches the ground, and is not known exactly
 LARGEST_OVERHANG = 0.2
+# pixels of the image around an outline in which cameras mix the depths on both of its sides
+MIXED = 3.0
+# part of the way from a corner to the middle, by which the corner is passed on its inner side
+WITHIN = 0.05
+FEWEST_TOUCHED = 2  # pixels that show what carries a thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,13 +33,17 @@ class Stability:
         below: share of the surface that lies below the ground, (H,) float64, 0 to 1.
         depth: of the lowest point below the ground, (H,) float64, metres; 0 where nothing lies
             below it.
-        stands: whether it touches the ground, and would not fall over, (H,) bool; True where no
-            view shows the ground.
+        stands: whether it touches the ground or what else carries it, and would not fall over,
+            (H,) bool; True where no view shows the ground.
     """
 
     below: Float
     depth: Float
     stands: Mask
+
+    def select(self, rows: Index) -> "Stability":
+        """Some of the hypotheses, by index."""
+        return Stability(self.below[rows], self.depth[rows], self.stands[rows])
 
 
 def standing(
@@ -73,18 +87,139 @@ def standing(
         if below[row]:
             depth[row] = -heights.min()
         turned = alignment.rotations[row] @ (surface.hull - surface.centroid).T
-        stands[row] = heights.min() < allowed and is_stable(turned, float(allowed))
+        touching = turned[:, turned[2] < turned[2].min() + allowed]
+        stands[row] = heights.min() < allowed and is_stable(touching)
     return Stability(below, depth, stands)
 
 
-def is_stable(corners: Float, slack: float) -> bool:
-    """Whether a body would stay as it stands: its centroid lies above what touches the ground.
+def carried(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+    rendered: Sequence[Rendered],
+    ground: Stability,
+) -> Stability:
+    """Find which of the hypotheses that do not stand on the ground alone are carried by others.
+
+    What carries them is measured beside their outlines, where none of their own surface shows: it
+    lies on their surface, up to the noise, the error of the scan and what cameras mix.
 
     Args:
-        corners: of its convex hull, from its centroid, z up, (3, N), metres.
-        slack: height below which a corner may touch the ground, metres.
+        caster: of all surfaces.
+        alignment: the hypotheses, in a frame that is level.
+        views: of the thing.
+        rendered: the hypotheses in each view.
+        ground: how they stand on the ground.
+
+    Returns:
+        The same, in which those stand, too, that are carried.
     """
-    x, y = corners[:2, corners[2] < corners[2].min() + slack]
+    stands = ground.stands.copy()
+    for row in np.flatnonzero(~stands & (ground.depth == 0)):
+        one = alignment.select(np.array([row]))
+        low = _underside(caster, one)
+        of_others, of_ground = [], []
+        for number, view in enumerate(views):
+            displaced = one.cameras[0, number]
+            beside = ~np.isfinite(rendered[number].depth[row])
+            touched, level = _touched(caster, one, displaced, view, beside)
+            of_others.append(touched[~level])
+            of_ground.append(touched[level])
+            low = low[~_seen_empty(low + displaced, view)]
+        others = np.concatenate(of_others)
+        seen = np.concatenate([others, *of_ground])
+        below = np.count_nonzero(seen[:, 2] < 0)
+        if len(others) < FEWEST_TOUCHED or below < FEWEST_TOUCHED:
+            continue
+        around = np.concatenate([seen, low - _centroid(caster, one)])
+        stands[row] = is_stable(around.T)
+    return replace(ground, stands=stands)
+
+
+def _centroid(caster: SurfaceCaster, one: Alignment) -> Float:
+    """Centroid of one hypothesis, (3,), metres."""
+    surface = caster.surfaces[one.things[0]]
+    return one.centres[0] + one.rotations[0] @ (surface.centroid - surface.centre)
+
+
+def _touched(
+    caster: SurfaceCaster,
+    one: Alignment,
+    displaced: Float,
+    view: DepthView,
+    beside: Mask,
+) -> tuple[Float, Mask]:
+    """What a view shows of others on the surface of a hypothesis.
+
+    Args:
+        caster: of all surfaces.
+        one: the hypothesis.
+        displaced: by how much the view sees it displaced, (3,), metres.
+        view: the view.
+        beside: pixels in which the hypothesis does not show, (P,).
+
+    Returns:
+        Points from the centroid of the hypothesis, (N, 3), metres, and which of them are of the
+        ground, (N,).
+    """
+    surface = caster.surfaces[one.things[0]]
+    others = beside & (view.kind == ELSEWHERE) & (view.edge > MIXED)
+    others &= (view.depth > 0) & np.isfinite(view.depth)
+    depth = view.depth[others].astype(np.float64)
+    points = view.origin + view.rays[others] * depth[:, None] - displaced
+    # what is beside the outline is off by the pixels that are left out there, and by the grid's
+    apart = (view.step.max() + MIXED) * view.pitch * depth
+    errors = SUNK + scan_errors(surface.radius) + HIDING_NOISE * view.noise[others]
+    reach = np.asarray(np.hypot(apart, errors), np.float64)
+
+    own = (points - one.centres[0]) @ one.rotations[0] + surface.centre
+    low, high = surface.vertices.min(0), surface.vertices.max(0)
+    near = ((own > low - reach[:, None]) & (own < high + reach[:, None])).all(1)
+    off, _ = surface.nearby.query(own[near])
+    touching = np.flatnonzero(near)[off < reach[near] + surface.spacing]
+    return points[touching] - _centroid(caster, one), view.level[others][touching]
+
+
+def _underside(caster: SurfaceCaster, one: Alignment) -> Float:
+    """Corners of the hull of a hypothesis below which nothing of it lies, (N, 3), metres."""
+    surface = caster.surfaces[one.things[0]]
+    down = -one.rotations[0, 2]
+    inwards = WITHIN * (surface.centre - surface.hull)  # not down along a vertical side
+    starts = (surface.hull + inwards + SUNK * down).astype(np.float32)
+    rays = np.tile(down.astype(np.float32), (len(starts), 1, 1))
+    free = ~np.isfinite(caster.depths(int(one.things[0]), starts, rays)[:, 0])
+    corners = (surface.hull[free] - surface.centre) @ one.rotations[0].T
+    return corners + one.centres[0]
+
+
+def _seen_empty(corners: Float, view: DepthView) -> Mask:
+    """Below which corners, (N, 3), metres, a view sees that nothing is, (N,) bool."""
+    below = (corners - (0, 0, SUNK) - view.origin) @ view.camera_axes
+    slopes = (view.rays @ view.camera_axes).reshape(*view.shape, 3)
+    ahead = np.maximum(below[:, 2], 1e-6)
+    column = _nearest(slopes[0, :, 0], below[:, 0] / ahead)
+    row = _nearest(slopes[:, 0, 1], below[:, 1] / ahead)
+    inside = (column >= 0) & (row >= 0)
+    pixel = np.where(inside, row * view.shape[1] + column, 0)
+    apart = np.hypot(HIDING, HIDING_NOISE * view.noise[pixel])
+    empty = (view.kind[pixel] == ELSEWHERE) & (view.depth[pixel] > ahead + apart)
+    return np.asarray(inside & empty, bool)
+
+
+def _nearest(grid: Float, values: Float) -> Index:
+    """Which of some ascending slopes is nearest to each value; -1 for one beyond their ends."""
+    middles = (grid[1:] + grid[:-1]) / 2
+    inside = (values >= grid[0]) & (values <= grid[-1])
+    return np.where(inside, np.searchsorted(middles, values), -1)
+
+
+def is_stable(touching: Float) -> bool:
+    """Whether a body would stay as it stands: its centroid lies above what it touches.
+
+    Args:
+        touching: where it touches others, from its centroid, horizontally, (2 or 3, N), metres.
+    """
+    x, y = touching[:2]
     around = np.sort(np.arctan2(y, x))
     gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
     return bool(gaps.max() <= np.pi + LARGEST_OVERHANG)

@@ -138,6 +138,16 @@ class Surface:
         return kept
 
     @cached_property
+    def nearby(self) -> cKDTree:
+        """Points spread over the surface, ``spacing`` apart, to look up what lies beside it."""
+        return cKDTree(self.sample(SURFACE_SAMPLES, np.random.default_rng(0)))
+
+    @property
+    def spacing(self) -> float:
+        """Distance within which a point of ``nearby`` is usual, metres."""
+        return float(np.sqrt(self.area / SURFACE_SAMPLES))
+
+    @cached_property
     def _areas(self) -> Float:
         """Area of each triangle, (F,), square metres."""
         corners = self.vertices[self.faces].astype(np.float64)

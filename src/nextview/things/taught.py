@@ -10,17 +10,29 @@ from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
 from nextview.recognition.model_card import Verification
 from nextview.recognition.protocol import log_evidence_of_views
+from nextview.things.depth_view import MetricImage
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.registration import RegistrationPrior
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import UNUSUAL, Verified, Verifier, rival_turns
+from nextview.things.verifier import (
+    FINE_SIDE,
+    UNUSUAL,
+    Verified,
+    Verifier,
+    images_of,
+    rival_turns,
+)
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
-# The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
+# The radius of an object that a thing may have, of that of the thing: little may be taken in of it.
 SMALLEST_SHARE = 0.25
+# how far from their middle its pixels may lie, of the radius of the thing
 LARGEST_SEEN_SHARE = 2.0
+MOST_PIXELS = (
+    0.9  # share of its pixels, without those that mix its depth with that behind it
+)
 TINY = 1e-300  # belief that has a logarithm
 
 
@@ -225,8 +237,8 @@ class TaughtThings:
         """Share of known things that are explained as badly by the likeliest hypothesis.
 
         What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is. Few things do not stand on the
-        ground that is seen below them.
+        few pixels say: it gets the least p-value that there is. Few things stand neither on the
+        ground nor on anything else that is seen below them.
 
         Args:
             observations: the views.
@@ -241,9 +253,10 @@ class TaughtThings:
 
         likeliest = int(found.things[0])
         views = found.mean.shape[1]
-        seen = max(observation.radius or 0.0 for observation in observations)
-        share = seen / float(self.verifier.caster.radii[likeliest])
-        if not SMALLEST_SHARE <= share <= LARGEST_SEEN_SHARE:
+        radius = float(self.verifier.caster.radii[likeliest])
+        whole = max(observation.radius or 0.0 for observation in observations)
+        seen = max(extent(image) for image in images_of(observations))
+        if whole < SMALLEST_SHARE * radius or seen > LARGEST_SEEN_SHARE * radius:
             return self.residuals.p_value(np.inf, likeliest, views)
 
         explained = float(found.explained[0].mean())
@@ -256,6 +269,13 @@ class TaughtThings:
             noise_share,
         )
         return p_value if found.stands[0] else UNUSUAL * p_value
+
+
+def extent(image: MetricImage) -> float:
+    """How far from their middle the pixels of a thing lie, metres."""
+    points = image.view(FINE_SIDE).thing_points
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return float(np.quantile(away, MOST_PIXELS))
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:

@@ -27,7 +27,7 @@ from nextview.things.registration import (
     rotations_of,
     start,
 )
-from nextview.things.stability import Stability, standing
+from nextview.things.stability import Stability, carried, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
@@ -214,6 +214,32 @@ class _Proposed:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """How likely M hypotheses are.
+
+    Attributes:
+        scores: their logarithms, up to a constant, (M,) float64.
+        costs: of the cameras' errors, (M, V) float64.
+        views: how well they explain the pixels of each of V views.
+        ground: how they stand.
+    """
+
+    scores: Float
+    costs: Float
+    views: Sequence[ViewLikelihood]
+    ground: Stability
+
+    def select(self, rows: Index) -> "_Judged":
+        """Some of the hypotheses, by index."""
+        return _Judged(
+            self.scores[rows],
+            self.costs[rows],
+            [view.select(rows) for view in self.views],
+            self.ground.select(rows),
+        )
+
+
 class Verifier:
     """Recognises things of known geometry, and tells their poses.
 
@@ -354,7 +380,8 @@ class Verifier:
         first = proposed.select(ranks == 0)
         tried = start(first.things, first.rotations, first.centres, len(views))
         tried = align(self.caster, tried, views, stage.levels, self.prior)
-        order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
+        judged = self._judged(first, tried, views)
+        order = np.argsort(-judged.scores, kind="stable")
 
         best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_ALIGNED]
         best += np.argsort(-proposed.by_outline)[:LIKELY_THINGS].tolist()
@@ -375,8 +402,9 @@ class Verifier:
         for stage in STAGES:
             views = [image.view(stage.side) for image in images]
             alignment = align(self.caster, alignment, views, stage.levels, self.prior)
-            scores, costs, judged = self._scores(proposed, alignment, views)
+            judged = self._judged(proposed, alignment, views, stage is STAGES[-1])
 
+            scores = judged.scores
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
             rows = order[different_poses(self.caster, alignment.select(order))]
@@ -390,29 +418,36 @@ class Verifier:
                 alignment = joined(alignment, turned)
                 proposed = proposed.select(np.r_[np.arange(len(rows)), source])
 
-        return self._verified(
-            proposed,
-            alignment,
-            views,
-            scores[rows],
-            costs[rows],
-            [view.select(rows) for view in judged],
-            level,
-        )
+        return self._verified(proposed, alignment, judged.select(rows), level)
 
-    def _scores(
+    def _judged(
         self,
         proposed: _Proposed,
         alignment: Alignment,
         views: Sequence[DepthView],
-    ) -> tuple[Float, Float, list[ViewLikelihood]]:
-        """Log-likelihoods of hypotheses, (M,), and the cameras' costs and pixels behind them."""
-        ground = self._standing(alignment, views)
-        judged = self._judge(alignment, views, ground)
+        others_carry: bool = False,
+    ) -> _Judged:
+        """Score hypotheses by the pixels of all views and by how they stand.
+
+        ``others_carry`` says whether it is looked up what else than the ground carries them.
+        """
+        ground = standing(self.caster, alignment, views, self.prior.tilt)
+        rendered = [
+            render(self.caster, alignment, view, number)
+            for number, view in enumerate(views)
+        ]
+        judged = [
+            likelihood(view, shown, self.pixels, ground.below)
+            for view, shown in zip(views, rendered, strict=True)
+        ]
+        if others_carry:
+            ground = carried(self.caster, alignment, views, rendered, ground)
+
         mean = np.stack([view.mean for view in judged], 1)
         costs = camera_cost(alignment, views, self.prior)
         scores = self.weights.scores(mean, costs, proposed.log_belief)
-        return scores + np.where(ground.stands, 0, np.log(UNUSUAL)), costs, judged
+        scores = scores + np.where(ground.stands, 0, np.log(UNUSUAL))
+        return _Judged(scores, costs, judged, ground)
 
     def _rivals(self, alignment: Alignment) -> tuple[Alignment, Index]:
         """The likeliest hypotheses in the poses in which their things hardly look different.
@@ -433,44 +468,21 @@ class Verifier:
         centres = fixed - np.einsum("nij,nj->ni", rotations, arms)
         return replace(turned, rotations=rotations, centres=centres), source
 
-    def _judge(
-        self,
-        alignment: Alignment,
-        views: Sequence[DepthView],
-        ground: Stability,
-    ) -> list[ViewLikelihood]:
-        return [
-            likelihood(
-                view,
-                render(self.caster, alignment, view, number),
-                self.pixels,
-                ground.below,
-            )
-            for number, view in enumerate(views)
-        ]
-
-    def _standing(self, alignment: Alignment, views: Sequence[DepthView]) -> Stability:
-        return standing(self.caster, alignment, views, self.prior.tilt)
-
     def _verified(
         self,
         proposed: _Proposed,
         alignment: Alignment,
-        views: Sequence[DepthView],
-        scores: Float,
-        costs: Float,
-        judged: Sequence[ViewLikelihood],
+        judged: _Judged,
         level: Float,
     ) -> Verified:
         """The answer of the proposals that survived, sorted by their scores.
 
-        ``alignment`` and ``views`` are in the frame that was turned to be level.
+        ``alignment`` is in the frame that was turned to be level.
         """
-        visible = np.sum([view.visible for view in judged], axis=0)
-        behind = np.sum([view.seen_behind for view in judged], axis=0)
-
+        visible = np.sum([view.visible for view in judged.views], axis=0)
+        behind = np.sum([view.seen_behind for view in judged.views], axis=0)
         aligned = alignment.turned(level.T)
-        ground = self._standing(alignment, views)
+        scores = judged.scores
         shares = np.exp(scores - scores.max())
 
         return Verified(
@@ -479,16 +491,16 @@ class Verifier:
             probabilities=shares / shares.sum(),
             poses=aligned.poses(self.caster),
             cameras=aligned.cameras,
-            mean=np.stack([view.mean for view in judged], 1),
-            camera_costs=costs,
+            mean=np.stack([view.mean for view in judged.views], 1),
+            camera_costs=judged.costs,
             log_belief=proposed.log_belief,
             by_outline=proposed.by_outline,
-            explained=np.stack([view.explained for view in judged], 1),
-            misfit=np.stack([view.misfit for view in judged], 1),
-            noise_share=np.stack([view.noise_share for view in judged], 1),
+            explained=np.stack([view.explained for view in judged.views], 1),
+            misfit=np.stack([view.misfit for view in judged.views], 1),
+            noise_share=np.stack([view.noise_share for view in judged.views], 1),
             seen_behind=behind / np.maximum(visible, 1),
-            below=ground.depth,
-            stands=ground.stands,
+            below=judged.ground.depth,
+            stands=judged.ground.stands,
         )
 
 
@@ -507,7 +519,7 @@ def _levelled(
     observations: Sequence[Observation],
 ) -> tuple[list[MetricImage], Float]:
     """The observations that show the thing, turned so that the ground is level, and that turn."""
-    images = _images(observations)
+    images = images_of(observations)
     grounds = [image.ground for image in images if image.ground is not None]
     level = levelling(grounds)
     return [image.turned(level) for image in images], level
@@ -515,12 +527,19 @@ def _levelled(
 
 def _held(observations: Sequence[Observation]) -> tuple[list[MetricImage], Float]:
     """The observations that show the thing, without a ground to stand on, and no turn."""
-    images = [replace(image, ground=None) for image in _images(observations)]
+    images = [replace(image, ground=None) for image in images_of(observations)]
     return images, np.eye(3)
 
 
-def _images(observations: Sequence[Observation]) -> list[MetricImage]:
-    """The observations that show the thing; ObservationError if none does."""
+def images_of(observations: Sequence[Observation]) -> list[MetricImage]:
+    """Take over the observations that show the thing.
+
+    Args:
+        observations: of one thing.
+
+    Raises:
+        ObservationError: none of them shows it, or its scale is not known.
+    """
     found = (MetricImage.of(observation) for observation in observations)
     images = [image for image in found if image is not None]
     if not images:
