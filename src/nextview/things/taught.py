@@ -30,7 +30,7 @@ from nextview.types import Float, Floats
 SMALLEST_SHARE = 0.25
 # how far from their middle its pixels may lie, of the radius of the thing
 LARGEST_SEEN_SHARE = 2.0
-MOST_PIXELS = (
+OF_ITS_PIXELS = (
     0.9  # share of its pixels, without those that mix its depth with that behind it
 )
 TINY = 1e-300  # belief that has a logarithm
@@ -275,7 +275,7 @@ def extent(image: MetricImage) -> float:
     """How far from their middle the pixels of a thing lie, metres."""
     points = image.view(FINE_SIDE).thing_points
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return float(np.quantile(away, MOST_PIXELS))
+    return float(np.quantile(away, OF_ITS_PIXELS))
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:
