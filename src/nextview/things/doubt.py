@@ -39,7 +39,7 @@ def doubt_of(
     degrees = uncertainty_of(own).degrees
     if below:
         return f"its scan would reach {below:.0f} mm below the ground"
-    if not found.stands[0]:
+    if not (found.stands[0] or found.carried[0]):
         return "its scan would not stand on what is seen below it"
     if pixels < FEWEST_PIXELS:
         return f"only {pixels} pixels show it"

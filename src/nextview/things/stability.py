@@ -6,7 +6,7 @@ Where no view shows whether the space below it is empty, something may carry it 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,8 +33,8 @@ class Stability:
         below: share of the surface that lies below the ground, (H,) float64, 0 to 1.
         depth: of the lowest point below the ground, (H,) float64, metres; 0 where nothing lies
             below it.
-        stands: whether it touches the ground or what else carries it, and would not fall over,
-            (H,) bool; True where no view shows the ground.
+        stands: whether it touches the ground, and would not fall over, (H,) bool; True where no
+            view shows the ground.
     """
 
     below: Float
@@ -67,28 +67,31 @@ def standing(
         How they stand; nothing speaks against any of them where no view shows the ground.
     """
     below = np.zeros(len(alignment))
-    stands = np.ones(len(alignment), bool)
     depth = np.zeros(len(alignment))
     grounds = [view for view in views if view.ground is not None]
     if not grounds:
-        return Stability(below, depth, stands)
+        return Stability(below, depth, np.ones(len(alignment), bool))
 
     lowest = min(grounds, key=ground_height)
     assert lowest.ground is not None
     noise = lowest.ground.noise * float(lowest.origin @ lowest.origin)
-    for row, thing in enumerate(alignment.things):
+    stands = np.zeros(len(alignment), bool)
+    ups = alignment.rotations[:, 2]
+    above = alignment.centres[:, 2] - ground_height(lowest)
+    for thing in np.unique(alignment.things):
         surface = caster.surfaces[thing]
-        turn = alignment.rotations[row, 2]
-        above = alignment.centres[row, 2] - ground_height(lowest)
-        heights = (surface.vertices - surface.centre) @ turn + above
-        slack = np.linalg.norm([SUNK, noise, tilt * surface.radius])
-        allowed = slack + scan_errors(surface.radius)
-        below[row] = surface.vertex_shares[heights < -allowed].sum()
-        if below[row]:
+        slack = float(np.linalg.norm([SUNK, noise, tilt * surface.radius]))
+        allowed = slack + float(scan_errors(surface.radius))
+        rows = np.flatnonzero(alignment.things == thing)
+        corners = ups[rows] @ (surface.hull - surface.centre).T + above[rows, None]
+        bottom = corners.min(1)
+        for row in rows[bottom < -allowed]:
+            heights = (surface.vertices - surface.centre) @ ups[row] + above[row]
+            below[row] = surface.vertex_shares[heights < -allowed].sum()
             depth[row] = -heights.min()
-        turned = alignment.rotations[row] @ (surface.hull - surface.centroid).T
-        touching = turned[:, turned[2] < turned[2].min() + allowed]
-        stands[row] = heights.min() < allowed and is_stable(touching)
+        for at in np.flatnonzero(bottom < allowed):
+            low = surface.hull[corners[at] < bottom[at] + allowed] - surface.centroid
+            stands[rows[at]] = is_stable(alignment.rotations[rows[at]] @ low.T)
     return Stability(below, depth, stands)
 
 
@@ -97,9 +100,9 @@ def carried(
     alignment: Alignment,
     views: Sequence[DepthView],
     rendered: Sequence[Rendered],
-    ground: Stability,
-) -> Stability:
-    """Find which of the hypotheses that do not stand on the ground alone are carried by others.
+    rows: Index,
+) -> Mask:
+    """Find which of some hypotheses, which do not stand on the ground alone, others carry.
 
     What carries them is measured beside their outlines, where none of their own surface shows: it
     lies on their surface, up to the noise, the error of the scan and what cameras mix.
@@ -109,13 +112,13 @@ def carried(
         alignment: the hypotheses, in a frame that is level.
         views: of the thing.
         rendered: the hypotheses in each view.
-        ground: how they stand on the ground.
+        rows: which of the hypotheses are looked at.
 
     Returns:
-        The same, in which those stand, too, that are carried.
+        Whether others carry each hypothesis, (H,) bool; False where that is not looked at.
     """
-    stands = ground.stands.copy()
-    for row in np.flatnonzero(~stands & (ground.depth == 0)):
+    stable = np.zeros(len(alignment), bool)
+    for row in rows:
         one = alignment.select(np.array([row]))
         low = _underside(caster, one)
         of_others, of_ground = [], []
@@ -132,8 +135,8 @@ def carried(
         if len(others) < FEWEST_TOUCHED or below < FEWEST_TOUCHED:
             continue
         around = np.concatenate([seen, low - _centroid(caster, one)])
-        stands[row] = is_stable(around.T)
-    return replace(ground, stands=stands)
+        stable[row] = is_stable(around.T)
+    return stable
 
 
 def _centroid(caster: SurfaceCaster, one: Alignment) -> Float:

@@ -237,8 +237,8 @@ class TaughtThings:
         """Share of known things that are explained as badly by the likeliest hypothesis.
 
         What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is. Few things stand neither on the
-        ground nor on anything else that is seen below them.
+        few pixels say: it gets the least p-value that there is. Few things do not stand on the
+        ground that is seen below them.
 
         Args:
             observations: the views.

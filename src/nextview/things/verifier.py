@@ -35,7 +35,7 @@ from nextview.things.view_templates import ViewTemplates, rank_within
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Index, Mask
 
-# share of things that do not stand on what is seen below them: they lean on something, or hang
+# share of things that do not stand on the ground: others carry them, or they hang
 UNUSUAL = 0.1
 THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
 # the same of the likeliest by outline: the first orientation of an occluded thing may fail
@@ -98,6 +98,7 @@ class Verified:
             noise, tilt and errors of the scan explain it.
         stands: whether each hypothesis touches the ground, and would not fall over, (M,) bool;
             True where no view shows the ground.
+        carried: whether others carry each hypothesis that does not stand on the ground, (M,) bool.
     """
 
     belief: Float
@@ -115,6 +116,7 @@ class Verified:
     seen_behind: Float
     below: Float
     stands: Mask
+    carried: Mask
 
     def select(self, rows: NDArray) -> "Verified":
         """Some of the hypotheses, by index or mask."""
@@ -171,6 +173,7 @@ OF_HYPOTHESES = (
     "seen_behind",
     "below",
     "stands",
+    "carried",
 )
 """What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
 
@@ -222,13 +225,15 @@ class _Judged:
         scores: their logarithms, up to a constant, (M,) float64.
         costs: of the cameras' errors, (M, V) float64.
         views: how well they explain the pixels of each of V views.
-        ground: how they stand.
+        ground: how they stand on the ground.
+        carried: whether others carry them, (M,) bool.
     """
 
     scores: Float
     costs: Float
     views: Sequence[ViewLikelihood]
     ground: Stability
+    carried: Mask
 
     def select(self, rows: Index) -> "_Judged":
         """Some of the hypotheses, by index."""
@@ -237,6 +242,7 @@ class _Judged:
             self.costs[rows],
             [view.select(rows) for view in self.views],
             self.ground.select(rows),
+            self.carried[rows],
         )
 
 
@@ -440,14 +446,16 @@ class Verifier:
             likelihood(view, shown, self.pixels, ground.below)
             for view, shown in zip(views, rendered, strict=True)
         ]
+        by_others = np.zeros(len(alignment), bool)
         if others_carry:
-            ground = carried(self.caster, alignment, views, rendered, ground)
+            rows = np.flatnonzero(~ground.stands & (ground.below == 0))
+            by_others = carried(self.caster, alignment, views, rendered, rows)
 
         mean = np.stack([view.mean for view in judged], 1)
         costs = camera_cost(alignment, views, self.prior)
         scores = self.weights.scores(mean, costs, proposed.log_belief)
         scores = scores + np.where(ground.stands, 0, np.log(UNUSUAL))
-        return _Judged(scores, costs, judged, ground)
+        return _Judged(scores, costs, judged, ground, by_others)
 
     def _rivals(self, alignment: Alignment) -> tuple[Alignment, Index]:
         """The likeliest hypotheses in the poses in which their things hardly look different.
@@ -501,6 +509,7 @@ class Verifier:
             seen_behind=behind / np.maximum(visible, 1),
             below=judged.ground.depth,
             stands=judged.ground.stands,
+            carried=judged.carried,
         )
 
 
