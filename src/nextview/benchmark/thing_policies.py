@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nextview.benchmark.own_things import OwnThings
+from nextview.benchmark.published_policies import PredictedEntropy, SampledInformation
 from nextview.benchmark.thing_episodes import EPISODE_SPHERE, ThingEpisode
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
@@ -24,6 +25,8 @@ THING_POLICIES = (
     "ring",
     "geometry",
     "pose",
+    "sampled",
+    "predicted",
     "ceiling",
 )
 CEILINGS = ("ceiling",)  # upper bound with access to the ground truth
@@ -31,7 +34,7 @@ CEILINGS = ("ceiling",)  # upper bound with access to the ground truth
 BLIND_RULES = ("random", "spread", "furthest", "fixed", "ring")
 BEST_BLIND = "best-blind"  # the blind rule that is best on other episodes
 # policies that use the hypotheses of a memory of taught things
-OF_MEMORIES = ("geometry", "pose")
+OF_MEMORIES = ("geometry", "pose", "sampled", "predicted")
 # azimuth steps of the fixed sequence, which reaches all 8 views of a ring
 TURN_AHEAD = 3
 # belief in the truth from which the upper bound accepts any view that keeps it
@@ -133,6 +136,8 @@ def policies_of(
         "ring": lambda _: RingSteps(EPISODE_SPHERE, 1),
         "geometry": lambda _: geometry,
         "pose": lambda _: replace(geometry, goal="pose"),
+        "sampled": lambda _: SampledInformation(EPISODE_SPHERE),
+        "predicted": lambda _: PredictedEntropy(EPISODE_SPHERE),
         "ceiling": TruthCeiling,
     }
     for name in names:

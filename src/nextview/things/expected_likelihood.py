@@ -49,12 +49,21 @@ def _pairs(count: int) -> tuple[Index, Index]:
     return first, second
 
 
-def _depth_variance(
+def depth_variance(
     images: HypothesisImages,
     sensor: ExpectedSensor,
     pixels: PixelModel,
 ) -> Float32:
-    """Variance of the depth that is measured of each hypothesis, (V, H, P) float32, metres^2."""
+    """Variance of the depth that is measured of each hypothesis.
+
+    Args:
+        images: the hypotheses as each view would show them.
+        sensor: its expected noise.
+        pixels: model of the pixels.
+
+    Returns:
+        (V, H, P) float32, square metres.
+    """
     depth = np.where(np.isfinite(images.depth), images.depth, 1)
     steepness = np.sqrt(1 - images.cosine**2) / images.cosine
     noise = sensor.noise * depth**2
@@ -253,7 +262,7 @@ class _Judged:
         return cls(
             shows=shows,
             lost=np.where(shows, np.maximum(1 - images.cosine / GRAZING_COSINE, 0), 0),
-            deviation=np.sqrt(_depth_variance(images, sensor, pixels)),
+            deviation=np.sqrt(depth_variance(images, sensor, pixels)),
             hole=(pixels.hole * images.cosine).astype(np.float32),
             missing=(pixels.outlier * deep).astype(np.float32),
             apart=1 - np.exp(-0.5 * beside**2),

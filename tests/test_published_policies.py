@@ -1,0 +1,74 @@
+"""The two published policies go where the leading hypotheses look different."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_expected_views import SPHERE, outlook_of
+
+from nextview.benchmark.published_policies import PredictedEntropy, SampledInformation
+from nextview.errors import PolicyError
+from nextview.geometry.viewsphere import angle_between
+from nextview.policies.base import EpisodeState
+from nextview.recognition.evidence import Evidence
+
+BOTH = pytest.mark.parametrize("policy", [SampledInformation, PredictedEntropy])
+KNOB_AT = np.array([1.0, 0, 0])
+BEHIND = int(SPHERE.directions[:, 0].argmin())  # the body hides the knob
+
+
+def state_from(view, outlook):
+    visited = np.arange(len(SPHERE)) == view
+    return EpisodeState(
+        current=np.array([view]),
+        visited=visited[None],
+        belief=np.full((1, 2), 0.5),
+        evidence=Evidence(np.zeros((1, 2))),
+        step=1,
+        outlook=outlook,
+    )
+
+
+@BOTH
+@pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
+def test_the_next_view_shows_where_the_hypotheses_differ(policy, belief):
+    state = state_from(BEHIND, [outlook_of(belief)])
+    for seed in range(3):
+        chosen = policy(SPHERE).next_views(state, np.random.default_rng(seed))
+        towards = np.degrees(angle_between(SPHERE.directions[chosen], KNOB_AT))
+        assert towards[0] < 80
+
+
+@BOTH
+def test_a_visited_view_is_never_chosen(policy):
+    towards = angle_between(SPHERE.directions, KNOB_AT)
+    best = int(towards.argmin())
+    state = state_from(best, [outlook_of((0.5, 0.5))])
+    chosen = policy(SPHERE).next_views(state, np.random.default_rng(0))
+    assert chosen[0] != best
+    assert np.degrees(towards[chosen[0]]) < 80
+
+
+@BOTH
+def test_any_free_view_may_come_where_nothing_can_be_predicted(policy):
+    rng = np.random.default_rng(0)
+    chosen = {
+        int(policy(SPHERE).next_views(state_from(0, [None]), rng)[0]) for _ in range(9)
+    }
+    assert len(chosen) > 3
+    assert 0 not in chosen
+
+
+@BOTH
+def test_a_state_without_geometry_is_refused(policy):
+    with pytest.raises(PolicyError, match="needs things of known geometry"):
+        policy(SPHERE).next_views(state_from(0, None), np.random.default_rng(0))
+
+
+def test_views_beside_the_present_one_are_discouraged():
+    towards = np.degrees(angle_between(SPHERE.directions, KNOB_AT))
+    beside = int(np.argsort(towards)[1])
+    outlook = replace(outlook_of((0.5, 0.5)), place=0.45 * SPHERE.directions[beside])
+    state = state_from(beside, [outlook])
+    chosen = PredictedEntropy(SPHERE).next_views(state, np.random.default_rng(0))[0]
+    assert np.degrees(SPHERE.arc[beside, chosen]) > 30
