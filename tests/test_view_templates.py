@@ -20,6 +20,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.things import view_templates
 from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
@@ -289,3 +290,16 @@ def test_several_views_share_the_orientations_of_a_thing(templates):
     assert set(found.things.tolist()) == {0, 1, 2}
     assert np.bincount(found.things).max() <= MOST_ORIENTATIONS
     assert np.bincount(found.things[found.ranks == 0]).tolist() == [len(images)] * 3
+
+
+def test_a_view_that_no_likely_thing_fits_proposes_nothing(monkeypatch):
+    small = mesh_of(((0.03, 0.02, 0.01), (0, 0, 0)))
+    large = mesh_of(((0.3, 0.2, 0.1), (0, 0, 0)))
+    monkeypatch.setattr(view_templates, "THINGS_PROPOSED", 1)
+    images = [
+        MetricImage.of(turned_views(one, np.eye(3))[0][0]) for one in (small, large)
+    ]
+    known = verifier_of(small, large)
+    found = known.templates.propose(images)
+    assert len(set(found.things.tolist())) == 1
+    assert len(found.rotations) == len(found.centres) == len(found.things) > 0

@@ -233,7 +233,7 @@ class ViewTemplates:
         x, y = view.camera.slopes(*(view.centre + fit.shift[rows])[:, ::-1].T)
         ahead = np.stack([x, y, np.ones(len(rows))], -1)
         lengths = np.linalg.norm(ahead, axis=1, keepdims=True)
-        axes = np.stack([_from_z_to(one) for one in ahead / lengths])
+        axes = np.array([_from_z_to(one) for one in ahead / lengths]).reshape(-1, 3, 3)
         looks = view.pose[:3, :3] @ axes @ rotation_z(fit.turn[rows])
         middles = ahead * (view.middle + fit.behind[rows])[:, None]
         centres = middles @ view.pose[:3, :3].T + view.pose[:3, 3]
