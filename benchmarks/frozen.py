@@ -90,9 +90,9 @@ CARD = """\
 {views} candidate views each. Seed {seed}.
 
 - **What**: depth of 640 x 480 pixels in steps of 0.1 mm (`NNN.png`), the pixels of the thing
-  (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/` holds
-  names, poses of the things and true poses of the cameras: only `nextview leaderboard` reads it. A
-  method is not shown it; who wants to be sure moves it away.
+  (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
+  holds names, poses of the things and true poses of the cameras: only `nextview leaderboard` reads
+  it. A method is not shown it; who wants to be sure moves it away.
 - **How**: things fall by the physics of MuJoCo and are seen by its renderer. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and
@@ -254,9 +254,7 @@ def finish(
     )
     (out / "README.md").write_text(card, encoding="utf-8")
 
-    files = {
-        path.relative_to(out).as_posix(): sha256_of(path) for path in listed(out)
-    }
+    files = {path.relative_to(out).as_posix(): sha256_of(path) for path in listed(out)}
     manifest = FrozenManifest(FROZEN_FORMAT, out.name, how.seed, made_with, files)
     write_record(out / MANIFEST, manifest)
     (out / TERMS_FILE).unlink()
@@ -289,7 +287,10 @@ def main(
 
     with only_one(out):
         out.mkdir(parents=True, exist_ok=True)
-        terms = {**asdict(how), "scans": hashlib.sha256(str(names).encode()).hexdigest()}
+        terms = {
+            **asdict(how),
+            "scans": hashlib.sha256(str(names).encode()).hexdigest(),
+        }
         same = msgspec.to_builtins(terms)
         if (out / TERMS_FILE).exists():
             before = read_record(out / TERMS_FILE, dict, "the terms of an archive")
