@@ -20,7 +20,6 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -51,16 +50,15 @@ from benchmarks.staged_things import (
 from nextview.benchmark.frozen import (
     EPISODE_FILE,
     EPISODES_FOLDER,
-    FROZEN_FORMAT,
     MANIFEST,
     SCANS_FOLDER,
     THINGS_FILE,
     TRUTH_FOLDER,
     EpisodeTruth,
     FrozenEpisode,
-    FrozenManifest,
     FrozenThing,
     as_matrix,
+    seal,
 )
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
@@ -211,14 +209,6 @@ def drawn(names: list[str], how: FrozenTerms) -> list[tuple[str, Place]]:
     return [pairs[row] for row in rng.permutation(len(pairs))]
 
 
-def listed(out: Path) -> Iterator[Path]:
-    """All files of an archive but its manifest, in order."""
-    for path in sorted(out.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(out).parts)
-        if path.is_file() and path != out / MANIFEST and not hidden:
-            yield path
-
-
 def finish(
     out: Path, scans: Path, names: list[str], pairs: list[Any], how: FrozenTerms
 ) -> str:
@@ -254,11 +244,9 @@ def finish(
     )
     (out / "README.md").write_text(card, encoding="utf-8")
 
-    files = {path.relative_to(out).as_posix(): sha256_of(path) for path in listed(out)}
-    manifest = FrozenManifest(FROZEN_FORMAT, out.name, how.seed, made_with, files)
-    write_record(out / MANIFEST, manifest)
+    sha256 = seal(out, out.name, how.seed, made_with)
     (out / TERMS_FILE).unlink()
-    return sha256_of(out / MANIFEST)
+    return sha256
 
 
 def main(

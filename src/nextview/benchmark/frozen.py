@@ -15,7 +15,13 @@ import numpy as np
 
 from nextview.captured.frames import opened_image, rigid, steps_of
 from nextview.errors import DatasetError, ModelError, ObservationError
-from nextview.files import HashText, checked_bytes, decode_record, sha256_of
+from nextview.files import (
+    HashText,
+    checked_bytes,
+    decode_record,
+    sha256_of,
+    write_record,
+)
 from nextview.types import Float, Float32, Mask
 
 MANIFEST = "manifest.json"
@@ -290,6 +296,31 @@ def read_view(view: FrozenView, metres_per_unit: float) -> tuple[Float32, Mask]:
     if mask.shape != depth.shape:
         raise DatasetError(f"{view.mask}: has another size than the depth image")
     return (depth * metres_per_unit).astype(np.float32), mask
+
+
+def seal(folder: Path, name: str, seed: int, made_with: dict[str, str]) -> str:
+    """Write the manifest of an archive, which makes it whole.
+
+    Args:
+        folder: with all other files; those whose names begin with a dot do not belong to it.
+        name: of the archive, with its version.
+        seed: of everything random in it.
+        made_with: versions of the libraries by name.
+
+    Returns:
+        The SHA-256 of the archive.
+
+    Raises:
+        ResultsError: the folder has a manifest.
+    """
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        place = path.relative_to(folder)
+        if path.is_file() and not any(part.startswith(".") for part in place.parts):
+            files[place.as_posix()] = sha256_of(path)
+    manifest = FrozenManifest(FROZEN_FORMAT, name, seed, made_with, files)
+    write_record(folder / MANIFEST, manifest)
+    return sha256_of(folder / MANIFEST)
 
 
 def as_matrix(values: Float) -> Matrix:

@@ -41,6 +41,7 @@ from nextview.types import Float, Mask
 
 UPRIGHT = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
 LONGEST_ANSWER = 1 << 20  # characters of a line
+ENDING = 5.0  # seconds that a process has to end when its input does
 STRAIGHT_DOWN = 0.99  # cosine, above which a camera looks from above
 
 
@@ -329,9 +330,10 @@ class CommandMethod:
             raise UsageError(f"{self._command}: cannot be started ({error})") from None
         self._lines: queue.Queue[str] = queue.Queue()
         assert self._process.stdout is not None
-        threading.Thread(
+        self._listener = threading.Thread(
             target=_listen, args=(self._process.stdout, self._lines), daemon=True
-        ).start()
+        )
+        self._listener.start()
 
     def answer(self, look: FrozenLook) -> MethodAnswer:
         """Answer a view; see ``Method``.
@@ -376,10 +378,14 @@ class CommandMethod:
         with suppress(BrokenPipeError):
             self._process.stdin.close()
         try:
-            self._process.wait(5)
+            self._process.wait(ENDING)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._listener.join(ENDING)
+        if not self._listener.is_alive():
+            assert self._process.stdout is not None
+            self._process.stdout.close()
 
 
 def _listen(output: IO[str], lines: "queue.Queue[str]") -> None:

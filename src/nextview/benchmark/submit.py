@@ -47,7 +47,7 @@ class SubmitOptions:
         version: version of the method; needed with --command.
         blind: the next views of --command ignore the images, so that it can be the reference for
             those that look.
-        views: views of each episode.
+        max_views: views of each episode, or all of them where there are fewer.
         episodes: number of episodes, the first ones, for a first try; by default all. The
             leaderboard refuses a file without all.
         patience: seconds to wait for an answer of --command.
@@ -60,7 +60,7 @@ class SubmitOptions:
     name: str | None = None
     version: str | None = None
     blind: bool = False
-    views: int = COMMON_VIEWS
+    max_views: int = COMMON_VIEWS
     episodes: int | None = None
     patience: float = 600.0
     seed: int = 0
@@ -109,7 +109,7 @@ class Submission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         version: of the method.
         blind: whether its next views ignore the images.
         run: how it was run: the command, or the memory, the policy and the seed.
-        views: views of each episode.
+        views: of each episode, or all of them where there are fewer.
         episodes: what it said.
     """
 
@@ -185,7 +185,7 @@ def submit(
     run = _how_run(how)
 
     key = hashlib.sha256(
-        msgspec.json.encode([frozen.sha256, run, how.name, how.version, how.views])
+        msgspec.json.encode([frozen.sha256, run, how.name, how.version, how.max_views])
     ).hexdigest()
     with only_one(out), unfinished(out, key) as parts:
         method = _method(frozen, how)
@@ -207,7 +207,7 @@ def submit(
             method.version,
             method.blind,
             run,
-            how.views,
+            how.max_views,
             episodes,
         )
         write_record(out, submission, overwrite)
@@ -226,7 +226,7 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
     """Check the options before any work is done; UsageError."""
     if out.suffix.lower() != ".json":
         raise UsageError(f"{out}: the name ends in .json")
-    whole(how.views, "the number of views", 1)
+    whole(how.max_views, "the number of views", 1)
     if how.episodes is not None:
         whole(how.episodes, "the number of episodes", 1)
     number(how.patience, "the patience, seconds,", above=0)
@@ -263,7 +263,7 @@ def _episodes(
     for done, number_ in enumerate(numbers, 1):
         part = parts / f"{number_}.json"
         if not part.exists():
-            write_record(part, run_episode(frozen, number_, method, how.views))
+            write_record(part, run_episode(frozen, number_, method, how.max_views))
         yield done
 
 
