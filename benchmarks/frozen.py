@@ -77,15 +77,15 @@ FROZEN_PLACES: tuple[Place, ...] = (
 STEPS_PER_METRE = 10_000  # of the depth images: 0.1 mm
 COMPRESSION = 6  # of PNG
 LIBRARIES = ("mujoco", "numpy", "scipy", "trimesh", "pillow")
-TERMS_FILE = ".terms.json"
+TERMS_FILE = ".terms.json"  # which does not belong to the archive
 PARTIAL = ".partial"  # ends the folder of an episode that is not whole
 LICENCE = "CC BY 4.0"
 SOURCE = "YCB Object and Model Set, https://www.ycbbenchmarks.com"
 CARD = """\
 # {name}
 
-{episodes} episodes: {shown} of {known} things, each in {draws} of {places} places ({names}), in
-{views} candidate views each. Seed {seed}.
+{episodes} episodes: {shown} of {known} things, each in {draws} of {places} places
+({names}), in {views} candidate views each. Seed {seed}.
 
 - **What**: depth of 640 x 480 pixels in steps of 0.1 mm (`NNN.png`), the pixels of the thing
   (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
@@ -94,17 +94,17 @@ CARD = """\
 - **How**: things fall by the physics of MuJoCo and are seen by its renderer. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and
-  where the second camera sees nothing. Told poses are wrong by {millimetres:g} mm along and
-  {degrees:g} degrees about each axis. **All of it is simulated.**
+  where the second camera sees nothing; nothing beyond {farthest:g} m. Told poses are wrong by
+  {millimetres:g} mm along and {degrees:g} degrees about each axis. **All of it is simulated.**
 - **First view**: drawn among those that show {enough} pixels of the thing or more. Other views may
   show little or nothing of it.
-- **Made by** `python -m benchmarks.frozen` of nextview with {made_with}. The same scans, seed and
-  versions give the same bytes.
-- **Licences**: `scans/` are of the {source}, {licence}: {changes} Images and poses are derived from
-  them, under the same licence.
+- **Made by** `python -m benchmarks.frozen` of nextview with {made_with}.
+  The same scans, seed and versions give the same bytes.
+- **Licences**: `scans/` are of the {source},
+  {licence}, as they were given to the script. Images and poses are derived from them, under the
+  same licence.
 - **Checksum**: the SHA-256 of `manifest.json`, which names every file with its own.
 """
-CHANGES = "they are as they were given to the script."
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,7 @@ class FrozenTerms:
         draws: in how many of the places each of them is shown.
         grid: elevations and azimuths of the candidate views.
         arm_error: standard deviations of the camera's poses along and about each axis, mm, degrees.
+        farthest: metres, beyond which the camera measures nothing.
         seed: of everything random.
     """
 
@@ -125,6 +126,7 @@ class FrozenTerms:
     draws: int = 2
     grid: tuple[int, int] = (5, 8)
     arm_error: tuple[float, float] = (3.0, 0.3)
+    farthest: float = 1.5
     seed: int = 1
 
 
@@ -171,6 +173,7 @@ def make_episode(
     with mujoco.Renderer(model, *IMAGE) as renderer:
         for number, pose in enumerate(poses):
             depth, mask = looked(renderer, model, data, pose, rng, STEPS_PER_METRE)
+            depth[depth > how.farthest * STEPS_PER_METRE] = 0
             pixels.append(int((mask & (depth > 0)).sum()))
             place_of = partial / f"{number:03d}"
             for end, image in (("", depth), ("-mask", mask)):
@@ -236,17 +239,30 @@ def finish(
         seed=how.seed,
         millimetres=how.arm_error[0],
         degrees=how.arm_error[1],
+        farthest=how.farthest,
         enough=ENOUGH_PIXELS,
         made_with=", ".join(f"{one} {which}" for one, which in made_with.items()),
         source=SOURCE,
         licence=LICENCE,
-        changes=CHANGES,
     )
     (out / "README.md").write_text(card, encoding="utf-8")
 
-    sha256 = seal(out, out.name, how.seed, made_with)
-    (out / TERMS_FILE).unlink()
-    return sha256
+    return seal(out, out.name, how.seed, made_with)
+
+
+def begin(out: Path, names: list[str], how: FrozenTerms) -> None:
+    """Note the terms of a new archive, or compare them with those that it was begun with."""
+    known = hashlib.sha256(str(names).encode()).hexdigest()
+    terms = msgspec.json.decode(msgspec.json.encode({**asdict(how), "scans": known}))
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / TERMS_FILE).exists():
+        if any(out.iterdir()):
+            raise UsageError(f"{out}: is not empty")
+        write_record(out / TERMS_FILE, terms)
+    if read_record(out / TERMS_FILE, dict, "the terms of an archive") != terms:
+        raise UsageError(f"{out}: was begun with other options")
+    for folder in (EPISODES_FOLDER, TRUTH_FOLDER):
+        (out / folder).mkdir(exist_ok=True)
 
 
 def main(
@@ -274,24 +290,8 @@ def main(
         raise UsageError(f"{out}: exists, and is whole; name another folder")
 
     with only_one(out):
-        out.mkdir(parents=True, exist_ok=True)
-        terms = {
-            **asdict(how),
-            "scans": hashlib.sha256(str(names).encode()).hexdigest(),
-        }
-        same = msgspec.to_builtins(terms)
-        if (out / TERMS_FILE).exists():
-            before = read_record(out / TERMS_FILE, dict, "the terms of an archive")
-            if before != msgspec.json.decode(msgspec.json.encode(same)):
-                raise UsageError(f"{out}: was begun with other options")
-        elif any(out.iterdir()):
-            raise UsageError(f"{out}: is not empty")
-        else:
-            write_record(out / TERMS_FILE, same)
-
+        begin(out, names, how)
         pairs = drawn(names, how)
-        for folder in (EPISODES_FOLDER, TRUTH_FOLDER):
-            (out / folder).mkdir(exist_ok=True)
         whole = []
         for row, (name, place) in enumerate(pairs):
             folder = out / EPISODES_FOLDER / f"{row:04d}"

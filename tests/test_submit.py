@@ -1,8 +1,11 @@
 """Methods on a frozen archive: what they are told, what is refused, and how they are compared."""
 
 import json
+import re
 import shutil
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +15,13 @@ from pipeline import refused
 from scipy.spatial.transform import Rotation
 
 from nextview.benchmark.frozen import FrozenArchive
-from nextview.benchmark.methods import aimed_at
-from nextview.benchmark.standings import KnownShape
+from nextview.benchmark.methods import FrozenLook, MethodAnswer, aimed_at
+from nextview.benchmark.standings import KnownShape, leaderboard_of
 from nextview.benchmark.submit import SubmitOptions, submit
 from nextview.cli.main import main
 from nextview.errors import DatasetError, ResultsError
 
+ROOT = Path(__file__).parents[1]
 BLIND = SubmitOptions("fixed", max_views=2)
 
 
@@ -194,6 +198,38 @@ def test_a_file_of_results_that_is_not_valid_is_refused(
     assert "mug.json" in heard
     assert said in heard
     assert not (tmp_path / "board").exists()
+
+
+def test_the_method_of_the_page_runs(archive, tmp_path):
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    (tmp_path / "results").mkdir()
+    how = SubmitOptions(
+        command=as_command(tmp_path, code), name="all mugs", version="1"
+    )
+    submit(archive, tmp_path / "results/mugs.json", how)
+    board = leaderboard_of(
+        tmp_path / "results", archive, tmp_path / "board", samples=100
+    )
+    assert board.reference is None
+    assert [cell.split()[0] for cell in board.tables[0].rows[0][1:4]] == ["0.500"] * 3
+
+
+def test_the_page_names_every_field():
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    fields = {*FrozenLook.__struct_fields__, *MethodAnswer.__struct_fields__}
+    assert not {field for field in fields if f"`{field}`" not in page}
+
+
+def test_the_example_of_icp_runs(archive, tmp_path):
+    command = f"{sys.executable} {ROOT}/examples/icp_method.py {archive}/scans"
+    how = SubmitOptions(command=command, name="ICP", version="1", max_views=2)
+    submit(archive, tmp_path / "icp.json", how)
+    found = json.loads((tmp_path / "icp.json").read_text())
+    said = [each for one in found["episodes"] for each in one["said"]]
+    assert all(each["name"] in FrozenArchive(archive).things for each in said)
+    assert all(each["pose"] for each in said)
+    assert all(each["cpu_seconds"] > 0 for each in said)
 
 
 def test_a_command_needs_a_name_for_the_table(archive, tmp_path, capsys):

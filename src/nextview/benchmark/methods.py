@@ -39,8 +39,8 @@ from nextview.session.session import Session
 from nextview.session.system import load
 from nextview.types import Float, Mask
 
-UPRIGHT = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
-LONGEST_ANSWER = 1 << 20  # characters of a line
+WORLD_UP = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
+LONGEST_LINE = 1 << 20  # characters of a line
 ENDING = 5.0  # seconds that a process has to end when its input does
 STRAIGHT_DOWN = 0.99  # cosine, above which a camera looks from above
 
@@ -203,13 +203,13 @@ class NextviewMethod:
 
         # an object frame points towards the first camera
         above = abs(first[2, 2]) >= STRAIGHT_DOWN
-        axes = upright_axes(UPRIGHT, first[:3, 1] if above else -first[:3, 2])
+        axes = upright_axes(WORLD_UP, first[:3, 1] if above else -first[:3, 2])
         sphere = Directions(away @ axes.T)
         system = replace(self._system, policy=self._make_policy(sphere), sphere=sphere)
         session = system.session(
             start=look.view,
             seed=int(self._rng.integers(2**62)),
-            object=ObservedObject(UPRIGHT, support=not look.held),
+            object=ObservedObject(WORLD_UP, support=not look.held),
             distance=float(np.median(np.linalg.norm(away, axis=1))),
             any_orientation=look.held,
         )
@@ -390,7 +390,7 @@ class CommandMethod:
 
 def _listen(output: IO[str], lines: "queue.Queue[str]") -> None:
     """Pass on the lines of a process; an empty one is its end."""
-    while line := output.readline(LONGEST_ANSWER):
+    while line := output.readline(LONGEST_LINE):
         lines.put(line)
     lines.put("")
 

@@ -36,7 +36,7 @@ CONFIDENT_RIGHT = "confident_right"
 CONFIDENT_WRONG = "confident_wrong"
 UNKNOWN_SAID = "unknown"
 SURFACE_POINTS = 20_000  # among which the nearest is looked for
-COMPARED_POINTS = 2_000  # of the true surface
+JUDGED_POINTS = 2_000  # of the true surface
 PAGE_FILE = "leaderboard.html"
 TEXT_FILE = "leaderboard.md"
 
@@ -150,7 +150,7 @@ class KnownShape:
             pose: that is judged, (4, 4), metres.
             true: pose, (4, 4), metres.
         """
-        there = self._points[:COMPARED_POINTS] @ true[:3, :3].T + true[:3, 3]
+        there = self._points[:JUDGED_POINTS] @ true[:3, :3].T + true[:3, 3]
         in_scan = (there - pose[:3, 3]) @ pose[:3, :3]
         _, nearest = self._tree.query(in_scan)
         off = ((in_scan - self._points[nearest]) * self._normals[nearest]).sum(1)
@@ -182,10 +182,10 @@ def leaderboard_of(
 ) -> Leaderboard:
     """Compare the methods of a folder of results on their archive.
 
-    Each file that nextview submit wrote is checked: it belongs to this archive, answers every
-    episode once, and its names and poses are ones. Then names and poses are compared with the
-    truth. Methods are compared with the best blind one, whose views ignore the images, by the
-    episodes that they share.
+    Each file that nextview submit wrote is checked: whether it belongs to this archive, answers
+    every episode once, names only things of the archive, and has poses that are rigid. Then names
+    and poses are compared with the truth, and methods with the best blind one, whose views ignore
+    the images, episode by episode.
 
     Args:
         folder: of the files of results, .json.

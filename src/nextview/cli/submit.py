@@ -1,11 +1,17 @@
 """``nextview submit`` and ``nextview leaderboard``: what they found, in the terminal."""
 
+from typing import TYPE_CHECKING
+
 from rich import box
 from rich.table import Table
 
-from nextview.benchmark.standings import Leaderboard
 from nextview.benchmark.submit import Submitted
 from nextview.cli.progress import Terminal, console
+
+if TYPE_CHECKING:
+    from nextview.benchmark.standings import (
+        Leaderboard,
+    )  # pandas, which submit does not need
 
 MOST_WHOLE_COLUMNS = 6  # of a table with its intervals; the page has them all
 
@@ -25,7 +31,7 @@ def print_submitted(run: Submitted) -> None:
         )
 
 
-def print_leaderboard(board: Leaderboard) -> None:
+def print_leaderboard(board: "Leaderboard") -> None:
     """Print the tables of a leaderboard.
 
     Args:
