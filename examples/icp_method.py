@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 TURNS = Rotation.create_group("O").as_matrix()
 clouds = {
-    p.stem: trimesh.load(p).sample(250, seed=0) for p in Path(sys.argv[1]).glob("*.ply")
+    p.stem: trimesh.load(p).sample(500, seed=0) for p in Path(sys.argv[1]).glob("*.ply")
 }
 trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
 
@@ -28,7 +28,7 @@ def misfit(name, seen, pose):
     """Mean distances of points from a scan, and of its nearer half from them, metres."""
     there, _ = trees[name].query((seen - pose[:3, 3]) @ pose[:3, :3])
     back, _ = cKDTree(seen).query(clouds[name] @ pose[:3, :3].T + pose[:3, 3])
-    return there.mean() + np.sort(back)[:125].mean()
+    return there.mean() + np.sort(back)[:250].mean()
 
 
 def fitted(name, seen):

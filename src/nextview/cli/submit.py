@@ -43,8 +43,9 @@ def print_leaderboard(board: "Leaderboard") -> None:
         table.title = one.title
         table.title_justify = "left"
         for heading in one.headings:
+            first = heading == "method"
             table.add_column(
-                heading, justify="left" if heading == "method" else "right"
+                heading, justify="left" if first else "right", no_wrap=first
             )
         wide = len(one.headings) > MOST_WHOLE_COLUMNS
         for row in one.rows:
