@@ -160,7 +160,7 @@ def test_a_method_that_ends_is_named(archive, tmp_path):
 
 def test_a_method_that_says_nothing_is_not_waited_for(archive, tmp_path):
     command = as_command(tmp_path, "import sys; sys.stdin.read()")
-    how = replace(answering(tmp_path), command=command, patience=0.2)
+    how = replace(answering(tmp_path), command=command, wait=0.2)
     with pytest.raises(ResultsError, match=r"no answer in 0\.2 s"):
         submit(archive, tmp_path / "out.json", how)
 

@@ -298,7 +298,7 @@ class CommandMethod:
         name: str,
         version: str,
         blind: bool = False,
-        patience: float = 600.0,
+        wait: float = 600.0,
     ) -> None:
         """Start the process.
 
@@ -307,7 +307,7 @@ class CommandMethod:
             name: of the method in tables.
             version: of the method.
             blind: whether its next views ignore the images.
-            patience: seconds to wait for an answer.
+            wait: seconds to wait for an answer.
 
         Raises:
             UsageError: the command cannot be started.
@@ -315,7 +315,7 @@ class CommandMethod:
         self.name = name
         self.version = version
         self.blind = blind
-        self._patience = patience
+        self._wait = wait
         self._command = one_line(command)
         try:
             self._process = subprocess.Popen(
@@ -349,12 +349,12 @@ class CommandMethod:
         try:
             self._process.stdin.write(msgspec.json.encode(look).decode() + "\n")
             self._process.stdin.flush()
-            line = self._lines.get(timeout=self._patience)
+            line = self._lines.get(timeout=self._wait)
         except BrokenPipeError:
             line = ""
         except queue.Empty:
             raise ResultsError(
-                f"{where}: no answer in {self._patience:g} s (--patience)"
+                f"{where}: no answer in {self._wait:g} s (--wait)"
             ) from None
         if not line:
             raise ResultsError(f"{where}: the process has ended; see what it said")

@@ -50,7 +50,7 @@ class SubmitOptions:
         max_views: views of each episode, or all of them where there are fewer.
         episodes: number of episodes, the first ones, for a first try; by default all. The
             leaderboard refuses a file without all.
-        patience: seconds to wait for an answer of --command.
+        wait: seconds to wait for an answer of --command.
         seed: seed of nextview's random policies.
     """
 
@@ -62,7 +62,7 @@ class SubmitOptions:
     blind: bool = False
     max_views: int = COMMON_VIEWS
     episodes: int | None = None
-    patience: float = 600.0
+    wait: float = 600.0
     seed: int = 0
 
 
@@ -229,7 +229,7 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
     whole(how.max_views, "the number of views", 1)
     if how.episodes is not None:
         whole(how.episodes, "the number of episodes", 1)
-    number(how.patience, "the patience, seconds,", above=0)
+    number(how.wait, "the time to wait, seconds,", above=0)
     if how.command is None and (how.name or how.version or how.blind):
         raise UsageError("--name, --version and --blind are for a --command")
     if how.command is not None and not (how.name and how.version):
@@ -249,7 +249,7 @@ def _method(frozen: FrozenArchive, how: SubmitOptions) -> Method:
         return NextviewMethod(how.policy, how.models, tuple(frozen.things), how.seed)
     assert how.name is not None
     assert how.version is not None
-    return CommandMethod(how.command, how.name, how.version, how.blind, how.patience)
+    return CommandMethod(how.command, how.name, how.version, how.blind, how.wait)
 
 
 def _episodes(
