@@ -57,24 +57,21 @@ from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
     PLACES,
-    STAGES,
     VIEW_COUNT,
-    Actor,
     Bools,
     Float,
     Place,
     Shot,
-    at_rest,
     scan_of,
     shots_of,
+    staged,
+    true_pose,
 )
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ObservationError, UsageError
 from nextview.recognition.belief import Stopping
 from nextview.sensing import Frame, ObservedObject
 from research.extras import extras
-
-STAGINGS_TRIED = 12  # of a thing in a place
 
 
 @dataclass(frozen=True)
@@ -208,23 +205,16 @@ def episode(place: Place, name: str, terms: Terms) -> dict[str, Any]:
     numbers = [terms.seed, PLACES.index(place), *name.encode()]
     rng = np.random.default_rng(numbers)
     line: dict[str, Any] = {"place": place, "thing": name, "terms": asdict(terms)}
-    for tries in range(STAGINGS_TRIED):
-        staging = STAGES[place](Actor(terms.scans, name, tries), rng)
-        scene = at_rest(staging)
-        if scene is not None and staging.stays(*scene):
-            break
-    else:
+    found_rest = staged(place, terms.scans, name, rng)
+    if found_rest is None:
         return {**line, "views": None}
-
-    thing = scene[1].body("thing")
-    true = np.eye(4)
-    true[:3, :3] = thing.xmat.reshape(3, 3)
-    true[:3, 3] = thing.xpos
+    scene, tries = found_rest
+    true = true_pose(scene[1])
     shots, distance = shots_of(
         place, scene, scan_of(terms.scans, name), terms.arm_error, rng
     )
     found = recognised(place, name, shots, distance, true, terms)
-    line["tries"] = tries + 1
+    line["tries"] = tries
     return {**line, "views": [None if view is None else asdict(view) for view in found]}
 
 

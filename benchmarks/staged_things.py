@@ -34,7 +34,9 @@ FOCAL = 610.0  # pixels
 IMAGE = 480, 640  # rows, columns
 STEREO_BASE = 0.055  # metres between the two cameras
 CAMERA_MATRIX = np.array([[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]])
+PER_METRE = 1000.0  # steps of a depth image, unless others are asked for
 VIEW_COUNT = 3
+STAGINGS_TRIED = 12  # of a thing in a place
 ENOUGH_PIXELS = 350  # of a thing, below which a view is not judged
 VIEWPOINTS_TRIED = 6  # of each view
 CONVEX_SHARE = 0.7  # of the hull that a scan fills, above which the hull is its shape
@@ -514,6 +516,48 @@ def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     return model, data
 
 
+def staged(
+    place: Place, folder: str, name: str, rng: np.random.Generator
+) -> tuple[tuple[Any, Any], int] | None:
+    """A thing at rest where it should be: MuJoCo's model and data, and how many tries it took; None
+    if all were in vain.
+    """
+    for tries in range(STAGINGS_TRIED):
+        staging = STAGES[place](Actor(folder, name, tries), rng)
+        scene = at_rest(staging)
+        if scene is not None and staging.stays(*scene):
+            return scene, tries + 1
+    return None
+
+
+def true_pose(data: Any) -> Float:
+    """From the scan of the thing to the world, (4, 4), metres."""
+    thing = data.body("thing")
+    pose = np.eye(4)
+    pose[:3, :3] = thing.xmat.reshape(3, 3)
+    pose[:3, 3] = thing.xpos
+    return pose
+
+
+def as_told(
+    pose: Float, arm_error: tuple[float, float], rng: np.random.Generator
+) -> Float:
+    """What an arm says of a camera's pose, (4, 4): standard deviations of its error along and about
+    each axis are in millimetres and degrees.
+    """
+    millimetres, degrees = arm_error
+    told = pose.copy()
+    error = Rotation.from_rotvec(rng.normal(0, degrees, 3), degrees=True)
+    told[:3, :3] = pose[:3, :3] @ error.as_matrix()
+    told[:3, 3] += rng.normal(0, millimetres / 1000, 3)
+    return told
+
+
+def camera_distance(scan: trimesh.Trimesh) -> float:
+    """From which a thing is looked at, metres."""
+    return float(np.clip(2 * np.linalg.norm(scan.extents), 0.3, 0.6))
+
+
 def field(rng: np.random.Generator) -> Float:
     """Normal noise of unit variance, correlated over about two pixels, of an image's shape."""
     noise = ndimage.gaussian_filter(rng.normal(size=IMAGE), 1.0)
@@ -528,8 +572,14 @@ def slope_along(values: Float, axis: int) -> Float:
     return np.where(np.abs(before) < np.abs(after), before, after)
 
 
-def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """What a stereo camera makes of depth: (H, W), metres, in; millimetres, 0 for holes, out."""
+def as_measured(
+    depth: Float,
+    rng: np.random.Generator,
+    per_metre: float = PER_METRE,
+) -> NDArray[np.uint16]:
+    """What a stereo camera makes of depth: (H, W), metres, in; steps of which so many make a metre,
+    0 for holes, out.
+    """
     true = FOCAL * STEREO_BASE / depth  # disparities, pixels
     slopes = [slope_along(true, axis) for axis in (0, 1)]
     rows, columns = np.indices(IMAGE)
@@ -557,9 +607,9 @@ def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
     shadow[:, :-1] = nearest[:, 1:] < in_second[:, :-1] - 0.5
     grazing = ~edges & (cosines < 0.2 + 0.04 * field(rng))
     holes = shadow | grazing | (in_second < 0) | (edges & (chance > 0.8)) | (seen < 4)
-    return np.where(
-        holes, 0, np.rint(1000 * FOCAL * STEREO_BASE / np.maximum(seen, 4))
-    ).astype(np.uint16)
+    measured = np.rint(per_metre * FOCAL * STEREO_BASE / np.maximum(seen, 4))
+    holes |= measured > np.iinfo(np.uint16).max
+    return np.where(holes, 0, measured).astype(np.uint16)
 
 
 def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> Float:
@@ -578,9 +628,16 @@ def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> 
 
 
 def looked(
-    renderer: Any, model: Any, data: Any, pose: Float, rng: np.random.Generator
+    renderer: Any,
+    model: Any,
+    data: Any,
+    pose: Float,
+    rng: np.random.Generator,
+    per_metre: float = PER_METRE,
 ) -> tuple[NDArray[np.uint16], Bools]:
-    """Measured depth, (H, W), millimetres, and the pixels of the thing, (H, W)."""
+    """Measured depth, (H, W), steps of which so many make a metre, and the pixels of the thing,
+    (H, W).
+    """
     import mujoco
 
     model.cam_pos[0] = pose[:3, 3]
@@ -597,7 +654,7 @@ def looked(
     thing = (numbers == model.geom("thing seen").id) & (
         kinds == mujoco.mjtObj.mjOBJ_GEOM
     )
-    return as_measured(depth, rng), thing
+    return as_measured(depth, rng, per_metre), thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -633,13 +690,12 @@ def shots_of(
     import mujoco
 
     model, data = scene
-    thing = data.body("thing")
-    middle = thing.xmat.reshape(3, 3) @ scan.bounds.mean(0) + thing.xpos
-    distance = float(np.clip(2 * np.linalg.norm(scan.extents), 0.3, 0.6))
+    true = true_pose(data)
+    middle = true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3]
+    distance = camera_distance(scan)
     left, right, low, high = WHERE_CAMERAS_STAND[place]
     around = (right - left) / VIEW_COUNT
     first = rng.uniform(0, 360) if right - left == 360 else 0.0
-    millimetres, degrees = arm_error
     shots = []
     with mujoco.Renderer(model, *IMAGE) as renderer:
         for third in rng.permutation(VIEW_COUNT):
@@ -648,10 +704,7 @@ def shots_of(
                 azimuth = first + left + (third + rng.uniform(0.15, 0.85)) * around
                 aim = middle + rng.normal(0, 0.005, 3)
                 pose = camera_at(aim, azimuth, rng.uniform(low, high), distance)
-                told = pose.copy()
-                error = Rotation.from_rotvec(rng.normal(0, degrees, 3), degrees=True)
-                told[:3, :3] = pose[:3, :3] @ error.as_matrix()
-                told[:3, 3] += rng.normal(0, millimetres / 1000, 3)
+                told = as_told(pose, arm_error, rng)
                 tried.append(
                     Shot(*looked(renderer, model, data, pose, rng), pose, told)
                 )

@@ -16,6 +16,7 @@ import pytest
 import trimesh
 from bop_datasets import write_dataset
 from filelock import FileLock
+from frozen_archives import write_archive
 from hypothesis import settings
 from small_tables import meshes_of
 
@@ -178,6 +179,12 @@ def household(shared) -> Path:
 def bop(shared) -> Path:
     """A dataset of two images in the layout of BOP."""
     return shared("bop", write_dataset)
+
+
+@pytest.fixture(scope="session")
+def archive(shared) -> Path:
+    """A frozen archive of two episodes."""
+    return shared("archive", write_archive)
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from pipeline import refused, run_python
 
+from nextview.benchmark.submit import SubmitOptions, submit
 from nextview.captured.writing import write_capture
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
@@ -71,6 +72,8 @@ WRITES = {
         "b.csv",
         "--models ycb --ids cracker_box=2 mug=14 --frames 1",
     ),
+    "submit": ("submit {archive}", "s.json", "--policy fixed --max-views 1"),
+    "leaderboard": ("leaderboard {submitted} {archive}", "folder", "--samples 100"),
     "report": ("report {results}/out", "r.html"),
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
@@ -105,6 +108,7 @@ def made(
     knobs_memory,
     household,
     bop,
+    archive,
     tmp_path_factory,
 ):
     """What the commands work on; the store is a copy."""
@@ -117,6 +121,10 @@ def made(
         write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True)
     )
     (folder / "scan").mkdir()
+    (folder / "submitted").mkdir()
+    submit(
+        archive, folder / "submitted/fixed.json", SubmitOptions("fixed", max_views=1)
+    )
     shutil.copy(SAMPLE, folder / "scan")
     return {
         "capture": folder / "capture",
@@ -131,6 +139,8 @@ def made(
         "knobs_memory": knobs_memory,
         "household": household,
         "bop": bop,
+        "archive": archive,
+        "submitted": folder / "submitted",
     }
 
 

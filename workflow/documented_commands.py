@@ -90,6 +90,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
+    r"benchmarks\.frozen|nextview-bench": (
+        "needs the YCB scans, and hours; tests/test_submit.py runs methods on a small archive"
+    ),
     r"benchmarks\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
         "needs the YCB scans, and minutes"
@@ -116,7 +119,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
-    r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
+    r"nextview (benchmark|evaluate|report|leaderboard) ": "nextview[benchmark]",
     r"benchmarks/(ablations|views)\.py|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),

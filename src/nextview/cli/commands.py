@@ -185,6 +185,18 @@ COMMANDS = {  # by name, in the order of the printed list
         "wrote {out}; next: evaluate it with bop_toolkit",
         f"{CLI}.bop:print_bop",
     ),
+    "submit": Command(
+        "nextview.benchmark.submit:submit",
+        "run a method over a frozen archive of episodes",
+        "wrote {out}; next: nextview leaderboard FOLDER {archive} OUT",
+        f"{CLI}.submit:print_submitted",
+    ),
+    "leaderboard": Command(
+        "nextview.benchmark.standings:leaderboard_of",
+        "compare methods on a frozen archive of episodes",
+        "the page is {out}/leaderboard.html",
+        f"{CLI}.submit:print_leaderboard",
+    ),
     "report": Command(
         "nextview.benchmark.report:report",
         "write one HTML page of a benchmark of classes",
@@ -201,6 +213,7 @@ RESUMES = (  # commands that continue an interrupted run
     "learn",
     "scenes",
     "bop",
+    "submit",
     "benchmark things",
     "benchmark tables",
 )

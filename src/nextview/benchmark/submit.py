@@ -1,0 +1,330 @@
+"""Run a method over a frozen archive, and write its answers into one file of results."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from nextview.benchmark.frozen import FrozenArchive, Matrix
+from nextview.benchmark.methods import (
+    CommandMethod,
+    FrozenLook,
+    Method,
+    NextviewMethod,
+    check_answer,
+)
+from nextview.checks import number, number_of, whole
+from nextview.data.progress import TrackProgress, silently
+from nextview.errors import UsageError
+from nextview.files import (
+    HashText,
+    check_new,
+    only_one,
+    read_record,
+    unfinished,
+    write_record,
+)
+
+SUBMISSION_FORMAT = 1
+COMMON_VIEWS = 3  # of an episode
+
+
+@dataclass(frozen=True)
+class SubmitOptions:
+    """Which method runs, and how many views it gets.
+
+    Attributes:
+        policy: how nextview chooses views: geometry, random, spread, furthest, fixed, ring, or a
+            policy of your own, MODULE:CLASS.
+        models: memory of nextview; it has to be taught with the scans of the archive.
+        command: run another process instead of nextview, such as "python my_method.py". It reads a
+            line of JSON for each view and writes one as its answer (docs/submit.md).
+        name: name of the method in tables; needed with --command.
+        version: version of the method; needed with --command.
+        blind: the next views of --command ignore the images, so that it can be the reference for
+            those that look.
+        max_views: views of each episode, or all of them where there are fewer.
+        episodes: number of episodes, the first ones, for a first try; by default all. The
+            leaderboard refuses a file without all.
+        wait: seconds to wait for an answer of --command.
+        seed: seed of nextview's random policies.
+    """
+
+    policy: str = "geometry"
+    models: str = "ycb"
+    command: str | None = None
+    name: str | None = None
+    version: str | None = None
+    blind: bool = False
+    max_views: int = COMMON_VIEWS
+    episodes: int | None = None
+    wait: float = 600.0
+    seed: int = 0
+
+
+class SaidAfterView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a method said after a view.
+
+    Attributes:
+        view: which of the candidate views it had.
+        name: of the thing; None for unknown.
+        confidence: probability of the name.
+        confident: whether a robot should act on it.
+        pose: from the scan to the world, (4, 4), metres; None without one.
+        cpu_seconds: that it took; None where it is not known.
+    """
+
+    view: int
+    name: str | None
+    confidence: float
+    confident: bool
+    pose: Matrix | None
+    cpu_seconds: float | None
+
+
+class SubmittedEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a method said in an episode.
+
+    Attributes:
+        episode: number of the episode.
+        said: after each view, in order.
+    """
+
+    episode: str
+    said: tuple[SaidAfterView, ...]
+
+
+class Submission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of results: what a method said in all episodes of an archive.
+
+    Attributes:
+        format: of the file, SUBMISSION_FORMAT.
+        archive: name of the archive.
+        archive_sha256: of its manifest.
+        method: name of the method.
+        version: of the method.
+        blind: whether its next views ignore the images.
+        run: how it was run: the command, or the memory, the policy and the seed.
+        views: of each episode, or all of them where there are fewer.
+        episodes: what it said.
+    """
+
+    format: int
+    archive: str
+    archive_sha256: HashText
+    method: str
+    version: str
+    blind: bool
+    run: str
+    views: int
+    episodes: tuple[SubmittedEpisode, ...]
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """What was run.
+
+    Attributes:
+        method: name of the method.
+        episodes: how many were run, those of an earlier run too.
+        cpu_seconds: of a view, mean; None where it is not known.
+        whole: whether these are all episodes of the archive.
+    """
+
+    method: str
+    episodes: int
+    cpu_seconds: float | None
+    whole: bool
+
+    def __str__(self) -> str:
+        time = (
+            ""
+            if self.cpu_seconds is None
+            else f", {self.cpu_seconds:.2f} s of CPU a view"
+        )
+        return f"{self.method}: {number_of(self.episodes, 'episode')}{time}"
+
+
+def submit(
+    archive: Path,
+    out: Path,
+    how: SubmitOptions = SubmitOptions(),
+    overwrite: bool = False,
+    track: TrackProgress = silently,
+) -> Submitted:
+    """Run a method over the episodes of a frozen archive, and write its answers.
+
+    A method sees a depth image, a mask and poses of cameras, names what it sees, and says which
+    view it wants next. It is not told what the images show: the truth is read by nextview
+    leaderboard alone. Without --command the method is nextview itself. An interrupted run resumes.
+
+    Args:
+        archive: folder of the archive, such as nextview-bench-1.0.
+        out: file of results to write, .json.
+        how: which method runs.
+        overwrite: replace OUT.
+        track: follows the episodes.
+
+    Returns:
+        What was run.
+
+    Raises:
+        DatasetError: the archive is damaged.
+        ResultsError: ``out`` exists, or the method answers something that is no answer.
+        UsageError: an option makes no sense, or the method cannot be started.
+    """
+    out = Path(out)
+    check_new(out, overwrite)
+    _check_options(out, how)
+    frozen = FrozenArchive(archive)
+    numbers = frozen.numbers[: how.episodes]
+    run = _how_run(how)
+
+    key = hashlib.sha256(
+        msgspec.json.encode([frozen.sha256, run, how.name, how.version, how.max_views])
+    ).hexdigest()
+    with only_one(out), unfinished(out, key) as parts:
+        method = _method(frozen, how)
+        try:
+            track(
+                _episodes(frozen, numbers, method, how, parts), len(numbers), "episodes"
+            )
+        finally:
+            method.close()
+        episodes = tuple(
+            read_record(parts / f"{number}.json", SubmittedEpisode, "answers")
+            for number in numbers
+        )
+        submission = Submission(
+            SUBMISSION_FORMAT,
+            frozen.manifest.name,
+            frozen.sha256,
+            method.name,
+            method.version,
+            method.blind,
+            run,
+            how.max_views,
+            episodes,
+        )
+        write_record(out, submission, overwrite)
+
+    times = [said.cpu_seconds for one in episodes for said in one.said]
+    known = [seconds for seconds in times if seconds is not None]
+    return Submitted(
+        method.name,
+        len(episodes),
+        float(np.mean(known)) if known else None,
+        len(episodes) == len(frozen.numbers),
+    )
+
+
+def _check_options(out: Path, how: SubmitOptions) -> None:
+    """Check the options before any work is done; UsageError."""
+    if out.suffix.lower() != ".json":
+        raise UsageError(f"{out}: the name ends in .json")
+    whole(how.max_views, "the number of views", 1)
+    if how.episodes is not None:
+        whole(how.episodes, "the number of episodes", 1)
+    number(how.wait, "the time to wait, seconds,", above=0)
+    if how.command is None and (how.name or how.version or how.blind):
+        raise UsageError("--name, --version and --blind are for a --command")
+    if how.command is not None and not (how.name and how.version):
+        raise UsageError("a --command needs a --name and a --version, for the table")
+
+
+def _how_run(how: SubmitOptions) -> str:
+    """Return how a method is run, in words."""
+    if how.command is not None:
+        return how.command
+    return f"--models {how.models} --policy {how.policy} --seed {how.seed}"
+
+
+def _method(frozen: FrozenArchive, how: SubmitOptions) -> Method:
+    """Start the method."""
+    if how.command is None:
+        return NextviewMethod(how.policy, how.models, tuple(frozen.things), how.seed)
+    assert how.name is not None
+    assert how.version is not None
+    return CommandMethod(how.command, how.name, how.version, how.blind, how.wait)
+
+
+def _episodes(
+    frozen: FrozenArchive,
+    numbers: tuple[str, ...],
+    method: Method,
+    how: SubmitOptions,
+    parts: Path,
+) -> Iterator[int]:
+    """Run each episode that is not done, and keep its answers; yields how many are done."""
+    for done, number_ in enumerate(numbers, 1):
+        part = parts / f"{number_}.json"
+        if not part.exists():
+            write_record(part, run_episode(frozen, number_, method, how.max_views))
+        yield done
+
+
+def run_episode(
+    frozen: FrozenArchive, episode: str, method: Method, views: int
+) -> SubmittedEpisode:
+    """Run a method in one episode.
+
+    Args:
+        frozen: the archive.
+        episode: number of the episode.
+        method: that answers.
+        views: how many it gets, at most as many as there are.
+
+    Returns:
+        What it said.
+
+    Raises:
+        DatasetError: a file of the archive is damaged.
+        ResultsError: it says something that is no answer.
+    """
+    told = frozen.episode(episode)
+    things = tuple(frozen.things)
+    views = min(views, len(told.poses))
+    view = told.first
+    taken: list[int] = []
+    said = []
+
+    for step in range(1, views + 1):
+        taken.append(view)
+        images = frozen.view(episode, view)
+        left = (one for one in range(len(told.poses)) if one not in taken)
+        look = FrozenLook(
+            episode=episode,
+            step=step,
+            of=views,
+            view=view,
+            depth=str(images.depth.resolve()),
+            mask=str(images.mask.resolve()),
+            metres_per_unit=told.metres_per_unit,
+            intrinsics=told.intrinsics,
+            poses=told.poses,
+            free=tuple(left) if step < views else (),
+            held=told.held,
+            things=things,
+        )
+        begun = method.cpu_seconds()
+        answer = method.answer(look)
+        seconds = method.cpu_seconds() - begun
+        check_answer(answer, look, f"{method.name}, episode {episode}, view {step}")
+        said.append(
+            SaidAfterView(
+                view,
+                answer.name,
+                answer.confidence,
+                answer.confident,
+                answer.pose,
+                round(seconds, 3) if isfinite(seconds) else None,
+            )
+        )
+        if look.free:
+            assert answer.next is not None  # check_answer
+            view = answer.next
+    return SubmittedEpisode(episode, tuple(said))

@@ -1,0 +1,74 @@
+"""The script of the frozen archive: the same bytes each time, and a run that is stopped goes on."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_places import MAKES_A_PICTURE
+
+pytest.importorskip("mujoco")
+
+from nextview.benchmark.frozen import FrozenArchive
+from nextview.benchmark.submit import SubmitOptions, submit
+
+ROOT = Path(__file__).parents[1]
+OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
+SURROUNDINGS = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
+
+
+def make(scans, out, options=OPTIONS):
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks.frozen", scans, out, *options.split()],
+        cwd=ROOT,
+        env=SURROUNDINGS,
+        capture_output=True,
+        text=True,
+    )
+
+
+def content(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_the_same_seed_gives_the_same_bytes_after_a_stop_too(household, tmp_path):
+    draws = subprocess.run([sys.executable, "-c", MAKES_A_PICTURE], env=SURROUNDINGS)
+    if draws.returncode:
+        pytest.skip("MuJoCo cannot draw here")
+
+    out = tmp_path / "first/tiny-1.0"
+    made = make(household, out)
+    assert made.returncode == 0, made.stderr
+    archive = FrozenArchive(out)
+    assert archive.sha256 in made.stdout
+    assert archive.manifest.name == "tiny-1.0"
+    assert len(archive.numbers) == 2
+    assert len(archive.things) == 10
+    whole = content(out)
+    assert sum(path.suffix == ".png" for path in whole) == 12
+
+    again = make(household, out)
+    assert again.returncode == 2
+    assert "is whole" in again.stderr
+
+    # what a run leaves that is stopped in the second episode
+    (out / "manifest.json").unlink()
+    (out / "truth/0001.json").unlink()
+    (out / "episodes/0001").rename(out / "episodes/0001.partial")
+    assert "was begun with other options" in make(household, out, "--seed 4").stderr
+    before = (out / "episodes/0000/000.png").stat().st_mtime_ns
+    assert make(household, out).returncode == 0
+    assert content(out) == whole
+    assert (out / "episodes/0000/000.png").stat().st_mtime_ns == before
+
+    other = tmp_path / "second/tiny-1.0"
+    assert make(household, other).returncode == 0
+    assert content(other) == whole
+
+    run = submit(other, tmp_path / "out.json", SubmitOptions("fixed"))
+    assert run.whole

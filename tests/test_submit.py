@@ -1,0 +1,262 @@
+"""Methods on a frozen archive: what they are told, what is refused, and how they are compared."""
+
+import json
+import re
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
+from pipeline import refused
+from scipy.spatial.transform import Rotation
+
+from nextview.benchmark.frozen import FrozenArchive
+from nextview.benchmark.methods import FrozenLook, MethodAnswer, aimed_at
+from nextview.benchmark.standings import KnownShape, leaderboard_of
+from nextview.benchmark.submit import SubmitOptions, submit
+from nextview.cli.main import main
+from nextview.errors import DatasetError, ResultsError
+
+ROOT = Path(__file__).parents[1]
+BLIND = SubmitOptions("fixed", max_views=2)
+
+
+@pytest.fixture
+def own(archive, tmp_path):
+    """An archive that may be damaged."""
+    return shutil.copytree(archive, tmp_path / "archive")
+
+
+@pytest.fixture(scope="module")
+def submitted(archive, tmp_path_factory):
+    """Results of nextview, of a blind rule, and of a method that calls everything a mug."""
+    folder = tmp_path_factory.mktemp("submitted")
+    always = SubmitOptions(
+        command=as_command(folder, ANSWERS_ALWAYS), name="mug", version="1", max_views=2
+    )
+    options = {"geometry": replace(BLIND, policy="geometry"), "fixed": BLIND}
+    for name, how in (options | {"mug": always}).items():
+        submit(archive, folder / f"{name}.json", how)
+    return folder
+
+
+def answering(folder, **answer):
+    """Options of a method that always says the same."""
+    code = (
+        "import json, sys\n"
+        f"for line in sys.stdin: print(json.dumps({answer!r}), flush=True)"
+    )
+    return SubmitOptions(
+        command=as_command(folder, code), name="m", version="1", max_views=2
+    )
+
+
+def test_nextview_names_what_it_sees(submitted):
+    found = json.loads((submitted / "geometry.json").read_text())
+    names = [[said["name"] for said in one["said"]] for one in found["episodes"]]
+    assert names == [["mug"] * 2, ["cracker_box"] * 2]
+    assert found["method"] == "nextview geometry"
+    assert not found["blind"]
+
+
+def test_a_blind_rule_goes_on_around_the_thing(submitted):
+    found = json.loads((submitted / "fixed.json").read_text())
+    views = [[said["view"] for said in one["said"]] for one in found["episodes"]]
+    assert all(first == 0 and second in (1, 2, 3) for first, second in views)
+    assert found["blind"]
+
+
+def test_no_method_reads_the_truth(own, tmp_path):
+    shutil.rmtree(own / "truth")
+    assert submit(own, tmp_path / "out.json", BLIND).whole
+    with pytest.raises(DatasetError, match=r"truth.0000.json: is missing"):
+        FrozenArchive(own).truth("0000")
+
+
+def test_the_leaderboard_compares_with_the_best_blind_method(
+    archive, submitted, tmp_path, capsys
+):
+    out = tmp_path / "board"
+    main(["leaderboard", str(submitted), str(archive), str(out), "--samples", "100"])
+    text = (out / "leaderboard.md").read_text()
+    rows = {
+        line.split(" | ")[0].strip("| "): line.split(" | ")[1:]
+        for line in text.split("## Differences")[0].splitlines()
+    }
+    version = json.loads((submitted / "fixed.json").read_text())["version"]
+    ours = rows[f"nextview geometry ({version})"]
+    mug = rows["mug (1)"]
+    assert [cell.split()[0] for cell in ours[:5]] == ["1.000"] * 3 + ["0.000"] * 2
+    assert [cell.split()[0] for cell in mug[:5]] == ["0.500"] * 4 + ["0.000"]
+    assert float(ours[5].split()[0]) < 10  # mm
+    assert "## Differences to nextview fixed" in text
+    assert "| mug | 2 views | -50.0 (" in text
+    assert "Too few to tell" in text
+    page = (out / "leaderboard.html").read_text()
+    assert FrozenArchive(archive).sha256 in page
+    assert "nextview geometry" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_goes_on(own, tmp_path):
+    out = tmp_path / "out.json"
+
+    def stopped(done, total, what):
+        next(iter(done))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        submit(own, out, BLIND, track=stopped)
+    assert not out.exists()
+
+    (own / "episodes/0000/000.png").unlink()
+    assert submit(own, out, BLIND).episodes == 2
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ({"name": "mugg", "confidence": 1.0, "confident": True}, "did you mean 'mug'"),
+        ({"name": "mug", "confidence": 2.0, "confident": True}, "between 0 and 1"),
+        ({"name": "mug", "confidence": 1.0}, "confident"),
+        (
+            {"name": None, "confidence": 0.0, "confident": False},
+            "one of free, not None",
+        ),
+        (
+            {"name": None, "confidence": 0.0, "confident": False, "next": 0},
+            "one of free, not 0",
+        ),
+        (
+            {
+                "name": "mug",
+                "confidence": 1.0,
+                "confident": True,
+                "next": 1,
+                "pose": np.diag([2.0, 2, 2, 1]).tolist(),
+            },
+            "scaled by 2",
+        ),
+    ],
+)
+def test_what_is_no_answer_is_refused(archive, tmp_path, answer, said):
+    with pytest.raises(ResultsError, match=said) as raised:
+        submit(archive, tmp_path / "out.json", answering(tmp_path, **answer))
+    assert "episode 0000, view 1" in str(raised.value)
+
+
+def test_a_method_that_ends_is_named(archive, tmp_path):
+    how = replace(answering(tmp_path), command=as_command(tmp_path, "print()"))
+    with pytest.raises(ResultsError, match=r"not an answer|has ended"):
+        submit(archive, tmp_path / "out.json", how)
+    how = replace(how, command=as_command(tmp_path, ""))
+    with pytest.raises(ResultsError, match="the process has ended"):
+        submit(archive, tmp_path / "out.json", how)
+
+
+def test_a_method_that_says_nothing_is_not_waited_for(archive, tmp_path):
+    command = as_command(tmp_path, "import sys; sys.stdin.read()")
+    how = replace(answering(tmp_path), command=command, wait=0.2)
+    with pytest.raises(ResultsError, match=r"no answer in 0\.2 s"):
+        submit(archive, tmp_path / "out.json", how)
+
+
+def test_a_changed_image_is_found(own, tmp_path, capsys):
+    path = own / "episodes/0000/000.png"
+    path.write_bytes(path.read_bytes() + b" ")
+    said = refused(capsys, "submit", own, tmp_path / "out.json", "--policy", "fixed")
+    assert "000.png: is missing, or not the file that the manifest names" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda v: v["episodes"].pop(), "episode 0001 0 times"),
+        (lambda v: v["episodes"].append(v["episodes"][0]), "episode 0000 2 times"),
+        (lambda v: v.update(archive_sha256="0" * 64), "is of another archive"),
+        (lambda v: v.update(format=9), "has format 9"),
+        (lambda v: v["episodes"][0]["said"].pop(), "has 1 view, not 2"),
+        (lambda v: v["episodes"][0]["said"][0].update(view=1), "do not begin with 0"),
+        (lambda v: v["episodes"][0]["said"][0].update(name="x"), "no thing called 'x'"),
+        (
+            lambda v: v["episodes"][0]["said"][0].update(pose=[[1.0] * 4] * 4),
+            "episode 0000: ",
+        ),
+        (lambda v: v.update(method="nextview geometry"), "another file has the method"),
+    ],
+)
+def test_a_file_of_results_that_is_not_valid_is_refused(
+    archive, submitted, tmp_path, capsys, change, said
+):
+    folder = shutil.copytree(submitted, tmp_path / "submitted")
+    edited(folder / "mug.json", change)
+    heard = refused(capsys, "leaderboard", folder, archive, tmp_path / "board")
+    assert "mug.json" in heard
+    assert said in heard
+    assert not (tmp_path / "board").exists()
+
+
+def test_the_method_of_the_page_runs(archive, tmp_path):
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    (tmp_path / "results").mkdir()
+    how = SubmitOptions(
+        command=as_command(tmp_path, code), name="all mugs", version="1"
+    )
+    submit(archive, tmp_path / "results/mugs.json", how)
+    board = leaderboard_of(
+        tmp_path / "results", archive, tmp_path / "board", samples=100
+    )
+    assert board.reference is None
+    assert [cell.split()[0] for cell in board.tables[0].rows[0][1:4]] == ["0.500"] * 3
+
+
+def test_the_page_names_every_field():
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    fields = {*FrozenLook.__struct_fields__, *MethodAnswer.__struct_fields__}
+    assert not {field for field in fields if f"`{field}`" not in page}
+
+
+def test_the_example_of_icp_runs(archive, tmp_path):
+    command = f"{sys.executable} {ROOT}/examples/icp_method.py {archive}/scans"
+    how = SubmitOptions(command=command, name="ICP", version="1", max_views=2)
+    submit(archive, tmp_path / "icp.json", how)
+    found = json.loads((tmp_path / "icp.json").read_text())
+    said = [each for one in found["episodes"] for each in one["said"]]
+    assert all(each["name"] in FrozenArchive(archive).things for each in said)
+    assert all(each["pose"] for each in said)
+    assert all(each["cpu_seconds"] > 0 for each in said)
+
+
+def test_a_command_needs_a_name_for_the_table(archive, tmp_path, capsys):
+    command = ("submit", archive, tmp_path / "o.json")
+    assert "--name" in refused(capsys, *command, "--command", "true")
+    assert "are for a --command" in refused(capsys, *command, "--name", "mine")
+
+
+def test_cameras_are_aimed_at_the_thing(archive):
+    poses = np.array(FrozenArchive(archive).episode("0000").poses)
+    assert len(poses) == len(AZIMUTHS)
+    assert aimed_at(poses) == pytest.approx([0, 0, 0.03], abs=1e-9)
+
+
+def test_poses_are_compared_modulo_symmetries(tmp_path):
+    trimesh.creation.cylinder(0.03, 0.1, sections=180).export(tmp_path / "can.ply")
+    can = KnownShape(tmp_path / "can.ply", "can")
+    true = np.eye(4)
+    true[:3, :3] = Rotation.from_euler("xyz", (10, 20, 30), degrees=True).as_matrix()
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("zx", (77, 183), degrees=True).as_matrix()
+    assert can.turn(true @ turn, true) == pytest.approx(3, abs=0.1)
+    assert can.distance(true, true) < 0.05
+
+    raised = true.copy()
+    raised[:3, 3] = 0.004 * true[:3, 2]  # along its axis: only the ends are elsewhere
+    aside = true.copy()
+    aside[:3, 3] = 0.004 * true[:3, 0]
+    assert can.distance(raised, true) < 0.1
+    assert can.distance(aside, true) == pytest.approx(2.2, abs=0.4)
