@@ -38,8 +38,7 @@ from nextview.types import Float, Index, Mask
 # share of things that do not stand on the ground: others carry them, or they hang
 UNUSUAL = 0.1
 THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
-# the same of the likeliest by outline: the first orientation of an occluded thing may fail
-LIKELY_THINGS = 4
+LIKELY_THINGS = 4  # the same of the likeliest by outline
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 
@@ -318,7 +317,7 @@ class Verifier:
             by_outline=belief / belief.sum(),
         )
         return self._settled(
-            *self._started(proposed, found.ranks, images), images, level
+            *self._started(proposed, found.ranks, found.hidden, images), images, level
         )
 
     def log_odds_of_stranger(
@@ -367,15 +366,18 @@ class Verifier:
         self,
         proposed: _Proposed,
         ranks: Index,
+        hidden: bool,
         images: Sequence[MetricImage],
     ) -> tuple[_Proposed, Alignment]:
         """Align the first orientation of each thing, and add all others of the likeliest things.
 
-        The likeliest are those that fit best after alignment, and those of the likeliest outlines.
+        The likeliest are those that fit best after alignment, and those of the likeliest outlines;
+        all of them where a part of the outline is hidden: its first orientation may be any.
 
         Args:
             proposed: orientations of things.
             ranks: how many orientations of the same thing come before each, (M,).
+            hidden: whether every view shows only a part of the outline.
             images: the views.
 
         Returns:
@@ -389,7 +391,8 @@ class Verifier:
         judged = self._judged(first, tried, views)
         order = np.argsort(-judged.scores, kind="stable")
 
-        best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_ALIGNED]
+        best = list(dict.fromkeys(first.things[order].tolist()))
+        best = best if hidden else best[:THINGS_ALIGNED]
         best += np.argsort(-proposed.by_outline)[:LIKELY_THINGS].tolist()
         others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
         alignment = start(others.things, others.rotations, others.centres, len(views))

@@ -33,6 +33,7 @@ RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
 TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
 THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
+HIDDEN_PROPOSED = 100  # the same where every view shows a part of the outline only
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
 NO_FIT = 12.0  # cost of a template of another size than what is seen
 # of the middle of an outline, root mean squares of it, beyond which depths do not differ
@@ -94,6 +95,7 @@ class OrientedProposals:
         centres: of the surfaces in the object frame, (M, 3) float64, metres.
         log_belief: in each thing by outline and the shape of the depth, up to a constant, (T,)
             float64.
+        hidden: whether every view shows only a part of the outline, which then says little.
     """
 
     things: Index
@@ -101,6 +103,7 @@ class OrientedProposals:
     rotations: Float
     centres: Float
     log_belief: Float
+    hidden: bool
 
 
 class ViewTemplates:
@@ -154,7 +157,7 @@ class ViewTemplates:
             nothing = np.zeros(0, np.int64)
             nowhere = np.zeros((0, 3))
             return OrientedProposals(
-                nothing, nothing, np.zeros((0, 3, 3)), nowhere, np.zeros(known)
+                nothing, nothing, np.zeros((0, 3, 3)), nowhere, np.zeros(known), False
             )
 
         fits = [self._fit(view) for view in views]
@@ -162,8 +165,10 @@ class ViewTemplates:
         for row, fit in enumerate(fits):
             np.minimum.at(of_things[row], self.things, fit.cost)
         together = of_things.sum(0)
+        hidden = all(view.hidden for view in views)
+        most = HIDDEN_PROPOSED if hidden else THINGS_PROPOSED
         likely = np.zeros(known, bool)
-        likely[np.argsort(together, kind="stable")[:THINGS_PROPOSED]] = True
+        likely[np.argsort(together, kind="stable")[:most]] = True
 
         of_one = max(1, MOST_ORIENTATIONS // len(views))
         proposed = []
@@ -183,7 +188,7 @@ class ViewTemplates:
             np.concatenate(parts) for parts in zip(*proposed, strict=True)
         )
         return OrientedProposals(
-            things, ranks, rotations, centres, -together / len(views)
+            things, ranks, rotations, centres, -together / len(views), hidden
         )
 
     def _fit(self, view: "SeenOutline") -> "TemplateFit":
@@ -197,7 +202,7 @@ class ViewTemplates:
         )
         bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
 
-        sizes = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
+        sizes = SIZES_HIDDEN if view.hidden else SIZES
         first, last = (round(one / SIZE_STEP) for one in sizes)
         if not ((bins >= first) & (bins <= last)).any():
             bins = bins.clip(first, last)  # those of the next size are the likeliest
@@ -441,6 +446,11 @@ class SeenOutline:
         size = spread * middle / np.sqrt(camera.fx * camera.fy)
         shifts = np.zeros((1, 2))
         return cls(depth, shown, known, camera, pose, centre, middle, size, shifts)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether something hides a part of the outline."""
+        return len(self.shifts) > 1
 
     @property
     def focal(self) -> float:
