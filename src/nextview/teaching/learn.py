@@ -299,7 +299,7 @@ def learn_things(
     folder = Path(folder)
     out = Path(out)
     how.check()
-    count_workers(workers)  # refuses a number that is none
+    count_workers(workers)  # rejects an invalid number
     changes = bool(remove or how.symmetry)
     nothing_new = changes and folder.resolve() == out.resolve()
     keeps = add or bool(remove) or nothing_new
@@ -310,7 +310,7 @@ def learn_things(
     left_out = list(found.left_out)
 
     with only_one(out), unfinished(out, PARTS) as part:
-        # Read inside: another run may have changed it until now.
+        # Read under the lock: another run may have changed it before.
         old = _before(out, keeps)
         taught = [] if old is None else _known(*old, remove)
         _check_names(found.things, taught)

@@ -16,7 +16,8 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 
 # log-likelihood per unit of cosine similarity
 COSINE_WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)
-BIN_CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
+# correlations of two views, see ``Calibration.bin_correlation``
+BIN_CORRELATIONS = (0.1, 0.3, 0.6)
 HEADS = (0.0, 5.0, 15.0)  # weights of the head relative to the nearest views
 RIDGE = 1.0
 # most things whose held-out views are evaluated; more are sampled
@@ -338,7 +339,8 @@ def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
                 / wide
                 + 1e-9
             )
-    density -= density.max()  # a usual size is no evidence against what is known
+    # the best size of all classes has log-likelihood 0, so sizes only count against a class
+    density -= density.max()
     density[~np.isin(np.arange(len(density)), label[known])] = 0
     # rounded, because people read cards, too
     short = np.array([float(f"{radius:.5g}") for radius in np.exp(grid)])

@@ -62,7 +62,7 @@ def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> 
         radius = median / UNITS[unit] * metres
         if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
             likely.append(f"--unit {other} ({_length(radius)})")
-    hint = f"is it {' or '.join(likely)}?" if likely else "is that so?"
+    hint = f"is it {' or '.join(likely)}?" if likely else "is that right?"
     return f"{who}; {hint} --any-size takes it as it is"
 
 

@@ -20,8 +20,8 @@ class ThingSource:
     """One thing to be taught.
 
     Attributes:
-        name: of the thing.
-        label: its class.
+        name: name of the thing.
+        label: class of the thing.
         path: its mesh file, or the folder or bag of captured frames.
     """
 

@@ -154,7 +154,7 @@ class MetricImage:
         metres = observation.radius if observation.radius is not None else radius
         if metres is None:
             raise ObservationError(
-                "the object radius in metres is not known, and surfaces are compared in metres"
+                "the object radius in metres is not known, and the comparison with scans needs it"
             )
         return _metric_image(observation, float(metres))
 

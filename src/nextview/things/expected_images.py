@@ -59,7 +59,7 @@ class ExpectedSensor:
         """
         if not views:
             raise ObservationError(
-                "without a view that shows the thing the sensor is not known"
+                "the sensor cannot be estimated without a view that shows the thing"
             )
         noise = []
         for view in views:

@@ -101,7 +101,7 @@ class Memory:
         )
         held_out = self.held_out.shape[1]
         if (held_out > 0) != self.has_features:
-            raise ModelError("its held_out are of other features than its views")
+            raise ModelError("its held_out and its views have different features")
         check_array(
             "its held_out_views",
             self.held_out_views,
@@ -125,9 +125,7 @@ class Memory:
     def _check_values(self) -> None:
         """Check that the values are valid."""
         if np.unique(self.thing).tolist() != list(range(len(self.radii))):
-            raise ModelError(
-                "its thing names things that are not there, or not all that are"
-            )
+            raise ModelError("its thing refers to missing things, or omits some")
         if (np.diff(self.thing) < 0).any():
             raise ModelError("its thing does not ascend")
 
@@ -140,7 +138,7 @@ class Memory:
         nameless = np.isnan(self.radii) & (self.surfaces.counts[:, 0] > 0)
         if nameless.any():
             raise ModelError(
-                "its radii lack that of a thing whose surface is known in metres"
+                "its radii lack the radius of a thing with a surface in metres"
             )
 
         head = self.head.astype(np.float64)
@@ -150,13 +148,13 @@ class Memory:
         )
         if largest.max() > LARGEST_LOGIT:
             raise ModelError(
-                f"its head says more than {LARGEST_LOGIT:g} of a view, which no chance has"
+                f"its head gives logits above {LARGEST_LOGIT:g}, whose exponentials overflow"
             )
 
         for name in ("views", "held_out"):
             lengths = np.linalg.norm(getattr(self, name).astype(np.float32), axis=-1)
             if (np.minimum(lengths, np.abs(lengths - 1)) > ROUNDED).any():
-                raise ModelError(f"its {name} are no unit vectors")
+                raise ModelError(f"its {name} are not unit vectors")
 
         rotations = self.rotations.astype(np.float64)
         products = rotations @ rotations.swapaxes(1, 2)
@@ -165,11 +163,11 @@ class Memory:
             and (np.linalg.det(rotations) > 0).all()
         )
         if not turned:
-            raise ModelError("its rotations are no rotations")
+            raise ModelError("its rotations are not rotation matrices")
 
         if not self.has_features and not (self.surfaces.counts[:, 0] > 0).all():
             raise ModelError(
-                "it holds neither views nor the surface of one of its things"
+                "it contains neither views nor a surface of one of its things"
             )
 
         if (np.abs(self.held_out_views[..., 0]) > np.pi / 2 + ROUNDED).any():
@@ -268,7 +266,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
     """
     card = find_card(model)
     if card.memory is None:
-        raise ModelError(f"{card.card_path}: is no memory of things")
+        raise ModelError(f"{card.card_path}: is not a memory of things")
 
     features = find_card(FEATURE_NETWORK)
     if card.memory.features_sha256 not in (None, features.sha256):
@@ -290,7 +288,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
     if memory.has_features != has_features:
         holds = "holds" if memory.has_features else "holds no"
         raise ModelError(
-            f"{card.path}: {holds} features, and its card, {card.card_path}, says otherwise"
+            f"{card.path}: {holds} features, and its card, {card.card_path}, disagrees"
         )
     if memory.thing.tolist() != list(card.memory.poses):
         raise ModelError(

@@ -158,7 +158,14 @@ class Alignment:
         return len(self.things)
 
     def select(self, rows: NDArray) -> "Alignment":
-        """Select hypotheses by index or mask."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices or mask.
+
+        Returns:
+            The selected hypotheses.
+        """
         return Alignment(
             things=self.things[rows],
             rotations=self.rotations[rows],

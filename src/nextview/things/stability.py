@@ -42,7 +42,14 @@ class Stability:
     stands: Mask
 
     def select(self, rows: Index) -> "Stability":
-        """Select hypotheses by index."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices, (N,).
+
+        Returns:
+            Stability of the selected hypotheses.
+        """
         return Stability(self.below[rows], self.depth[rows], self.stands[rows])
 
 

@@ -43,20 +43,20 @@ class StoredSurfaces:
         if (self.counts < 0).any() or (
             (self.counts == 0).any(1) != (self.counts == 0).all(1)
         ).any():
-            raise ModelError("its counts are not those of surfaces")
+            raise ModelError("its counts are not valid for surfaces")
         totals = (len(self.places), len(self.faces))
         if _sums(self.counts) != totals:
             raise ModelError("its counts do not add up to its places and faces")
 
         extents = self.boxes[:, 1]
         if (np.abs(self.boxes) > LARGEST_EXTENT).any() or (extents < 0).any():
-            raise ModelError("its boxes are not those of things")
+            raise ModelError("its boxes have invalid sizes or positions")
         if (extents[self.counts[:, 0] > 0].max(1) == 0).any():
-            raise ModelError("its boxes hold things without extent")
+            raise ModelError("its boxes contain things without extent")
 
         limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
         if (self.faces >= limits[:, None]).any():
-            raise ModelError("its faces name vertices that are not there")
+            raise ModelError("its faces refer to missing vertices")
         for thing in np.flatnonzero(self.counts[:, 0]).tolist():
             self._check_surface(thing)
 

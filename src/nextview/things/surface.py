@@ -56,7 +56,7 @@ class Surface:
         """
         if mesh.unit is None:
             raise MeshError(
-                f"{mesh.name}: the unit of length is not known; say it with --unit"
+                f"{mesh.name}: the unit of length is not known; give --unit"
             )
 
         vertices = (mesh.vertices * mesh.radius + mesh.centre).astype(np.float32)

@@ -304,7 +304,7 @@ def _beside(distances: Float, median: float) -> float:
 
 
 def _axis_of(rotation: Rotation) -> Float:
-    """The axis of a rotation, (3,)."""
+    """Axis of a rotation, unit vector, (3,)."""
     vector = rotation.as_rotvec()
     return np.asarray(vector / np.linalg.norm(vector))
 

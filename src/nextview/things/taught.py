@@ -338,12 +338,14 @@ def weights_of(verification: Verification, where: str) -> EvidenceWeights:
     )
     if strange:
         raise ModelError(
-            f"{where}: weighs {strange[0]}, which this version does not know"
+            f"{where}: has a weight {strange[0]}, which this version does not support"
         )
     for share in ("correlation", "doubt"):
         value = verification.weights.get(share, 0)
         if value > 1:
-            raise ModelError(f"{where}: its {share} is {value:g}, and it is a share")
+            raise ModelError(
+                f"{where}: its {share} is {value:g}, and a share is at most 1"
+            )
     return EvidenceWeights(**verification.weights)
 
 

@@ -60,7 +60,14 @@ class ViewLikelihood:
     seen_behind: Float
 
     def select(self, rows: Index) -> "ViewLikelihood":
-        """Select hypotheses by index."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices, (N,).
+
+        Returns:
+            Likelihood under the selected hypotheses.
+        """
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
         return ViewLikelihood(**{name: part[rows] for name, part in parts.items()})
 

@@ -119,7 +119,14 @@ class Verified:
     carried: Mask
 
     def select(self, rows: NDArray) -> "Verified":
-        """Select hypotheses by index or mask."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices or mask.
+
+        Returns:
+            The selected hypotheses, with probabilities that sum to 1.
+        """
         kept = (*OF_HYPOTHESES, "probabilities", "log_belief")
         some = replace(self, **{name: getattr(self, name)[rows] for name in kept})
         return replace(
@@ -317,7 +324,7 @@ class Verifier:
         found = self.templates.propose(images)
         if not len(found.things):
             raise ObservationError(
-                "no view shows enough of the thing to be compared with others"
+                "no view shows enough of the thing to compare it with the scans"
             )
         by_outline = found.log_belief + (0 if prior is None else prior)
         by_outline -= by_outline.max()
