@@ -1,1 +1,1 @@
-"""Teaching things from a folder of meshes or captured frames; needs no torch."""
+"""Teaching of things from a folder of meshes or captured frames, without PyTorch."""

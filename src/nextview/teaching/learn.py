@@ -1,4 +1,4 @@
-"""Teach things: from scans or captured frames to a memory, without PyTorch."""
+"""Teaching of things: from scans or captured frames to a memory, without PyTorch."""
 
 import glob
 import shutil
@@ -87,23 +87,23 @@ from nextview.things.taught import TaughtThings
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"
-# folder beside these things, of the memory that things are shown to before it is finished
+# folder of the preliminary memory that recognises the things during the fits
 JUDGED = "judged"
-# the key of the things that a run that was stopped has taught, see ``files.unfinished``
+# key of the things that an interrupted run has taught, see ``files.unfinished``
 PARTS = "things"
 
 
 @dataclass(frozen=True)
 class Work:
-    """How the work is done.
+    """Execution of a run.
 
     Attributes:
-        how: how things are looked at.
-        part: folder of what is not finished.
+        how: options of the teaching.
+        part: folder of unfinished results.
         workers: see ``pool.each``.
         scheduler: see ``pool.each``.
-        track: follows the work.
-        of_classes: whether some class has several things.
+        track: progress callback.
+        of_classes: whether a class has several things.
     """
 
     how: TeachingOptions
@@ -116,22 +116,21 @@ class Work:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned.
+    """Result of teaching.
 
     Attributes:
         out: folder of the memory.
         things: number of things.
-        classes: number of classes that they belong to.
-        accuracy: share of the cases in which views are named right after 1, 2 and 3 of them, by
-            geometry where it is known, with weights that were fitted to other things, else after 1,
-            2, 3 and 5 held-out views by features and size; things of a class of several by the
-            others of that class. () if nothing was shown, as when things were only removed.
-        confused: pairs of things that are most often taken for each other, with the share of the
-            cases.
-        notes: what there is to know, a sentence each.
+        classes: number of their classes.
+        accuracy: share of correct answers. With geometry: after 1, 2 and 3 views, with weights that
+            were fitted to other things. Otherwise: after 1, 2, 3 and 5 held-out views, by features
+            and size. A thing of a class of several is recognised by the others of that class. () if
+            nothing was tested, as after a removal.
+        confused: pairs of things that are most often confused, with the share of the cases.
+        notes: notes for the user, a sentence each.
         left_out: what could not be learned and why, a phrase each.
-        by_outline: where ``accuracy`` is by geometry: the same cases by outline and size alone.
-        judged: how many things were shown to tell it by geometry.
+        by_outline: with geometry: the accuracy in the same cases by outline and size alone.
+        judged: number of things in this test.
     """
 
     out: Path
@@ -145,7 +144,7 @@ class Learned:
     judged: int = 0
 
     def __str__(self) -> str:
-        """In words."""
+        """Summary in words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         thing = "thing" if self.things == 1 else "things"
         told = f"; {self._how_often()}" if self.accuracy else ""
@@ -161,7 +160,7 @@ class Learned:
         )
 
     def _how_often(self) -> str:
-        """How often views are named right, in words."""
+        """Accuracy in words."""
         shown = self.accuracy[:3]
         views = ", ".join(str(k) for k in VIEWS_FITTED[: len(shown)])
         named = f"named right after {views} views: {_percent(shown)}"
@@ -184,24 +183,24 @@ class LearnOptions(TypedDict, total=False):
         unit: of the mesh files, "mm", "cm", "inch", "foot" or "m"; with it size counts as evidence,
             and things are recognised by their geometry.
         up: up axis of the mesh files, "y" or "z"; by default z, and y for GLB.
-        upright: whether the things only stand as in their files; by default they may also lie.
+        upright: whether the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at them, NAME or NAME:STRENGTH; "wrist" by default.
         largest_part: whether to keep only the largest connected part of each mesh.
         any_size: whether to accept things of very different sizes.
         one_class: whether things that are all in one folder are one class.
-        symmetry: of things for which it shall not be found, such as "flange=z:6", see
+        symmetry: symmetries that replace the detected ones, such as "flange=z:6", see
             ``teaching.symmetries.named_symmetries``.
         turntable: direction in which a turntable turned, "ccw" or "cw", seen from above.
-        depth_scale: metres per step of captured depth images; by default as their files say.
+        depth_scale: metres per step of captured depth images; by default from their files.
         depth_topic: topic of the depth images of ROS 2 bags with several.
         world_frame: tf frame of the world in ROS 2 bags, z up; by default the root of the tree.
-        seed: of all random draws; 0 by default.
-        add: whether to add the things to those that the memory knows.
+        seed: seed of all random draws; 0 by default.
+        add: whether to add the things to an existing memory.
         remove: names of things to remove from the memory.
         workers: number of processes; None for one on each core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         overwrite: whether to replace an existing memory.
-        track: follows the work; by default it is told in lines on standard error.
+        track: progress callback; by default it prints lines on standard error.
     """
 
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None
@@ -279,24 +278,28 @@ def learn_things(
     Args:
         folder: folder of meshes, bags and folders of captured frames.
         out: folder of the memory to write.
-        add: add the things to those that OUT knows, which are not processed again; FOLDER contains
-            only the new things.
-        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added, and this
-            or --symmetry is what changes.
+        add: add the things to those in OUT, which are not processed again; FOLDER contains only the
+            new things.
+        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added, and this or
+            --symmetry is what changes.
         workers: number of processes; by default one for each core; 0 uses this process.
         scheduler: address of a dask.distributed scheduler to use instead, whose workers see the
             same files.
         overwrite: replace the memory in OUT.
-        track: follows the things.
+        track: progress callback.
+
+    Returns:
+        What was learned, with the accuracy on held-out views.
 
     Raises:
-        DatasetError: nothing can be taught; what is wrong, in one sentence.
-        ResultsError: ``out`` is there, and neither ``add`` nor ``overwrite``.
+        DatasetError: nothing can be taught.
+        ResultsError: ``out`` exists, and neither ``add`` nor ``overwrite`` is set.
+        UsageError: an option is not valid.
     """
     folder = Path(folder)
     out = Path(out)
     how.check()
-    count_workers(workers)  # refuses a number that is none
+    count_workers(workers)  # rejects an invalid number
     changes = bool(remove or how.symmetry)
     nothing_new = changes and folder.resolve() == out.resolve()
     keeps = add or bool(remove) or nothing_new
@@ -307,7 +310,7 @@ def learn_things(
     left_out = list(found.left_out)
 
     with only_one(out), unfinished(out, PARTS) as part:
-        # Read inside: another run may have changed it until now.
+        # Read under the lock: another run may have changed it before.
         old = _before(out, keeps)
         taught = [] if old is None else _known(*old, remove)
         _check_names(found.things, taught)
@@ -337,7 +340,7 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
     """Check, before any work, that the outputs can be written.
 
     Raises:
-        UsageError: there is a memory, and it is neither to be kept nor to be replaced.
+        UsageError: a memory exists, and no option keeps or replaces it.
         ResultsError: see ``files.check_new``.
     """
     card = out / CARD
@@ -352,7 +355,7 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
 
 
 def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
-    """The memory whose things are kept; None if none is."""
+    """The memory whose things are kept; None without one."""
     if not keeps:
         return None
     card, memory = open_memory(out / CARD)
@@ -362,7 +365,11 @@ def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
 
 
 def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
-    """Refuse things that are called as one that is known already."""
+    """Refuse things with the name of a known thing.
+
+    Raises:
+        UsageError: a name is taken.
+    """
     names = {source.name for source, _ in taught}
     for thing in things:
         if thing.name in names:
@@ -373,7 +380,11 @@ def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
 
 
 def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]:
-    """The things of a memory, without some."""
+    """The things of a memory, except those to be removed.
+
+    Raises:
+        UsageError: a thing to be removed is not in the memory.
+    """
     assert card.memory is not None
     names = {thing.name for thing in card.memory.things}
     missing = sorted(set(remove) - names)
@@ -403,10 +414,10 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 
 
 def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
-    """Put the symmetries that a person gave in the place of those that were found.
+    """Replace detected symmetries by those of the user.
 
     Raises:
-        UsageError: one is of no thing, or of one whose size is not known.
+        UsageError: one names an unknown thing, or a thing of unknown size.
     """
     known = {source.name: arrays for source, arrays in taught}
     for name, symmetries in named_symmetries(given).items():
@@ -420,7 +431,7 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
 
 
 def _of_classes(sources: Sequence[ThingSource]) -> bool:
-    """Whether some class has several things."""
+    """Whether a class has several things."""
     return len({source.label for source in sources}) < len(sources)
 
 
@@ -428,11 +439,11 @@ def _with_features_where_they_count(
     taught: Sequence[Pair],
     work: Work,
 ) -> list[Pair]:
-    """Bring all things to the same: all with features of their views, or none.
+    """Make the things uniform: all with features of their views, or none.
 
-    Geometry tells things apart whose surfaces are known. Features count where it does not: for
-    things of unknown size, and for classes of several things, which others of the class resemble
-    without being the same. Where they are missing, the stored surface is rendered.
+    Geometry separates things with known surfaces. Features count where it does not: for things of
+    unknown size, and for classes of several things, whose further members resemble them without
+    being identical. The stored surface is rendered if features are missing.
     """
     sources = [source for source, _ in taught]
     count = _of_classes(sources) or any(VERTICES not in each for _, each in taught)
@@ -460,7 +471,7 @@ def _with_features_where_they_count(
 
 
 def _features_again(how: TeachingOptions, item: tuple[int, str, Arrays]) -> Arrays:
-    """The features of views of a thing by its stored surface."""
+    """Features of views of a thing's stored surface."""
     _, name, arrays = item
     in_file = make_mesh(arrays[VERTICES].astype(np.float64), arrays[FACES], name, "m")
     to_mesh = arrays["rotations"][0].astype(np.float64)
@@ -477,7 +488,7 @@ def _teach(
     taught: list[Pair],
     left_out: list[str],
 ) -> Iterator[int]:
-    """Teach things in parallel, each into its own file; finished ones are kept."""
+    """Teach things in parallel, each into its own file; finished files are reused."""
     waiting = []
     for source in sources:
         stamp = stamp_of(source, work.how, work.of_classes)
@@ -486,9 +497,9 @@ def _teach(
             taught.append((source, _without_phrase(source, arrays, left_out)))
         else:
             waiting.append((source, stamp))
-    # the longest first: none is left alone at the end
+    # the largest first, so that none remains alone at the end
     waiting.sort(key=lambda item: -item[0].path.stat().st_size)
-    # A thing alone takes all cores.
+    # A single thing uses all cores.
     threads = (
         1
         if work.scheduler
@@ -508,7 +519,7 @@ def _teach(
 
 
 def _without_phrase(source: ThingSource, arrays: Arrays, left_out: list[str]) -> Arrays:
-    """The arrays of a thing; which of its frames were not used is told instead."""
+    """The arrays of a thing; the phrase about its unused frames moves to ``left_out``."""
     phrase = arrays.get(LEFT_OUT)
     if phrase is not None:
         left_out.append(f"{source.name}: {bytes(phrase.tobytes()).decode()}")
@@ -522,7 +533,7 @@ def _teach_one(
     threads: int,
     item: tuple[ThingSource, str],
 ) -> Arrays | str:
-    """What is to be remembered of one thing; a sentence where it cannot be taught."""
+    """Arrays of one thing; a sentence if it cannot be taught."""
     source, stamp = item
     try:
         arrays = teach(source.path, source.name, how, threads, features)
@@ -542,11 +553,11 @@ def _write(
     old: ModelCard | None,
     work: Work,
 ) -> Learned:
-    """Fit what is fitted to all things together, and write memory and card.
+    """Fit to all things together, and write memory and card.
 
-    The new memory gets a name of its own, with its hash. The card's renaming is what makes it the
-    one that counts: a run that is killed leaves the old memory or the new one. The old file is
-    removed at the very end.
+    The file name of the new memory contains its hash. Renaming the card switches to the new memory
+    atomically, so that an interrupted run leaves the old memory or the new one. The old file is
+    removed last.
     """
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
@@ -576,7 +587,7 @@ def _write(
             {source.name: arrays["pictures"] for source, arrays in taught},
             fit,
         )
-        # the very same memory again
+        # the memory has not changed
         if _is_intact(out / weights.name, read_card(part / CARD).sha256):
             weights.unlink()
     _remove_old(out, weights.name)
@@ -598,7 +609,7 @@ def _write(
 
 
 def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
-    """Write a memory and its card, which gets its hash; returns the path of the memory."""
+    """Write a memory and its card with the hash; return the path of the memory."""
     sha256 = memory.save(folder / MEMORY_FILE)
     weights = memory_path(folder / CARD, sha256)
     (folder / MEMORY_FILE).rename(weights)
@@ -612,26 +623,28 @@ def _verified(
     old: ModelCard | None,
     work: Work,
 ) -> VerifiedFit | None:
-    """Show things of known geometry, and fit to what is found; None if there are none.
+    """Recognise rendered views of things of known geometry, and fit to the results.
 
-    All are shown, or a drawn part of very many. Where things are added to more than there were
-    before, the new ones
-    alone: the weights stay, until there are GROWTH times as many things as they were fitted to.
+    All things are tested, or a random sample of very many. If things are added, only the new ones
+    are tested: the weights stay until there are GROWTH times as many things as in their fit. The
+    result is None without known geometry.
     """
     if not memory.surfaces.counts.any():
         return None
 
     folder = work.part / JUDGED
-    shutil.rmtree(folder, ignore_errors=True)  # what an earlier run has left
+    shutil.rmtree(folder, ignore_errors=True)  # left by an earlier run
     folder.mkdir()
     _save(folder, card, memory)
     recogniser = TaughtRecogniser(folder / CARD, threads=1)
     known = TaughtThings.of(recogniser)
     assert known is not None
+
     labels = class_of_things(recogniser, known)
     before = None if old is None or old.memory is None else old.memory.verification
     rng = np.random.default_rng(work.how.seed)
     every = range(len(labels))
+
     if (
         old is None
         or old.memory is None
@@ -658,9 +671,10 @@ def _shown(
     rng: np.random.Generator,
     work: Work,
 ) -> tuple[list[Shown], list[int]]:
-    """Show things to the memory in parallel; sorted, so that the order does not matter.
+    """Test things with the memory in parallel, in a fixed order.
 
-    Returns what was found, and the things of which nothing was seen.
+    Returns:
+        The results, and the things that were not visible.
     """
     items = to_be_shown(things, known, rng)
     show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
@@ -677,7 +691,7 @@ def _all_done(
     work: Work,
     what: str,
 ) -> list[tuple[GivenItem, Result]]:
-    """Each of some items with what a function returns for it, in parallel, in any order.
+    """Results of a function for some items, in parallel, in any order.
 
     Raises:
         DatasetError: a process died.
@@ -702,10 +716,10 @@ def _is_intact(weights: Path, sha256: str) -> bool:
 
 
 def _remove_old(out: Path, kept: str) -> None:
-    """Remove the files of memories that the card does not name any more.
+    """Remove memory files that the card no longer names.
 
-    Ours are those whose name holds their hash, and that of earlier versions, which has none, if it
-    is a memory. A link is removed, never what it points to.
+    These are files whose name contains their hash, and the file of earlier versions, whose name has
+    no hash, if it is a memory. A link is removed, but never its target.
     """
     for file in out.glob(f"{glob.escape(MEMORY_NAME)}-*{MEMORY_SUFFIX}"):
         digits = file.stem.removeprefix(f"{MEMORY_NAME}-")
@@ -723,7 +737,7 @@ def _remove_old(out: Path, kept: str) -> None:
 
 
 def _holds_views(file: Path) -> bool:
-    """Whether a file is that of a memory, by the names of its arrays."""
+    """Whether a file is a memory, by the names of its arrays."""
     try:
         with safe_open(file, "numpy") as arrays:
             return {"views", "thing", "held_out", "pictures"} <= set(arrays.keys())
@@ -732,7 +746,7 @@ def _holds_views(file: Path) -> bool:
 
 
 def _unseen(taught: Sequence[Pair], verified: VerifiedFit | None) -> set[str]:
-    """Names of the things of which the sensor sees nothing."""
+    """Names of the things that the sensor does not see."""
     of_features = {
         source.name
         for source, arrays in taught
@@ -742,9 +756,9 @@ def _unseen(taught: Sequence[Pair], verified: VerifiedFit | None) -> set[str]:
 
 
 def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
-    """What there is to know of what was learned, a sentence each.
+    """Notes on the things for the user, a sentence each.
 
-    The sensor sees nothing of the things that are called ``unseen``.
+    ``unseen`` are the names of things that the sensor does not see.
     """
     names = [source.name for source, _ in taught]
     notes = []
@@ -754,9 +768,11 @@ def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
             f" unknown is told from views of {names[0]} alone; teach what it may be mistaken for,"
             " too"
         )
+
     first: dict[bytes, str] = {}
+
     for source, arrays in taught:
-        # The picture is a render without errors: only the same mesh gives the very same one.
+        # The picture is an exact rendering: only the same mesh gives an identical one.
         look = (
             arrays["pictures"].tobytes()
             + np.round(np.log(arrays["radii"]), 3).tobytes()
@@ -766,17 +782,19 @@ def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
                 f"{twin} and {source.name} look the same: one thing under two names?"
             )
     for source, arrays in taught:
-        # of what was taught now, from a mesh file
+        # doubts about the mesh files of this run
         doubts = arrays.get("doubts", np.zeros(0, np.uint8))
         notes.extend(
             f"{source.name}: {doubt}"
             for doubt in doubts.tobytes().decode().splitlines()
         )
+
     notes += [
         f"{name}: the sensor sees nothing of it; is it in another unit?"
         for name in names
         if name in unseen
     ]
+
     unknown = [
         source.name for source, arrays in taught if not np.isfinite(arrays["radii"])
     ]

@@ -1,4 +1,4 @@
-"""One picture of what was learned: how sure it will be, and which things it will confuse."""
+"""Summary picture of the learned things: their accuracy and the confused pairs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from nextview.teaching.memory_fit import VIEWS_FITTED, Fit
 
 PAGE_WIDTH = 11.0  # inches
-PICTURE_WIDTH = 1.05  # inches, and as high
+PICTURE_WIDTH = 1.05  # width and height, inches
 PICTURE_GAP = 0.11  # between pictures, inches
 LINE = 0.22  # height of a name below a picture, inches
 PICTURE_MARGIN = 0.33
-# of things beside the bars
+# grid of things beside the bars
 THING_COLUMNS = 6
 THING_ROWS = 2
-ALL_COLUMNS = 9  # of things below the bars
+ALL_COLUMNS = 9  # columns of things below the bars
 ROW = PICTURE_WIDTH + LINE + PICTURE_GAP
 TITLE_HEIGHT = 0.75
-MOST_THINGS_SHOWN = 120  # of more an even choice is shown
+MOST_THINGS_SHOWN = 120  # largest number of things; more are thinned evenly
 MOST_PAIRS = 4
 LONGEST_LABEL = 18  # letters
 PIXELS_PER_INCH = 120
@@ -35,12 +35,12 @@ ThingPictures = Mapping[str, NDArray[np.uint8]]
 def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     """Draw the things, the accuracy by the number of views, and the confused pairs.
 
-    It is as high as what is on it.
+    The height of the picture follows its content.
 
     Args:
-        path: of the PNG file.
-        pictures: one for each thing, by its name, (64, 64) uint8; 0 where nothing is seen.
-        fit: what was fitted to the things.
+        path: path of the PNG file.
+        pictures: picture of each thing, by its name, (64, 64) uint8; 0 for background.
+        fit: fit to the things.
     """
     names = list(pictures)
     shown = _even_choice(names)
@@ -54,7 +54,7 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
         dpi=PIXELS_PER_INCH,
         facecolor="white",
     )
-    # one for all pictures: axes take longer than what is in them
+    # one for all pictures: creating axes takes longer than drawing them
     page = figure.add_axes((0, 0, 1, 1))
     page.set_axis_off()
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0))  # inches from the top left corner
@@ -62,13 +62,13 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     if fit.accuracy:
         _draw_bars(figure, fit, height)
         _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
-    # a picture sets them anew
+    # imshow changes the limits
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")
     figure.savefig(path)
 
 
 def _even_choice(names: list[str]) -> list[str]:
-    """All names, or an even choice of MOST_THINGS_SHOWN."""
+    """All names, or MOST_THINGS_SHOWN evenly spaced ones."""
     if len(names) <= MOST_THINGS_SHOWN:
         return names
     return [
@@ -169,7 +169,7 @@ def _draw_picture(
     picture: NDArray[np.uint8],
     name: str,
 ) -> None:
-    """A small picture with its name below, at a place in inches."""
+    """A small picture with its name below, at a position in inches."""
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
     extent = (left, left + PICTURE_WIDTH, top + PICTURE_WIDTH, top)
     page.imshow(

@@ -1,4 +1,4 @@
-"""Join taught things to a memory, with its card."""
+"""Combine taught things in a memory, with its card."""
 
 from collections.abc import Sequence
 
@@ -38,20 +38,20 @@ from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
 from nextview.types import Index
 
-MEMORY_NAME = "memory"  # of the card in a folder of taught things
-Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
+MEMORY_NAME = "memory"  # name of the card in the folder of a memory
+Pair = tuple[ThingSource, Arrays]  # a thing and its arrays
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
 def fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
-    """Join things to a memory, and fit what is fitted to them together.
+    """Combine things in a memory, and fit to all of them.
 
     Args:
         taught: the things, sorted by class.
         label: class of each, (T,) int64.
 
     Returns:
-        The memory, and what was fitted to it.
+        The memory, and the fit.
     """
     poses = [len(arrays["rotations"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
@@ -63,6 +63,7 @@ def fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
         name: np.concatenate([arrays[name] for _, arrays in taught])
         for name in ("views", "rotations")
     }
+
     if joint["views"].shape[-1]:
         fit = fit_memory(
             joint["views"],
@@ -72,6 +73,7 @@ def fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
         )
     else:
         fit = fit_without_features(int(label.max()) + 1)
+
     surfaces = StoredSurfaces.of(
         [_surface_of(source, arrays) for source, arrays in taught]
     )
@@ -95,15 +97,18 @@ def card_of(
     fit: Fit,
     commands: tuple[str, ...],
 ) -> ModelCard:
-    """Write the card of a memory, without the hash of its file.
+    """Create the card of a memory, without the hash of its file.
 
     Args:
         taught: the things.
-        classes: their names.
+        classes: names of the classes.
         label: class of each thing, (T,) int64.
         memory: the memory.
-        fit: what was fitted to it.
-        commands: that produced the earlier content of the memory.
+        fit: fit to the memory.
+        commands: commands that produced the earlier content of the memory.
+
+    Returns:
+        The card.
     """
     poses = np.bincount(memory.thing)
     things = tuple(
@@ -157,12 +162,15 @@ def with_verification(
     memory: Memory,
     verified: VerifiedFit,
 ) -> ModelCard:
-    """Return a card with the fits to the surfaces; residuals are 0 without geometry.
+    """Add the fits to the surfaces to a card; residuals are 0 for unknown geometry.
 
     Args:
-        card: of the memory.
+        card: card of the memory.
         memory: the memory.
-        verified: what was fitted.
+        verified: fits to the surfaces.
+
+    Returns:
+        The extended card.
     """
     about = card.memory
     assert about is not None
@@ -184,10 +192,13 @@ def with_verification(
 
 
 def by_views(shares: Sequence[float]) -> dict[str, float]:
-    """Shares after 1, 2, ... views, as a card holds them.
+    """Shares by the number of views, in the format of cards.
 
     Args:
-        shares: in this order.
+        shares: shares after each number of views in VIEWS_FITTED.
+
+    Returns:
+        Rounded shares.
     """
     return {
         str(k): round(share, 4) for k, share in zip(VIEWS_FITTED, shares, strict=False)
@@ -195,13 +206,13 @@ def by_views(shares: Sequence[float]) -> dict[str, float]:
 
 
 def _surface_of(source: ThingSource, arrays: Arrays) -> Surface | None:
-    """The surface of a thing; None if its size is not known."""
+    """The surface of a thing; None for unknown size."""
     if VERTICES not in arrays:
         return None
     return Surface(source.name, arrays[VERTICES], arrays[FACES])
 
 
 def _symmetries_of(arrays: Arrays, name: str) -> tuple[Symmetry, ...]:
-    """The symmetries of a thing under this name; () where its geometry is not known."""
+    """The symmetries of a thing under this name; () for unknown geometry."""
     rows = arrays.get(name, np.zeros((0, 4))).tolist()
     return tuple(Symmetry((x, y, z), int(order)) for x, y, z, order in rows)

@@ -1,4 +1,4 @@
-"""Fits to a whole memory: weight of a likeness, a head for classes, sizes, novelty."""
+"""Fits to a whole memory: weight of similarities, linear head for classes, sizes, novelty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,33 +14,36 @@ from nextview.recognition.belief import (
 from nextview.things.memory import AZIMUTHS, by_ring, similarities
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-COSINE_WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
-BIN_CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
-HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
+# log-likelihood per unit of cosine similarity
+COSINE_WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)
+# correlations of two views, see ``Calibration.bin_correlation``
+BIN_CORRELATIONS = (0.1, 0.3, 0.6)
+HEADS = (0.0, 5.0, 15.0)  # weights of the head relative to the nearest views
 RIDGE = 1.0
-MOST_THINGS_JUDGED = 150  # things whose held-out views are judged: a drawn part of more
+# most things whose held-out views are evaluated; more are sampled
+MOST_THINGS_JUDGED = 150
 DRAWS = 4
 VIEWS_FITTED = (1, 2, 3, 5)
 FOLDS = 5
 QUANTILE_COUNT = 101
-SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
+SIZE_ERROR = 0.05  # standard deviation of a measured log-radius
 NO_LIKENESS = -1e3
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What was fitted to a memory, with the accuracy on held-out views.
+    """Fit to a memory, with the accuracy on held-out views.
 
     Without features there is nothing to fit, and the last four are empty.
 
     Attributes:
-        weight: of the similarity of a view to what is remembered.
-        correlation: of the evidence of two views.
+        weight: weight of the similarity of a view to the stored views.
+        correlation: correlation of the evidence of two views.
         head: weights of the linear head on the features.
         head_bias: biases of the head.
-        quantiles: of the novelty score, see ``recognition.novelty.Quantiles``.
+        quantiles: quantiles of the novelty score, see ``recognition.novelty.Quantiles``.
         usual: see ``recognition.novelty.Quantiles``.
-        accuracy: share of right answers after each number of views in VIEWS_FITTED.
+        accuracy: share of correct answers after each number of views in VIEWS_FITTED.
         confused: pairs that are most often confused: (thing, thing, share).
     """
 
@@ -62,19 +65,22 @@ def fit_memory(
     held_out_views: Floats,
     radii: Floats,
 ) -> Fit:
-    """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
+    """Fit to the held-out views of the things by maximum likelihood after 1, 2, 3 and 5 views.
 
-    A thing that has others of its class is judged by these alone, in folds over things: whoever
-    teaches a class will meet other things of it. A thing that is a class of its own is judged by
-    what is remembered of itself.
+    A thing in a class of several is recognised by the others of its class, in folds over things,
+    because a taught class will meet new members. A thing that is a class of its own is recognised
+    by its own stored views.
 
     Args:
-        views: (H, rings, azimuths, F), remembered, unit vectors.
-        thing: of each resting pose, (H,).
+        views: stored views, unit vectors, (H, rings, azimuths, F).
+        thing: thing of each resting pose, (H,).
         label: class of each thing, ascending, (T,).
-        held_out: embeddings of views that are not remembered, (T, K, F).
+        held_out: embeddings of held-out views, (T, K, F).
         held_out_views: their elevations and azimuths, radians, (T, K, 2).
-        radii: object radius of each thing, metres, (T,); NaN where it is not known.
+        radii: object radius of each thing, metres, (T,); NaN if unknown.
+
+    Returns:
+        The fit.
     """
     views = np.asarray(views, np.float32)
     held_out = np.asarray(held_out, np.float32)
@@ -92,6 +98,7 @@ def fit_memory(
     # as a sensor would measure it
     measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))
     sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
+
     drawn = np.stack(
         [
             np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)])
@@ -109,12 +116,14 @@ def fit_memory(
                 (_belief(sums, heads.shape[-1], of_class, c), (w, c, h))
                 for c in BIN_CORRELATIONS
             ]
+
     truth = label[judged]
     loss = [
         -np.mean([of_true_class(logs, truth).mean() for logs in beliefs])
         for beliefs, _ in scored
     ]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
+
     accuracy = tuple(
         float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs
     )
@@ -125,6 +134,7 @@ def fit_memory(
         drawn,
         range(1, 1 + max(VIEWS_FITTED)),
     )
+
     each = _belief(sums, heads.shape[-1], of_class, correlation)
     usual = np.stack([_usual(logs, truth) for logs in each])
     scores = [
@@ -147,7 +157,14 @@ def fit_memory(
 
 
 def fit_without_features(classes: int) -> Fit:
-    """What a memory of so many classes without features has in the place of what is fitted."""
+    """Placeholder fit of a memory without features.
+
+    Args:
+        classes: number of classes.
+
+    Returns:
+        A fit with neutral values.
+    """
     nothing = np.zeros(0)
     return Fit(
         1.0,
@@ -162,11 +179,10 @@ def fit_without_features(classes: int) -> Fit:
 
 
 def _usual(logs: Floats, truth: Index) -> Floats:
-    """Return the usual excess novelty of each class, (C,); 0 if it is not known.
+    """Usual excess novelty of each class, (C,), from log-beliefs, (T, draws, C); 0 if unknown.
 
-    The input is the log-belief, (T, draws, C).
-
-    Half of it: eight views, through one setup of a sensor, do not tell more.
+    It is half the observed excess, because eight views through one setup of a sensor do not support
+    more.
     """
     scores = -logs.max(-1)
     found = np.zeros(logs.shape[-1])
@@ -176,7 +192,7 @@ def _usual(logs: Floats, truth: Index) -> Floats:
 
 
 def _judged(views: Floats, thing: Index, held_out: Floats, where: Floats) -> Float32:
-    """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
+    """Similarity of each held-out view to each resting pose and azimuth, (T, K, H, azimuths)."""
     flat = similarities(
         by_ring(views),
         held_out.reshape(-1, held_out.shape[-1]),
@@ -194,7 +210,7 @@ def _heads(
     held_out: Floats,
     judged: Index,
 ) -> tuple[Float32, tuple[Floats, Floats]]:
-    """Return the logits of held-out views by heads that have not seen the thing, (T, K, C).
+    """Logits of held-out views by heads that were fitted without the thing, (T, K, C).
 
     The head of all things is returned as well.
     """
@@ -222,7 +238,7 @@ def _heads(
 def _ridge(x: Floats, y: Index, classes: int) -> tuple[Floats, Floats]:
     """Fit ridge regression from views, (H, n, F), to one-hot classes, (H,).
 
-    Classes have equal weight.
+    All classes have equal weight.
     """
     h, n, f = x.shape
     rows = x.reshape(h * n, f)
@@ -245,7 +261,7 @@ def _sums(
     drawn: Index,
     after: Sequence[int],
 ) -> dict[int, Floats]:
-    """Sums of log-evidence ``after`` so many drawn views, (T, draws, ...) each."""
+    """Sums of log-evidence ``after`` some numbers of drawn views, (T, draws, ...) each."""
     total = [
         log_evidence_of(x, a, z)
         for x, a, z in zip(logits, alike, where[..., 1], strict=True)
@@ -262,7 +278,7 @@ def _belief(
     hypotheses: Index,
     correlation: float,
 ) -> list[Float]:
-    """Return the log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
+    """Log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     return [calibration.log_belief(total, k, classes) for k, total in sums.items()]
 
@@ -273,7 +289,7 @@ def _confused(
     judged: Index,
     label: Index,
 ) -> tuple[tuple[int, int, float], ...]:
-    """Return pairs of things by how often one is named as the other, worst first."""
+    """Pairs of things by the frequency of their confusion, worst first."""
     answers = logs.argmax(-1)
     pairs = dict[tuple[int, int], float]()
     first = {int(c): int(np.flatnonzero(label == c)[0]) for c in np.unique(label)}
@@ -289,13 +305,14 @@ def _confused(
 
 
 def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
-    """Estimate how likely each size is for the things of each class.
+    """Likelihood of each size for the things of each class.
 
-    Each thing of a class adds a normal distribution of the log radius, and a tenth of a wide one,
-    because half-hidden things look smaller. A class of which no size is known has none.
+    Each thing of a class adds a normal distribution of the log-radius, and a wide one with a tenth
+    of the weight, because half-hidden things appear smaller. A class without known sizes has no
+    evidence.
 
     Args:
-        radii: of the things, metres, (T,); NaN where not known.
+        radii: radii of the things, metres, (T,); NaN if unknown.
         label: class of each thing, (T,) int64.
 
     Returns:
@@ -308,9 +325,10 @@ def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
     high = np.log(radii[known].max()) + 0.7
     grid = np.linspace(low, high, int((high - low) / 0.03) + 2)
     density = np.zeros((int(label.max()) + 1, len(grid)))
+
     for c in range(len(density)):
         own = np.log(radii[known & (label == c)])
-        # Things of a class differ in size, and the fewer are known the wider their sizes may lie.
+        # The sizes in a class differ, and fewer known things require a wider distribution.
         wide = SIZE_ERROR
         if (label == c).sum() > 1:
             wide = max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
@@ -321,8 +339,9 @@ def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
                 / wide
                 + 1e-9
             )
-    density -= density.max()  # a usual size is no evidence against what is known
+    # the best size of all classes has log-likelihood 0, so sizes only count against a class
+    density -= density.max()
     density[~np.isin(np.arange(len(density)), label[known])] = 0
-    # a card is read by people, too
+    # rounded, because people read cards, too
     short = np.array([float(f"{radius:.5g}") for radius in np.exp(grid)])
     return SizeEvidence.from_arrays(short, np.round(density, 3), 1.0)

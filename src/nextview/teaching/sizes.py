@@ -1,4 +1,4 @@
-"""Sizes of taught things that give away a wrong unit of length."""
+"""Plausibility of the sizes of taught things: detection of a wrong unit of length."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,25 +9,25 @@ from nextview.errors import DatasetError
 from nextview.geometry.mesh import UNITS
 from nextview.types import Floats
 
-# a thing so many times larger or smaller than the median of the others is asked about
+# ratio to the median of the others from which a size is implausible
 ODD_SIZE = 300
-# metres, of the median thing: no camera looks at larger ones from all around
+# largest plausible median radius, metres: no camera goes around a larger thing
 LARGEST_MEDIAN_RADIUS = 20.0
-SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
-USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
+SMALLEST_RADIUS = 0.001  # smallest one, metres: the resolution of depth cameras
+USUAL_RADII = (0.01, 3.0)  # range of usual radii, metres
 
 
 def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
-    """Ask about things whose size says that their files are in another unit of length.
+    """Refuse things whose sizes indicate another unit of length.
 
     Args:
-        paths: of the things.
-        radii: their object radii, (N,), metres; NaN where they are not known.
-        unit: of the mesh files, as it was given; None if it was not.
+        paths: paths of the things.
+        radii: their object radii, (N,), metres; NaN if unknown.
+        unit: unit of the mesh files as given; None without one.
 
     Raises:
         DatasetError: a thing is hundreds of times larger or smaller than most, or most are larger
-            than a house or smaller than what a depth camera sees.
+            than a house or smaller than the resolution of a depth camera.
     """
     known = np.isfinite(radii)
     if not known.any():
@@ -48,7 +48,7 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
 
 
 def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> str:
-    """Return a sentence about things of odd size, with the unit that makes them usual."""
+    """A sentence about things of implausible size, with the unit that makes them usual."""
     middle = int(np.nanargmin(np.abs(radii - median)))
     size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"
     who = (
@@ -62,12 +62,12 @@ def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> 
         radius = median / UNITS[unit] * metres
         if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
             likely.append(f"--unit {other} ({_length(radius)})")
-    hint = f"is it {' or '.join(likely)}?" if likely else "is that so?"
+    hint = f"is it {' or '.join(likely)}?" if likely else "is that right?"
     return f"{who}; {hint} --any-size takes it as it is"
 
 
 def _length(metres: float) -> str:
-    """A length for people to read."""
+    """A length in a readable unit."""
     if metres >= 1:
         return f"{metres:.3g} m" if metres < 1000 else f"{metres / 1000:,.3g} km"
     return f"{100 * metres:.2g} cm" if metres >= 0.01 else f"{1000 * metres:.2g} mm"

@@ -1,4 +1,4 @@
-"""Symmetries that a person names, such as ``flange=z:6``, instead of those that are found."""
+"""Symmetries that a user specifies, such as ``flange=z:6``, instead of detected ones."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from nextview.checks import one_line
 from nextview.errors import UsageError
 from nextview.recognition.model_card import LARGEST_ORDER, Symmetry
 
-NO_SYMMETRY = "none"  # of a thing that has no symmetry
+NO_SYMMETRY = "none"  # value for a thing without symmetries
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 EVERY_TURN = tuple(Symmetry(axis, 0) for axis in AXES.values())
 HOW = (
@@ -18,17 +18,17 @@ HOW = (
 
 
 def named_symmetries(given: Sequence[str]) -> dict[str, tuple[Symmetry, ...]]:
-    """Read the symmetries of things.
+    """Parse specifications of symmetries.
 
     Args:
-        given: ``NAME=none``, ``NAME=ball`` or ``NAME=AXIS:ORDER,...`` of each thing, such as
-            ``flange=z:6`` or ``can=z,x:2``.
+        given: one specification for each thing, ``NAME=none``, ``NAME=ball`` or
+            ``NAME=AXIS:ORDER,...`` of each thing, such as ``flange=z:6`` or ``can=z,x:2``.
 
     Returns:
         The symmetries of each thing by its name.
 
     Raises:
-        UsageError: one of them cannot be read, or two are of one thing.
+        UsageError: a specification is invalid, or two name the same thing.
     """
     found: dict[str, tuple[Symmetry, ...]] = {}
     for text in given:
@@ -47,7 +47,7 @@ def named_symmetries(given: Sequence[str]) -> dict[str, tuple[Symmetry, ...]]:
 
 
 def _read(part: str, text: str) -> Symmetry:
-    """One symmetry, AXIS or AXIS:ORDER; ``text`` is all that was given, for the error."""
+    """Parse one symmetry, AXIS or AXIS:ORDER; ``text`` is the whole input, for error messages."""
     axis, colon, order = part.partition(":")
     try:
         x, y, z = AXES[axis] if axis in AXES else map(float, axis.split("/"))

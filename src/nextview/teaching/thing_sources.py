@@ -20,8 +20,8 @@ class ThingSource:
     """One thing to be taught.
 
     Attributes:
-        name: of the thing.
-        label: its class.
+        name: name of the thing.
+        label: class of the thing.
         path: its mesh file, or the folder or bag of captured frames.
     """
 
@@ -32,12 +32,12 @@ class ThingSource:
 
 @dataclass(frozen=True)
 class Found:
-    """What a folder teaches.
+    """Things in a folder.
 
     Attributes:
-        things: sorted by class and name.
-        left_out: what was left out and why, a phrase each.
-        notes: how the folder was understood, a sentence each.
+        things: the things, sorted by class and name.
+        left_out: ignored files and the reasons, a phrase each.
+        notes: interpretation of the folder, a sentence each.
     """
 
     things: list[ThingSource]
@@ -50,24 +50,24 @@ def find_things(
     out: Path | None = None,
     one_class: bool = False,
 ) -> Found:
-    """Find the things that a folder teaches.
+    """Find the things in a folder.
 
     A mesh in the folder itself, and a folder or a ROS 2 bag of captured frames, is a thing and a
-    class of its own name. All else is as in a dataset (``data.folders``): each mesh in a class
-    folder is a thing of that class; where there are splits, those of "train".
+    class of its own name. Everything else is read as a dataset (``data.folders``): each mesh in a
+    class folder is a thing of that class; if there are splits, only "train" is used.
 
     Args:
-        folder: to be looked through.
-        out: where the result goes, which is no source of things if it lies in the folder.
-        one_class: whether all things may be of one class.
+        folder: folder to be searched.
+        out: output folder, which is ignored if it lies in the folder.
+        one_class: whether all things may belong to one class.
 
     Returns:
         The things, and all that was left out.
 
     Raises:
         DatasetError: there is no such folder, nothing in it can be taught, two things have one
-            name, or all are of one class: a folder around the things, as an archive has one, looks
-            the same.
+            name, or all belong to one class: an extra folder around the things, as in an archive,
+            looks the same.
     """
     if folder.is_file():
         raise DatasetError(
@@ -128,7 +128,7 @@ def find_things(
 
 
 def _captures(folder: Path) -> list[Path]:
-    """The folders and bags of captured frames in a folder, sorted by name."""
+    """Folders and bags of captured frames in a folder, sorted by name."""
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [
         path
@@ -141,20 +141,20 @@ def _captures(folder: Path) -> list[Path]:
 
 
 def _counted(count: int, one: str, several: str) -> list[str]:
-    """How many there are, a phrase; nothing for none."""
+    """A phrase with a count; nothing for zero."""
     if count == 0:
         return []
     return [f"{count} {one if count == 1 else several}"]
 
 
 def _of_frames(path: Path) -> ThingSource:
-    """The thing that a folder of captured frames, or the file of a bag, shows."""
+    """The thing of a folder of captured frames or of a bag."""
     name = path.name if path.is_dir() else path.stem
     return ThingSource(name, name, path)
 
 
 def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-    """Return the entries to teach, without those of test and validation splits."""
+    """Split the entries into those to be taught and those of test and validation splits."""
     if not any(entry.split == "train" for entry in entries):
         return entries, []
     taught = [entry for entry in entries if entry.split in ("train", "")]
@@ -172,7 +172,7 @@ def _check_names(things: list[ThingSource]) -> None:
 
 
 def _check_classes(folder: Path, things: list[ThingSource]) -> None:
-    """Ask about several things that all lie in one class folder."""
+    """Refuse several things that all lie in one class folder."""
     label = things[0].label
     if len(things) == 1 or any(thing.label != label for thing in things):
         return

@@ -1,4 +1,4 @@
-"""Look at one thing: its surface and symmetries, and the features of its views where they count."""
+"""Arrays of one thing: its surface and symmetries, and features of its views if they count."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,41 +39,40 @@ from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview.types import Float
 
-# of a thing's arrays: a phrase about the frames that were not used; it is not remembered
+# key of a phrase about unused frames, which does not enter the memory
 LEFT_OUT = "left_out"
-# of a thing's arrays: whether it is known only as it stands, (1,) bool
+# key of a flag, (1,) bool: whether the thing is known in its upright pose only
 UPRIGHT = "upright"
-# of a thing's arrays: its surface, if its size is known
+# keys of its surface, if its size is known
 VERTICES = "vertices"
 FACES = "faces"
-SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
-NEAR_SYMMETRIES = "near_symmetries"  # and of each near symmetry
-# of the radius: a camera stands farther from a large thing, and measures it less exactly
+SYMMETRIES = "symmetries"  # axis and order of each symmetry, (S, 4)
+NEAR_SYMMETRIES = "near_symmetries"  # axis and order of each near symmetry, (S, 4)
+# error relative to the radius: cameras stand farther from large things and resolve less
 COARSER = 0.002
 
 
 @dataclass(frozen=True)
 class TeachingOptions:
-    """How things are taught.
+    """Options of the teaching.
 
     Attributes:
         unit: unit of length of the mesh files; with it, size counts as evidence, and things are
             recognised by their geometry.
         up: up axis of the mesh files; by default z, and y for GLB.
-        upright: the things only stand as in their files; by default they may also lie.
+        upright: the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at the things: kinect, stereo, setup, wrist or none, or
             NAME:STRENGTH.
         largest_part: keep only the largest connected part of each mesh.
         any_size: accept things of very different sizes.
         one_class: things that are all in one folder are one class; --add assumes this.
-        symmetry: symmetries of things for which they shall not be found, in the axes of their
-            files: NAME=none, NAME=z (any angle), NAME=z:6 (order 6), NAME=z:4,x:2, NAME=1/0/1:2,
-            NAME=ball.
+        symmetry: symmetries that replace the detected ones, in the axes of the files: NAME=none,
+            NAME=z (any angle), NAME=z:6 (order 6), NAME=z:4,x:2, NAME=1/0/1:2, NAME=ball.
         turntable: the depth frames have no poses: the camera stood still, and the thing made one
             full turn in equal steps, counter-clockwise (ccw) or clockwise (cw) seen from above;
             camera-intrinsics.txt is beside them.
-        depth_scale: for captured frames: metres per step of the depth images, such as 0.001 for
-            millimetres; by default as their files say.
+        depth_scale: metres per step of captured depth images, such as 0.001 for millimetres; by
+            default from their files.
         depth_topic: for ROS 2 bags with several topics of depth images: the topic.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
         seed: seed of all random draws.
@@ -94,10 +93,10 @@ class TeachingOptions:
     seed: int = 0
 
     def check(self) -> None:
-        """Refuse, before anything is taught, what every thing would be refused for.
+        """Refuse invalid options before anything is taught.
 
         Raises:
-            UsageError: a value that makes no sense.
+            UsageError: a value is invalid.
         """
         sensor_named(self.sensor)
         named_symmetries(self.symmetry)
@@ -114,23 +113,24 @@ def teach(
     threads: int = 1,
     features: bool = True,
 ) -> Arrays:
-    """Look at one thing, and note what is to be remembered of it.
+    """Process one thing, and collect the arrays of its memory.
 
     Args:
         path: a mesh file, or a folder or a bag of captured frames.
-        name: of the thing; with the seed it decides all random draws.
-        how: how it is looked at.
-        threads: that work side by side.
-        features: whether the features of its views are remembered even if its geometry is known.
+        name: name of the thing; together with the seed it determines all random draws.
+        how: options of the teaching.
+        threads: number of threads.
+        features: whether to compute the features of its views even if its geometry is known.
 
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
         its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
-        SYMMETRIES and NEAR_SYMMETRIES. Where some of the frames were not used, a phrase about them
+        SYMMETRIES and NEAR_SYMMETRIES. If some of the frames were not used, a phrase about them
         under LEFT_OUT.
 
     Raises:
-        MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
+        MeshError, DatasetError, ObservationError: the reason why it cannot be taught, in one
+            sentence.
     """
     if path.is_dir() or is_bag(path):
         return _of_capture(_captured(path, how), name, features)
@@ -163,10 +163,11 @@ def teach(
 
 
 def _flatness(mesh: Mesh, upright: bool) -> Iterator[str]:
-    """A sentence where a thing can lie so flat that depth does not show it."""
+    """A sentence for a thing that can lie too flat for a depth camera."""
     if mesh.metres is None:
         return
-    down = np.linalg.eigh(np.cov(mesh.vertices.T))[1][:, 0]  # lies on its flattest side
+    # normal of its flattest side
+    down = np.linalg.eigh(np.cov(mesh.vertices.T))[1][:, 0]
     if upright:
         down = np.array([0.0, 0.0, 1.0])
     height = float(np.ptp(mesh.vertices @ down)) * mesh.radius
@@ -179,7 +180,7 @@ def _flatness(mesh: Mesh, upright: bool) -> Iterator[str]:
 
 
 def _captured(path: Path, how: TeachingOptions) -> Capture:
-    """The frames of a folder or a bag."""
+    """Frames of a folder or a bag."""
     if is_bag(path):
         return read_capture(
             path,
@@ -197,7 +198,7 @@ def _captured(path: Path, how: TeachingOptions) -> Capture:
 
 
 def _surface(mesh: Mesh, to_mesh: Float) -> Arrays:
-    """Return the surface of a mesh in the axes of its file; nothing without a unit."""
+    """Surface of a mesh in the axes of its file; nothing without a unit."""
     if mesh.metres is None:
         return {}
 
@@ -207,11 +208,14 @@ def _surface(mesh: Mesh, to_mesh: Float) -> Arrays:
 
 
 def of_surface(whole: Surface, error: float = 0.0) -> Arrays:
-    """What is remembered of a surface: itself and its symmetries.
+    """Arrays of a surface and its symmetries.
 
     Args:
-        whole: the surface as it was scanned, which its symmetries are those of.
-        error: metres by which it may be off where it is simplified; 0 keeps it.
+        whole: the scanned surface, from which the symmetries are computed.
+        error: tolerated error of the simplified surface, metres; 0 keeps the surface.
+
+    Returns:
+        VERTICES, FACES, SYMMETRIES and NEAR_SYMMETRIES.
     """
     surface = whole.simplified(error) if error else whole
     return {
@@ -223,15 +227,22 @@ def of_surface(whole: Surface, error: float = 0.0) -> Arrays:
 
 
 def rows_of(symmetries: Sequence[Symmetry]) -> Float:
-    """Symmetries as an array, axis and order of each, (S, 4) float64."""
+    """Convert symmetries to an array.
+
+    Args:
+        symmetries: S symmetries.
+
+    Returns:
+        Axis and order of each, (S, 4) float64.
+    """
     rows = [(*one.axis, one.order) for one in symmetries]
     return np.array(rows, np.float64).reshape(-1, 4)
 
 
 def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
-    """Return what captured frames show: the surface, and the features of the views if they count.
+    """Arrays of captured frames: the surface, and features of the views if they count.
 
-    Its surface, and its resting pose, are in the frame of the world in which it was captured.
+    Surface and resting pose are in the world frame of the capture.
     """
     camera = CapturedCamera(capture)
     camera.take_all(MEMORY_GRID.poses[0])
@@ -257,7 +268,7 @@ def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
 
 
 def _said(left_out: Mapping[str, str], total: int) -> Arrays:
-    """Which frames were left out and why, UTF-8 under LEFT_OUT; nothing if all were used."""
+    """A phrase about unused frames, UTF-8 under LEFT_OUT; nothing if all were used."""
     if not left_out:
         return {}
     phrase = f"{len(left_out)} of {total} frames: {summary(left_out)}"
@@ -265,7 +276,7 @@ def _said(left_out: Mapping[str, str], total: int) -> Arrays:
 
 
 def _picture(view: Observation) -> NDArray[np.uint8]:
-    """A view of a thing as a small picture, (64, 64) uint8."""
+    """A thumbnail of a view, (64, 64) uint8."""
     from PIL import Image
 
     return np.asarray(Image.fromarray(view.picture).resize((64, 64)))

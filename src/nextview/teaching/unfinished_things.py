@@ -1,4 +1,4 @@
-"""Things that were taught by a run that was stopped: each in a file, with a stamp of its source."""
+"""Results of an interrupted run: a file for each taught thing, with a stamp of its source."""
 
 import hashlib
 import os
@@ -16,23 +16,26 @@ from nextview.teaching.view_features import Arrays
 
 
 def stamp_of(source: ThingSource, how: TeachingOptions, features: bool) -> str:
-    """Describe what a thing is taught from: it is taught again if any of this has changed.
+    """Stamp of the inputs of a thing, which is taught again if the stamp changes.
 
-    That is its path, the name, size and time of its file or of each file in its folder, the
-    options, and the features. The time of the folder itself does not tell: copying over its files
-    leaves it as it was.
+    The stamp contains the path, the name, size and time of its file or of each file in its folder,
+    the options, and the features. It ignores the time of the folder itself, which does not change
+    when its files are overwritten.
 
     Args:
         source: the thing.
-        how: how it is taught.
-        features: whether its views are remembered even if its geometry is known.
+        how: options of the teaching.
+        features: whether features of its views are computed even if its geometry is known.
+
+    Returns:
+        The stamp.
     """
     content = hashlib.sha256()
     for file in _files_of(source.path):
         try:
             status = file.stat()
             seen = f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0"
-        except OSError as error:  # a broken link: what reads the thing says so
+        except OSError as error:  # a broken link: the reader of the thing reports it
             seen = f"{file}\0{error.errno}\0"
         content.update(seen.encode(errors="surrogateescape"))
 
@@ -49,7 +52,7 @@ def stamp_of(source: ThingSource, how: TeachingOptions, features: bool) -> str:
 
 
 def _files_of(path: Path) -> Iterator[Path]:
-    """A file itself, or all files in a folder, also behind links to folders, in order."""
+    """A file itself, or all files in a folder in order, including those behind links to folders."""
     if not path.is_dir():
         yield path
         return
@@ -57,7 +60,7 @@ def _files_of(path: Path) -> Iterator[Path]:
     for place, folders, names in os.walk(path, followlinks=True):
         real = Path(place).resolve()
         above = {real, *real.parents}
-        # A link to a folder above would be walked for ever.
+        # A link to a parent folder would cause an infinite walk.
         folders[:] = [
             name for name in sorted(folders) if Path(place, name).resolve() not in above
         ]
@@ -65,26 +68,32 @@ def _files_of(path: Path) -> Iterator[Path]:
 
 
 def part_of(part: Path, source: ThingSource) -> Path:
-    """Return the file in which an unfinished run keeps a thing; its name has a limited length.
+    """File of a thing in an unfinished run; the length of its name is bounded.
 
     Args:
-        part: folder of what is not finished.
+        part: folder of unfinished results.
         source: the thing.
+
+    Returns:
+        Path of the file.
     """
     name = source.name.encode(errors="surrogateescape")
     return part / f"{hashlib.sha256(name).hexdigest()[:32]}.safetensors"
 
 
 def finished(file: Path, stamp: str) -> Arrays | None:
-    """Return a thing that an interrupted run has taught; None if it cannot be used.
+    """Load a thing that an interrupted run has taught.
 
     Args:
         file: see ``part_of``.
         stamp: see ``stamp_of``.
+
+    Returns:
+        Its arrays; None if the file is missing, damaged or out of date.
     """
     try:
         arrays = load_file(file)
-    except (OSError, SafetensorError):  # missing, or damaged: it is made again
+    except (OSError, SafetensorError):  # missing or damaged: taught again
         return None
     found = arrays.pop("stamp", None)
     if found is None or found.tobytes() != stamp.encode(errors="surrogateescape"):

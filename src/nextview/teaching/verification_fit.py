@@ -1,4 +1,4 @@
-"""Fits to the surfaces of taught things: weight of geometry, and usual residuals."""
+"""Fits to the surfaces of taught things: weight of the geometry, and usual residuals."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
@@ -26,32 +26,34 @@ from nextview.things.weighing import (
 )
 from nextview.types import Float, Index
 
-VIEWS_VERIFIED = (1, 2, 3)  # after so many views things are judged
-SHOWING_VIEWS_TRIED = 6  # views that are taken at most, until so many show the thing
-MOST_THINGS_VERIFIED = 150  # that are shown: a drawn part of more
-EPISODES_PER_THING = 1  # for each of many things
-ENOUGH_EPISODES = 20  # for each of few things as if all of them had so many together
-GROWTH = 2  # weights are fitted anew when there are so many times as many things
-# things that the default weights count for, beside those that others are fitted to
+VIEWS_VERIFIED = (1, 2, 3)  # numbers of views after which things are tested
+# most rendered views per test, including those that miss the thing
+SHOWING_VIEWS_TRIED = 6
+MOST_THINGS_VERIFIED = 150  # most things in the test; more are sampled
+EPISODES_PER_THING = 1  # episodes per thing, if there are many
+ENOUGH_EPISODES = 20  # episodes of all things together, at least
+GROWTH = 2  # growth of the number of things after which the weights are refitted
+# weight of the defaults, in things of the fit
 DEFAULT_THINGS = 10.0
-# by which weights of five numbers have to raise the log-likelihood (Akaike, 1974)
+# increase of the log-likelihood that five fitted weights must reach (Akaike, 1974)
 WEIGHTS_COST = 5.0
-MOST_RESIDUALS = 400  # for a number of views; of more their quantiles are kept
-# of fewer, what further ones are likely to be is kept: a p-value of 0.01 needs so many
+# most residuals for a number of views; more are replaced by their quantiles
+MOST_RESIDUALS = 400
+# fewer are extrapolated to so many: a p-value of 0.01 needs them
 FEW_RESIDUALS = 100
 DECIMALS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What was found of a thing that was shown for a while.
+    """Result of a test with one thing and some views.
 
     Attributes:
-        thing: its number among those of known geometry.
-        views: after how many views.
+        thing: number of the thing among those of known geometry.
+        views: number of views.
         named: number of the thing that explains the views best.
-        residual: how badly it does.
-        judged: its belief is in classes.
+        residual: residual of that thing.
+        judged: evidence; its belief is in classes.
     """
 
     thing: int
@@ -63,17 +65,17 @@ class Shown:
 
 @dataclass(frozen=True)
 class VerifiedFit:
-    """What was fitted to things that were shown.
+    """Fits to the results of tests.
 
     Attributes:
         verification: for the card, of the things of known geometry alone.
-        accuracy: share of the cases that are named right after 1, 2 and 3 views, with weights that
-            were fitted to other things; () if nothing was shown.
+        accuracy: share of correct answers after 1, 2 and 3 views, with weights that were fitted to
+            other things; () without tests.
         by_outline: the same by outline and size alone.
-        confused: pairs of a class and the one that it was named, with the share of its cases, after
-            two views.
-        things: how many were shown.
-        unseen: names of those of which no view showed enough to be recognised.
+        confused: pairs of a true and an answered class, with the share of the cases, after two
+            views.
+        things: number of tested things.
+        unseen: names of the things that no view showed well enough.
     """
 
     verification: Verification
@@ -89,12 +91,15 @@ def to_be_shown(
     known: int,
     rng: Generator,
 ) -> list[tuple[int, int]]:
-    """Which things are shown how often: (thing, draw) each.
+    """Choose the tests.
 
     Args:
-        things: numbers of those that may be shown.
-        known: how many there are in all.
-        rng: draws a part of very many.
+        things: numbers of the things to be tested.
+        known: number of all things.
+        rng: samples from very many things.
+
+    Returns:
+        (thing, draw) of each test.
     """
     some = np.sort(rng.permutation(things)[:MOST_THINGS_VERIFIED])
     episodes = max(EPISODES_PER_THING, ENOUGH_EPISODES // known)
@@ -102,20 +107,20 @@ def to_be_shown(
 
 
 def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Shown]:
-    """Show a thing through a sensor, as it falls, and recognise it by its geometry.
+    """Test the recognition of one thing in simulated views of a sensor, in a random stable pose.
 
-    A thing that has others of its class is recognised by these alone: whoever teaches a class will
-    meet other things of it.
+    A thing in a class of several is recognised by the others of its class, because a taught class
+    will meet new members.
 
     Args:
-        card: of a memory; its weights are not used.
+        card: card of a memory; its weights are not used.
         sensor: see ``sensor_named``.
-        seed: of all draws.
-        item: number of the thing among those of known geometry, and of the draw.
+        seed: seed of all draws.
+        item: number of the thing among those of known geometry, and number of the draw.
 
     Returns:
-        What was found after one and more views; empty where nothing is seen, or no other thing of
-        the class is known.
+        Results after one or more views; empty if the thing is not visible, or no other thing of the
+        class is known.
     """
     thing, draw = item
     known, labels = _opened(card)
@@ -136,9 +141,7 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     for count in VIEWS_VERIFIED[: len(observations)]:
         try:
             verified = known(observations[:count])
-        except (
-            ObservationError
-        ):  # what was seen is too little to be compared with surfaces
+        except ObservationError:  # too little is visible for a comparison with surfaces
             continue
         judged = _of_classes(verified.judged(0), int(labels[thing]), labels[others])
         named = int(others[verified.things[0]])
@@ -157,11 +160,11 @@ def _opened(card: Path) -> tuple[TaughtThings, Index]:
 
 
 def class_of_things(recogniser: TaughtRecogniser, known: TaughtThings) -> Index:
-    """Return the class of each thing with known geometry.
+    """Class of each thing of known geometry.
 
     Args:
         recogniser: the memory.
-        known: its things with known geometry.
+        known: its things of known geometry.
 
     Returns:
         Classes, (T,) int64.
@@ -180,10 +183,10 @@ def _views(
     sensor: str,
     rng: Generator,
 ) -> list[Observation]:
-    """Some random views of a thing that show it.
+    """Random views of a thing that show it.
 
-    It lies as it falls, in any stable pose by its share of the throws; what is known only as it
-    stands, stands.
+    Its stable pose is drawn by its probability after a throw; a thing that is known in its upright
+    pose only stands.
     """
     surface = known.verifier.caster.surfaces[thing]
     mesh = make_mesh(
@@ -198,6 +201,7 @@ def _views(
         stable = stable_poses(mesh)
         lies = stable.rotations
         shares = stable.shares
+
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lies[rng.choice(len(lies), p=shares)]
     camera = SensedCamera(rotated(mesh, turn), sensor, rng.spawn(1)[0])
 
@@ -218,7 +222,7 @@ def _views(
 
 
 def _of_classes(judged: JudgedEpisode, truth: int, labels: Index) -> JudgedEpisode:
-    """The same in classes, by the class of each thing; ``truth`` is the class that is right."""
+    """Convert evidence to classes, by the class of each thing; ``truth`` is the true class."""
     by_outline = np.zeros(max(int(labels.max()), truth) + 1)
     np.add.at(by_outline, labels, judged.by_outline)
     return JudgedEpisode(
@@ -232,14 +236,14 @@ def _of_classes(judged: JudgedEpisode, truth: int, labels: Index) -> JudgedEpiso
 
 
 def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
-    """Fit weights and residuals to things that were shown.
+    """Fit weights and residuals to the results of tests.
 
     Args:
-        shown: all of them.
+        shown: the results.
         labels: class of each thing of known geometry, (T,).
 
     Returns:
-        What was fitted. With few things the weights are near their defaults.
+        The fits. With few things the weights are near their defaults.
     """
     things = np.array([one.thing for one in shown], np.int64)
     weights = _weights(shown)
@@ -264,9 +268,9 @@ def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
 
 
 def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
-    """Fit the weights to the shown things, shrunk towards the defaults."""
+    """Fit the weights, shrunk towards the defaults."""
     count = len({one.judged.truth for one in shown})
-    if count < 2:  # whatever the weights are, a thing alone is named right
+    if count < 2:  # a single thing is correct with any weights
         return EvidenceWeights()
 
     episodes = [one.judged for one in shown]
@@ -291,13 +295,13 @@ def _log_likelihood(
     weights: EvidenceWeights,
     episodes: Sequence[JudgedEpisode],
 ) -> float:
-    """Sum of the logarithms of the belief in the truth."""
+    """Sum of the log-belief in the truth."""
     believed = [episode.belief(weights)[episode.truth] for episode in episodes]
     return float(np.log(np.maximum(believed, LEAST_TRUE_BELIEF)).sum())
 
 
 def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
-    """How badly known things are explained; None if none was named right."""
+    """Residuals of known things; None without a correct answer."""
     named, values, views = _right(shown, labels)
     if not len(named):
         return None
@@ -309,7 +313,7 @@ def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
 
 
 def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
-    """Return thing, residual and number of views of the cases that were named correctly."""
+    """Thing, residual and number of views of the correct answers."""
     right = [one for one in shown if labels[one.named] == one.judged.truth]
     things = np.array([one.named for one in right], np.int64)
     residuals = np.array([one.residual for one in right], np.float64)
@@ -317,17 +321,17 @@ def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
 
 
 def likely_excess(found: Float) -> Float:
-    """By how much known things are likely to exceed their usual residuals, from what some did.
+    """Predictive quantiles of the excess residuals of known things.
 
-    Few of them do not tell how rare larger ones are. Of fewer than FEW_RESIDUALS the quantiles are
-    kept that a further one of a normal distribution would have (Student's t, as of a prediction
-    interval), or those that were found where these are larger.
+    A small sample does not show how rare larger values are. For fewer than FEW_RESIDUALS values,
+    the result contains the quantiles of the predictive distribution of a further normal value
+    (Student's t, as for a prediction interval), or the empirical quantiles where these are larger.
 
     Args:
         found: see ``KnownResiduals.excess``, ascending, (N,).
 
     Returns:
-        The same, or FEW_RESIDUALS quantiles, ascending.
+        The same values, or FEW_RESIDUALS quantiles, ascending.
     """
     count = len(found)
     if not 1 < count < FEW_RESIDUALS:
@@ -347,13 +351,16 @@ def with_new_things(
     labels: Index,
     carried: Index,
 ) -> VerifiedFit:
-    """Add what was found of new things to what was fitted before.
+    """Add the results of new things to earlier fits.
 
     Args:
-        before: what was fitted to all things that there were.
-        shown: the new ones; the weights stay as they are.
+        before: fits to all earlier things.
+        shown: results of the new things; the weights do not change.
         labels: class of each thing of known geometry, (T,).
-        carried: number that each of these things had before, -1 for a new one, (T,).
+        carried: previous number of each thing, -1 for a new one, (T,).
+
+    Returns:
+        The extended fits.
     """
     weights = EvidenceWeights(**before.weights)
     answers = [int(one.judged.belief(weights).argmax()) for one in shown]
@@ -381,12 +388,12 @@ def as_stored(
     """Round weights and residuals for a card.
 
     Args:
-        weights: how much each kind of evidence counts.
-        residuals: of known things; None if there are none.
-        things: number of things that they were fitted to.
+        weights: weights of the evidence.
+        residuals: residuals of known things; None without any.
+        things: number of things in the fit of the weights.
 
     Returns:
-        What the card holds of them.
+        Their entry on the card.
     """
     named = {
         field.name: float(f"{getattr(weights, field.name):.4g}")
@@ -410,7 +417,7 @@ def as_stored(
 
 
 def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ...]:
-    """Share of the cases that are right after each number of views."""
+    """Share of correct answers after each number of views."""
     if not shown:
         return ()
     right = np.array([one.judged.truth for one in shown]) == answers
@@ -426,7 +433,7 @@ def _confused(
     shown: Sequence[Shown],
     answers: Sequence[int],
 ) -> tuple[tuple[int, int, float], ...]:
-    """Return pairs of classes by how often one is named as the other, worst first."""
+    """Pairs of classes by the frequency of their confusion, worst first."""
     truths = [one.judged.truth for one in shown if one.views == 2]
     named = [
         answer for one, answer in zip(shown, answers, strict=True) if one.views == 2

@@ -1,4 +1,4 @@
-"""Features of the views of things that geometry alone does not tell apart."""
+"""Features of the views of things that geometry alone does not separate."""
 
 import zlib
 from collections.abc import Iterator, Sequence
@@ -25,24 +25,31 @@ from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.types import Float, Float32
 
-Arrays = dict[str, NDArray]  # of a thing, by their names
-HELD_OUT = 8  # views of each thing that are not remembered
-SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
+Arrays = dict[str, NDArray]  # arrays of a thing by their names
+HELD_OUT = 8  # held-out views of each thing
+SETUP = 8  # views that share the errors of one setup, such as a wrong centre or size
 VIEWS_PER_BATCH = 20
 MEMORY_GRID = ViewSphere(RINGS, AZIMUTHS)
-# a captured view teaches what the thing looks like from no farther than this
+# largest angle between a cell of the grid and the captured view that fills it
 NEAR_CAPTURED = np.radians(30)
-# poses of views through the sensor
+# poses of the simulated views of the sensor
 SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(
     -1,
     4,
     4,
 )
-EmbeddingParts = Iterator[Float32]  # of embeddings, (.., F) each, in order
+EmbeddingParts = Iterator[Float32]  # batches of embeddings, (.., F) each, in order
 
 
 def without_features(poses: int) -> Arrays:
-    """The arrays of a thing in so many resting poses of which no views are remembered."""
+    """Placeholder arrays of a thing without stored views.
+
+    Args:
+        poses: number of resting poses.
+
+    Returns:
+        Empty arrays views, held_out and held_out_views of ``things.memory.Memory``.
+    """
     return {
         "views": np.zeros((poses, len(RINGS), AZIMUTHS, 0), np.float16),
         "held_out": np.zeros((0, 0), np.float16),
@@ -60,11 +67,11 @@ def features_of(
     """Render a thing in its resting poses, and compute the features of its views.
 
     Args:
-        lying: the mesh in each of them.
-        name: of the thing; with the seed it decides all random draws.
-        sensor: camera that looks at it, see ``sensor_named``.
-        seed: of all random draws.
-        threads: that work side by side.
+        lying: the mesh in each resting pose.
+        name: name of the thing; together with the seed it determines all random draws.
+        sensor: camera of the views, see ``sensor_named``.
+        seed: seed of all random draws.
+        threads: number of threads.
 
     Returns:
         The arrays views, held_out and held_out_views of ``things.memory.Memory``.
@@ -75,8 +82,8 @@ def features_of(
         rng.uniform(0, 2 * np.pi, HELD_OUT),
     )
     with ThreadPoolExecutor(threads) as pool:
-        # Of any of its resting poses: things lie in practice, and calibration and the rate of
-        # strangers follow these.
+        # A random resting pose: things do lie in practice, and calibration and the false-alarm rate
+        # for strangers depend on it.
         shown_pose = lying[int(rng.integers(len(lying)))]
         held_out = _sensed(
             pool,
@@ -97,14 +104,10 @@ def features_of(
 
 
 def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:
-    """Return embeddings of the grid of views, (rings, azimuths, F).
-
-    They are the mean of clean and sensed views.
-    """
+    """Mean embeddings of clean and sensed views on the grid, (rings, azimuths, F)."""
     ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
     through = np.zeros_like(ideal)
-    # Between the rings and azimuths that are looked at through the sensor the embeddings are
-    # interpolated.
+    # Interpolate between the rings and azimuths of the sensed views.
     through[::2, ::2] = np.concatenate(list(sensed)).reshape(
         len(RINGS[::2]),
         AZIMUTHS // 2,
@@ -116,7 +119,7 @@ def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:
 
 
 def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> EmbeddingParts:
-    """Embeddings of the views of the grid without errors."""
+    """Embeddings of the noise-free views of the grid."""
     camera = SimulatedCamera(mesh)
     return pool.map(
         partial(_seen, camera),
@@ -131,7 +134,7 @@ def _sensed(
     sensor: str,
     rng: Generator,
 ) -> EmbeddingParts:
-    """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
+    """Embeddings of views of a mesh through a sensor, from poses, (B, 4, 4)."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
     cameras = (
         partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts))
@@ -144,10 +147,10 @@ def _seen(camera: Camera, poses: Float) -> Float32:
 
 
 def features_captured(seen: list[Observation]) -> Arrays:
-    """Compute the features of captured views, for each cell of the grid those of the nearest one.
+    """Compute the features of captured views; each cell of the grid gets those of the nearest view.
 
     Args:
-        seen: the views; something is seen in each. Every fourth is held out.
+        seen: views that show the thing. Every fourth is held out.
 
     Returns:
         The arrays views, held_out and held_out_views of ``things.memory.Memory``.
@@ -158,7 +161,7 @@ def features_captured(seen: list[Observation]) -> Arrays:
     arc = angle_between(MEMORY_GRID.directions[:, None], directions[kept][None])
     views = np.where(arc.min(1)[:, None] < NEAR_CAPTURED, each[kept][arc.argmin(1)], 0)
 
-    # the views that are held out
+    # held-out views
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
     held_out = np.resize(rest, HELD_OUT)
     angles = np.stack(
@@ -178,9 +181,13 @@ def _features() -> Features:
 
 
 def embeddings(observations: list[Observation]) -> Float32:
-    """Return embeddings of views from one camera, unit vectors, (B, F) float32.
+    """Embeddings of views of one camera; zero for a view that does not show the object.
 
-    They are zero where nothing is seen.
+    Args:
+        observations: B views.
+
+    Returns:
+        Unit vectors, (B, F) float32.
     """
     network = _features()
     inputs = from_observations(network.card.input, observations)

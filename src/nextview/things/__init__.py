@@ -1,1 +1,1 @@
-"""Taught things as surfaces, aligned with the depth that a camera saw and judged by its pixels."""
+"""Taught things as surfaces: registration with depth images and verification of every pixel."""

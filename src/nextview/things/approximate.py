@@ -1,4 +1,4 @@
-"""The nearest of very many remembered views, found by faiss, which the extra "large" brings."""
+"""Approximate nearest-neighbour search among many stored views, with faiss (extra "large")."""
 
 from importlib.util import find_spec
 from typing import Any
@@ -8,41 +8,51 @@ import numpy as np
 from nextview.checks import extras
 from nextview.types import Float32, Floats, Index
 
-# views of a ring from which looking at all of them takes more than 10 ms
+# size of a ring from which an exhaustive search takes more than 10 ms
 LARGE_RING = 20_000
-INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
-PROBED = 16  # cells that are searched
-VIEWS_SAMPLED = 10_240  # views from which an index learns its cells
-VIEWS_COMPARED = 1000  # views of a ring that are compared exactly
+INDEX = "PCA64,IVF256,SQ8"  # one byte for each of 64 components, 256 cells
+PROBED = 16  # cells searched per query
+VIEWS_SAMPLED = 10_240  # views on which the cells are trained
+VIEWS_COMPARED = 1000  # candidates of a ring that are compared exactly
 
 
 def is_large(views: Float32) -> bool:
-    """Whether remembered views, (rings, N, F), are searched approximately.
+    """Whether stored views are numerous enough to be searched approximately.
 
-    They are if there are many, and faiss is installed.
+    Args:
+        views: stored views, (rings, N, F) float32.
+
+    Returns:
+        True if a ring has at least LARGE_RING views and faiss is installed.
     """
     return views.shape[1] >= LARGE_RING and find_spec("faiss") is not None
 
 
 class NearestViews:
-    """An index for each ring of remembered views, (rings, N, F) float32, unit vectors."""
+    """One faiss index for each ring of stored views."""
 
     def __init__(self, views: Float32) -> None:
+        """Build the indices.
+
+        Args:
+            views: stored views, unit vectors, (rings, N, F) float32.
+        """
         sample = np.random.default_rng(0).permutation(views.shape[1])[:VIEWS_SAMPLED]
         self._views = views
         self._indices = [_index(ring, sample) for ring in views]
 
     def similarities(self, embeddings: Floats, shares: Float32) -> Float32:
-        """Cosines of views with what is remembered, summed over rings.
+        """Cosine similarities of views with the stored views, summed over rings.
 
-        The nearest of each ring are compared exactly. All others count as the least alike of these.
+        The nearest stored views of each ring are compared exactly. All others get the lowest of
+        these similarities.
 
         Args:
-            embeddings: of the views, (B, F).
-            shares: how much each ring counts for each view, (B, rings).
+            embeddings: embeddings of the views, (B, F).
+            shares: weight of each ring for each view, (B, rings).
 
         Returns:
-            (B, N) float32.
+            Similarities, (B, N) float32.
         """
         found = np.empty((len(embeddings), self._views.shape[1]), np.float32)
         pairs = zip(np.asarray(embeddings, np.float32), shares, strict=True)
@@ -65,6 +75,7 @@ class NearestViews:
 
 
 def _index(views: Float32, sample: Index) -> Any:
+    """Train a faiss index on a sample of the views and add all views."""
     with extras():
         import faiss
 

@@ -1,4 +1,4 @@
-"""Depth images as they are compared with surfaces: few pixels, metres, and what each shows."""
+"""Depth images in metres, sampled on a coarse grid for the comparison with surfaces."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,47 +16,47 @@ from nextview.things.ground import Ground, find_ground
 from nextview.types import Float, Float32, Index, Mask
 
 NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
-"""What a pixel shows: nothing was measured; something else, or nothing at all, was; the thing."""
+"""Label of a pixel: no measurement; another object or free background; the thing."""
 
-WINDOW_MARGIN = 0.35  # of the size of the thing's outline that is looked at around it
-# share of the pixels that show the thing, below which more of them are chosen
+WINDOW_MARGIN = 0.35  # margin around the outline of the thing, relative to its size
+# share of thing pixels in the window, below which the grid gets denser
 USUAL_FILL = 0.2
-MOST_DENSE = 2.0  # times as many rows and columns at most
-SMALLEST_MARGIN = 4  # pixels of the image around the outline, at least
-NOISE_ROWS = 40  # rows of an image in which its noise is measured
-NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
-GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
-GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
-# metres by which something stands before a surface that it hides, at least
+MOST_DENSE = 2.0  # largest increase of rows and columns
+SMALLEST_MARGIN = 4  # smallest margin around the outline, pixels of the image
+NOISE_ROWS = 40  # image rows in which the noise is estimated
+NOISIEST = 0.005  # relative depth noise, at most, if no ground is visible
+# margin of the search for the ground, relative to the size of the outline
+GROUND_MARGIN = 1.0
+GROUND_SIDE = 48  # rows and columns of pixels in the search for the ground
+# smallest distance between an occluder and the surface behind it, metres
 HIDING = 0.005
-HIDING_NOISE = 4.0  # deviations of the noise by which it does
-KEPT_IMAGES = 12  # of the last objects: poses are asked for after the names
+HIDING_NOISE = 4.0  # the same distance, standard deviations of the depth
+KEPT_IMAGES = 12  # cached images: poses are computed after the names
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """Some pixels of one view, in the object frame, in metres.
+    """Sampled pixels of one view in the object frame, in metres.
 
-    The pixels lie on a grid over the outline of the thing and a margin around it.
+    The pixels form a grid over the outline of the thing and a margin around it.
 
     Attributes:
-        origin: where the camera stands, (3,) float64.
-        camera_axes: the camera's x, y and z in the object frame, columns, (3, 3) float64.
-        rays: rays through the pixels, as long as one metre of depth, (P, 3) float32.
-        depth: along the optical axis, (P,) float32: of the thing and of all else; infinity where
-            nothing is there, 0 where nothing was measured.
+        origin: position of the camera, (3,) float64.
+        camera_axes: x, y and z axes of the camera in the object frame, as columns, (3, 3) float64.
+        rays: rays through the pixels, scaled to one metre along the optical axis, (P, 3) float32.
+        depth: depth along the optical axis, (P,) float32, of the thing and its surroundings;
+            infinity where the background is free, 0 without a measurement.
         kind: NOT_MEASURED, ELSEWHERE or THING, (P,) uint8.
-        noise: standard deviation of the depth that was measured, (P,) float32.
-        edge: distance to the outline of the thing, (P,) float32, pixels of the image; negative
-            within it.
+        noise: standard deviation of the depth, (P,) float32.
+        edge: signed distance to the outline of the thing, (P,) float32, pixels of the image;
+            negative inside.
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
-            unit vectors; zero within it.
-        ground: plane that the thing stands on, if it is seen.
-        level: pixels on the ground within its noise, (P,) bool: whether they show the thing is
-            unknown, whatever they were segmented as.
+            unit vectors; zero inside the outline.
+        ground: plane that supports the thing, if it is visible.
+        level: pixels on the ground within its noise, (P,) bool. They may show the thing or the
+            ground, whatever their segmentation.
         shape: rows and columns of the grid; P is their product.
-        step: distance between the grid's rows, and between its columns, (2,) float64, pixels of the
-            image.
+        step: spacing of the rows and of the columns, (2,) float64, pixels of the image.
         pitch: angle between neighbouring pixels of the image, radians.
         whole: number of pixels of the image that show the thing.
     """
@@ -78,7 +78,7 @@ class DepthView:
 
     @property
     def thing_points(self) -> Float32:
-        """Where the pixels of the thing end, (N, 3) float32, object frame, metres."""
+        """Measured points of the thing, (N, 3) float32, object frame, metres."""
         thing = self.kind == THING
         return (
             self.origin.astype(np.float32) + self.rays[thing] * self.depth[thing, None]
@@ -90,18 +90,18 @@ def depth_view(
     side: int,
     radius: float | None = None,
 ) -> DepthView | None:
-    """Choose the pixels of an observation that are compared with surfaces.
+    """Sample the pixels of an observation for the comparison with surfaces.
 
     Args:
         observation: a view of the thing.
-        side: about so many rows, and so many columns, are chosen; more if the thing is thin.
-        radius: object radius, metres, for an observation that knows none.
+        side: approximate number of rows and of columns; larger if the thing is thin.
+        radius: object radius, metres, for an observation without a scale.
 
     Returns:
-        The pixels; None if the observation does not show the thing.
+        The sampled pixels; None if the observation does not show the thing.
 
     Raises:
-        ObservationError: neither the observation nor the caller knows the scale.
+        ObservationError: neither the observation nor the caller gives the scale.
     """
     image = MetricImage.of(observation, radius)
     return None if image is None else image.view(side)
@@ -109,17 +109,17 @@ def depth_view(
 
 @dataclass(frozen=True, eq=False)
 class MetricImage:
-    """All pixels of one view, in metres, from which few or many are chosen.
+    """All pixels of one view in metres, from which a grid of any density can be sampled.
 
     Attributes:
-        depth: along the optical axis, (H, W) float32; infinity where nothing is there, 0 where
-            nothing was measured.
+        depth: depth along the optical axis, (H, W) float32; infinity where the background is free,
+            0 without a measurement.
         kind: NOT_MEASURED, ELSEWHERE or THING, (H, W) uint8.
         pose: camera-to-object, (4, 4), metres.
         intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
-        noise: of single pixels.
-        ground: plane that the thing stands on, if it is seen.
-        hiding: pixels around the thing that show something before it, (H, W) bool.
+        noise: noise of single pixels.
+        ground: plane that supports the thing, if it is visible.
+        hiding: pixels around the thing that show an occluder, (H, W) bool.
     """
 
     depth: Float32
@@ -136,31 +136,36 @@ class MetricImage:
         observation: Observation,
         radius: float | None = None,
     ) -> "MetricImage | None":
-        """Take over what a camera saw; None if it did not see the thing.
+        """Convert an observation to metres; None if it does not show the thing.
 
-        An observation that knows all that its camera saw is taken as it was measured. Without that,
-        pixels beside the thing show that nothing is there if the depth is exact, and nothing
-        otherwise.
+        An observation with its scene keeps all measured pixels. Without a scene, pixels beside the
+        thing count as free background if the depth is exact, and as not measured otherwise.
 
         Args:
             observation: a view of the thing.
-            radius: object radius, metres, for an observation that knows none.
+            radius: object radius, metres, for an observation without a scale.
+
+        Returns:
+            The image; None if the observation does not show the thing.
 
         Raises:
-            ObservationError: neither the observation nor the caller knows the scale.
+            ObservationError: neither the observation nor the caller gives the scale.
         """
         metres = observation.radius if observation.radius is not None else radius
         if metres is None:
             raise ObservationError(
-                "the object radius in metres is not known, and surfaces are compared in metres"
+                "the object radius in metres is not known, and the comparison with scans needs it"
             )
         return _metric_image(observation, float(metres))
 
     def turned(self, rotation: Float) -> "MetricImage":
-        """The same in an object frame that is turned about its origin.
+        """The same image in an object frame that is rotated about its origin.
 
         Args:
-            rotation: from the axes so far to the new ones, (3, 3).
+            rotation: from the old axes to the new axes, (3, 3).
+
+        Returns:
+            The image with a rotated pose and ground.
         """
         pose = self.pose.copy()
         pose[:3] = rotation @ pose[:3]
@@ -170,7 +175,7 @@ class MetricImage:
         return replace(self, pose=pose, ground=ground)
 
     def find_ground(self) -> Ground | None:
-        """The plane that the thing stands on."""
+        """Find the plane that supports the thing; None if none is visible."""
         rows, columns = _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
         chosen = np.ix_(rows, columns)
         depth = self.depth[chosen].ravel()
@@ -184,9 +189,12 @@ class MetricImage:
         return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
 
     def find_hiding(self) -> Mask:
-        """Return the pixels around the thing that show an occluder in front of it, (H, W) bool.
+        """Find the pixels around the thing that show an occluder in front of it.
 
         The ground is no occluder.
+
+        Returns:
+            Mask of the occluders, (H, W) bool.
         """
         rows, columns = (
             slice(lines[0], lines[-1] + 1)
@@ -221,7 +229,7 @@ class MetricImage:
         return every
 
     def _rays(self, rows: Index, columns: Index) -> Float:
-        """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
+        """Rays through the pixels of some rows and columns, (rows * columns, 3), object frame."""
         x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(rows, columns)
         ahead = np.ones((len(rows), len(columns)))
         return (
@@ -230,10 +238,13 @@ class MetricImage:
         )
 
     def view(self, side: int) -> DepthView:
-        """Choose pixels on a grid over the outline of the thing and a margin around it.
+        """Sample pixels on a grid over the outline of the thing and a margin around it.
 
         Args:
             side: approximate number of rows and of columns; larger if the thing is thin.
+
+        Returns:
+            The sampled pixels.
         """
         mask = self.kind == THING
         rows, columns = _window(mask, side, WINDOW_MARGIN)
@@ -247,13 +258,14 @@ class MetricImage:
         rays = self._rays(rows, columns).astype(np.float32)
         depth = self.depth[in_image].ravel()
         kind = self.kind[in_image].ravel()
+
         finite = np.where(np.isfinite(depth), depth, 0)
         level = np.zeros(len(depth), bool)
         if self.ground is None:
-            # Of what has many edges the noise is overrated.
+            # Edges inflate the noise estimate of single pixels.
             noise = np.minimum(self.noise.at(finite) * finite**2, NOISIEST * finite)
         else:
-            # It tells more than single pixels, which are too few beside edges.
+            # The ground gives a better estimate than single pixels, which are few beside edges.
             noise = self.ground.noise * finite**2
             heights = self.ground.heights(
                 origin + rays * finite[:, None].astype(np.float64)
@@ -282,7 +294,7 @@ class MetricImage:
 
 @lru_cache(maxsize=KEPT_IMAGES)
 def _metric_image(observation: Observation, metres: float) -> MetricImage | None:
-    """What a camera saw of a thing of this radius, metres; None if it did not see it."""
+    """Convert an observation of a thing of this radius, metres; None if it is not visible."""
     depth, kind, pose, intrinsics = _what_is_seen(observation)
     if not (kind == THING).any():
         return None
@@ -301,7 +313,7 @@ def _metric_image(observation: Observation, metres: float) -> MetricImage | None
 def _what_is_seen(
     observation: Observation,
 ) -> tuple[Float32, NDArray[np.uint8], Float, Float]:
-    """Depth, object radii, what each pixel shows, pose and intrinsics."""
+    """Depth in object radii, labels of the pixels, pose and intrinsics."""
     scene = observation.scene
     if scene is None:
         mask = observation.depth > 0
@@ -325,7 +337,7 @@ def _what_is_seen(
 
 
 def _window(mask: Mask, side: int, relative_margin: float) -> tuple[Index, Index]:
-    """Ascending rows and columns that lie evenly over an outline and a margin around it."""
+    """Rows and columns, ascending, spread evenly over an outline and a margin around it."""
     ends = []
     for axis in (1, 0):
         filled = np.flatnonzero(mask.any(axis))
@@ -335,7 +347,7 @@ def _window(mask: Mask, side: int, relative_margin: float) -> tuple[Index, Index
         last = min(mask.shape[1 - axis] - 1, filled[-1] + margin)
         ends.append((first, last))
 
-    # What is thin, and lies across the image, fills little of it.
+    # A thin oblique thing fills little of the window.
     area = np.prod([last + 1 - first for first, last in ends])
     fill = np.count_nonzero(mask) / area
     denser = np.clip(np.sqrt(USUAL_FILL / fill), 1, MOST_DENSE)
@@ -348,12 +360,12 @@ def _window(mask: Mask, side: int, relative_margin: float) -> tuple[Index, Index
 
 
 def _step(lines: Index) -> float:
-    """Mean distance between chosen rows or columns, pixels."""
+    """Mean spacing of the sampled rows or columns, pixels."""
     return float(lines[-1] - lines[0]) / max(1, len(lines) - 1)
 
 
 def _outline(mask: Mask) -> tuple[Float32, Float32]:
-    """Distance of each pixel to the outline, negative within, and the direction to it."""
+    """Signed distance of each pixel to the outline, negative inside, and the direction to it."""
     if mask.all():
         return np.full(mask.shape, -np.inf, np.float32), np.zeros(
             (*mask.shape, 2),

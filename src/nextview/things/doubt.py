@@ -1,4 +1,4 @@
-"""Why a thing that is believed is not to be acted on yet: "this thing in this pose" is in doubt."""
+"""Reasons not to act yet on the likeliest hypothesis, a thing in a pose, despite its belief."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,10 +8,10 @@ from nextview.recognition.model_card import Symmetry
 from nextview.recognition.poses import UNKNOWN_TURN, PoseCandidate, uncertainty_of
 from nextview.things.verifier import Verified
 
-# share of what should be visible of the scan, past which cameras see what is behind
+# share of the visible pixels of a scan that may show something behind it
 MOST_SEEN_BEHIND = 0.1
-FEWEST_PIXELS = 350  # that show a thing whose shape can be told
-# of the deviation that an orientation has of which nothing is known, from which on it is not known
+FEWEST_PIXELS = 350  # fewest pixels from which a shape can be recognised
+# share of the deviation of a uniformly random orientation, from which it counts as unknown
 UNKNOWN_PART = 0.75
 
 
@@ -21,14 +21,14 @@ def doubt_of(
     pixels: int,
     stranger: Callable[[], float],
 ) -> str:
-    """Say why the likeliest hypothesis is in doubt, however strongly it is believed.
+    """Explain why the likeliest hypothesis is in doubt, even if the belief in it is high.
 
     Args:
-        found: what was found of some views.
-        poses: that the object may have, the likeliest first.
-        pixels: of a frame that show it, in the frame that shows most of it.
-        stranger: gives the log-odds of a stranger of its shape against the thing, nats; asked only
-            where nothing else is in doubt.
+        found: verification of the views.
+        poses: candidate poses of the object, the likeliest first.
+        pixels: number of pixels of the object in the frame that shows most of it.
+        stranger: returns the log-odds of a stranger of the same shape against the thing, nats;
+            called only if there is no other doubt.
 
     Returns:
         The reason in words; "" if there is none.
@@ -53,13 +53,16 @@ def doubt_of(
 
 
 def unknown_turn(symmetries: Sequence[Symmetry]) -> float:
-    """Standard deviation from which on the orientation of a thing is not known, degrees.
+    """Standard deviation from which the orientation of a thing counts as unknown.
 
-    A thing of four equal sides is never off by more than 45 degrees, and by 26 in the mean square
-    where nothing is known of it.
+    A symmetry of order 4 limits the error to 45 degrees; a uniformly random orientation then has a
+    root mean square error of 26 degrees.
 
     Args:
-        symmetries: of the thing.
+        symmetries: symmetries of the thing.
+
+    Returns:
+        Standard deviation, degrees.
     """
     order = max((one.order for one in symmetries), default=1)
     of_nothing = 180 / max(order, 1) / np.sqrt(3)

@@ -1,7 +1,8 @@
-"""The leading hypotheses as candidate cameras would see them, with what stands in the way.
+"""Renderings of the leading hypotheses from candidate cameras, with occlusion.
 
-Each hypothesis, a thing in a pose, is rendered from each candidate camera with few pixels. What the
-views so far measured beside the thing hides parts of it, and the support shows behind it.
+Each hypothesis, a thing in a pose, is rendered from each candidate camera at low resolution.
+Obstacles that earlier views measured occlude parts of it, and the support surface is visible behind
+it.
 """
 
 from collections.abc import Sequence
@@ -18,20 +19,22 @@ from nextview.things.surface import SurfaceCaster
 from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.types import Float, Float32, Mask
 
-LOWEST_COSINE = 0.15  # of incidence, in the judgement of a pixel
-# metres from the height of the support, within which a point lies on it
+LOWEST_COSINE = 0.15  # smallest cosine of incidence in the likelihood of a pixel
+# distance from the support surface within which a point belongs to it, metres
 SUPPORT_NEAR = 0.01
-OWN_MARGIN = 0.005  # metres around the thing, within which a point may be its own
-OBSTACLE_REACH = 4.0  # radii of the thing, within which an obstacle may hide it
-OBSTACLE_ROWS = 120  # rows of a depth image that are looked through for obstacles
-# radii of the thing, within which something that no view shows may hide it
+# margin around the thing within which a point may belong to it, metres
+OWN_MARGIN = 0.005
+# distance within which an obstacle may occlude the thing, radii of the thing
+OBSTACLE_REACH = 4.0
+OBSTACLE_ROWS = 120  # rows of a depth image in the search for obstacles
+# distance within which unobserved space may occlude the thing, radii of the thing
 UNSEEN_REACH = 4.0
-UNSEEN_EVERY = 2  # every so many rows and columns of pixels, unseen space is looked up
+UNSEEN_EVERY = 2  # unobserved space is looked up at every second row and column
 
 
 @dataclass(frozen=True)
 class ExpectedSensor:
-    """The camera of the views to come.
+    """The camera of future views.
 
     Attributes:
         pitch: angle between neighbouring pixels, radians.
@@ -43,17 +46,20 @@ class ExpectedSensor:
 
     @classmethod
     def of(cls, views: Sequence[DepthView]) -> "ExpectedSensor":
-        """The camera that took some views of the thing.
+        """Estimate the camera from views of the thing.
 
         Args:
-            views: at least one.
+            views: views of the thing, at least one.
+
+        Returns:
+            Mean pixel pitch and mean noise of the views.
 
         Raises:
-            ObservationError: there is none.
+            ObservationError: there is no view.
         """
         if not views:
             raise ObservationError(
-                "without a view that shows the thing the sensor is not known"
+                "the sensor cannot be estimated without a view that shows the thing"
             )
         noise = []
         for view in views:
@@ -65,14 +71,15 @@ class ExpectedSensor:
 
 @dataclass(frozen=True, eq=False)
 class SeenSurroundings:
-    """What is known of the scene around the thing.
+    """Measured surroundings of the thing.
 
     Attributes:
-        obstacles: points of other things that may hide it, (N, 3) float64, object frame, metres.
-        floor: height of the support, metres; minus infinity for none.
-        reach: how far from the origin the support was seen, metres. There it is measured behind the
-            thing; elsewhere nothing is.
-        seen: the depth images of the views so far: where they did not look, more may stand.
+        obstacles: points of other objects that may occlude the thing, (N, 3) float64, object frame,
+            metres.
+        floor: height of the support surface, metres; minus infinity for none.
+        reach: distance from the origin up to which the support surface was measured, metres. Beyond
+            it, rays past the thing measure nothing.
+        seen: depth images of the views so far. Space outside them may contain further obstacles.
     """
 
     obstacles: Float
@@ -82,7 +89,7 @@ class SeenSurroundings:
 
     @classmethod
     def nothing(cls) -> "SeenSurroundings":
-        """The thing alone, with nothing that is measured behind it."""
+        """An isolated thing, without obstacles and without a measurable background."""
         return cls(np.zeros((0, 3)))
 
     @classmethod
@@ -92,16 +99,17 @@ class SeenSurroundings:
         caster: SurfaceCaster,
         hypotheses: Hypotheses,
     ) -> "SeenSurroundings":
-        """Gather what some views saw beside the thing.
+        """Collect the measurements of some views around the thing.
 
         Args:
-            observations: views of the thing, with all that their cameras saw. Those without that
-                say nothing.
-            caster: the surfaces.
-            hypotheses: the leading ones. The support is where the first of them stands.
+            observations: views of the thing with their scenes. Observations without a scene are
+                ignored.
+            caster: surfaces of the things.
+            hypotheses: leading hypotheses. The support surface is at the lowest point of the first
+                one.
 
         Returns:
-            Obstacles and the support.
+            Obstacles and the support surface.
         """
         surface = caster.surfaces[hypotheses.things[0]]
         pose = hypotheses.poses[0]
@@ -131,7 +139,7 @@ class SeenSurroundings:
 
 
 def _beside(observation: Observation) -> Float:
-    """Points that a view measured beside the thing, (N, 3), object frame, metres."""
+    """Measured points of a view that do not belong to the thing, (N, 3), object frame, metres."""
     scene = observation.scene
     if scene is None or observation.radius is None:
         return np.zeros((0, 3))
@@ -147,21 +155,21 @@ def _beside(observation: Observation) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisImages:
-    """The hypotheses as V cameras would see them, P pixels each.
+    """Renderings of H hypotheses from V cameras, with P pixels each.
 
     Attributes:
-        rays: through the pixels, as long as one metre of depth, (V, P, 3) float32.
-        lengths: of these, (V, P) float32.
-        depth: of each hypothesis, (V, H, P) float32, metres; infinity where it does not show, or
-            something stands before it.
-        hidden: where a hypothesis is behind something else, (V, H, P) bool.
-        clear: how likely nothing that no view has shown stands before a pixel, (V, P) float32.
-        normals: towards the camera, (V, H, P, 3) float32, object frame.
-        cosine: of the angle of incidence, (V, H, P) float32.
-        behind: whether something is measured where no hypothesis shows, (V, P) bool.
-        origins: of the cameras, (V, 3) float32.
-        centre: about which hypotheses turn, (3,) float32.
-        step: between pixels, tangents, (V, 2) float32, rows and columns.
+        rays: rays through the pixels, scaled to one metre of depth, (V, P, 3) float32.
+        lengths: lengths of the rays, (V, P) float32.
+        depth: depth of each hypothesis, (V, H, P) float32, metres; infinity where it is absent or
+            occluded.
+        hidden: pixels where a hypothesis is occluded, (V, H, P) bool.
+        clear: probability that no unobserved obstacle occludes a pixel, (V, P) float32.
+        normals: surface normals towards the camera, (V, H, P, 3) float32, object frame.
+        cosine: cosine of the angle of incidence, (V, H, P) float32.
+        behind: whether a background is measured where no hypothesis is visible, (V, P) bool.
+        origins: positions of the cameras, (V, 3) float32.
+        centre: centre of rotation of the hypotheses, (3,) float32.
+        step: spacing of the pixels, tangents, (V, 2) float32, rows and columns.
         side: rows and columns.
     """
 
@@ -179,10 +187,13 @@ class HypothesisImages:
     side: int
 
     def pixels_shown(self, pitch: float) -> Float:
-        """Expected pixels of the camera that show each hypothesis, (V, H) float64.
+        """Expected number of camera pixels that show each hypothesis.
 
         Args:
             pitch: angle between neighbouring pixels of the camera, radians.
+
+        Returns:
+            Numbers of pixels, (V, H) float64.
         """
         some = np.where(np.isfinite(self.depth), self.clear[:, None], 0).sum(2)
         return some * (self.step / pitch).prod(1)[:, None].astype(np.float64)
@@ -195,13 +206,13 @@ def rendered_images(
     scene: SeenSurroundings,
     side: int,
 ) -> HypothesisImages:
-    """Render all hypotheses from all cameras with few pixels.
+    """Render all hypotheses from all cameras at low resolution.
 
     Args:
         caster: surfaces of the things.
         hypotheses: things in poses.
         cameras: camera-to-world, (V, 4, 4), metres, object frame.
-        scene: what hides the things.
+        scene: occluders and the support surface.
         side: rows and columns of each image.
 
     Returns:
@@ -221,7 +232,7 @@ def rendered_images(
     turned = in_camera.reshape(views, -1, 3) @ cameras[:, :3, :3].swapaxes(1, 2)
     rays = turned.astype(np.float32)
 
-    # Rows of the call: all hypotheses of the first camera, then of the second.
+    # Order of the rows: all hypotheses of the first camera, then of the second, and so on.
     from_place = origins[:, None] - places
     in_file = np.einsum("vhj,hji->vhi", from_place, hypotheses.poses[:, :3, :3])
     directions = rays[:, None] @ turns
@@ -266,7 +277,7 @@ def _windows(
     cameras: Float,
     side: int,
 ) -> tuple[Float, Float, Float]:
-    """Tangents of columns and rows, (V, side) each, that cover all hypotheses, and the steps."""
+    """Tangents of columns and rows, (V, side) each, that cover all hypotheses, and their steps."""
     boxes = []
     for thing, pose in zip(hypotheses.things, hypotheses.poses, strict=True):
         vertices = caster.surfaces[thing].vertices
@@ -308,11 +319,12 @@ def _obstacle_depth(
     row = np.floor((in_camera[..., 1] / ahead - y[:, :1]) / step[:, :1] + 0.5).astype(
         np.int64
     )
+
     inside = (z > 1e-3) & (row >= 0) & (row < side) & (column >= 0) & (column < side)
     view, point = np.nonzero(inside)
     at = (view, row[view, point], column[view, point])
     np.minimum.at(depth, at, z[view, point].astype(np.float32))
-    # Points may lie farther apart than pixels: gaps between them are closed.
+    # The points may be sparser than the pixels: close the gaps between them.
     wider = minimum_filter(depth, (1, 3, 3))
     return maximum_filter(wider, (1, 3, 3)).reshape(views, -1)
 
@@ -325,7 +337,7 @@ def _clear(
     before: Float32,
     radius: float,
 ) -> Float32:
-    """How likely nothing that no view has shown stands before each pixel, (V, P) float32."""
+    """Probability that no unobserved obstacle occludes each pixel, (V, P) float32."""
     views, pixels = depth.shape
     if not scene.seen or not len(scene.obstacles):
         return np.ones((views, pixels), np.float32)
@@ -337,6 +349,7 @@ def _clear(
     ends = origins.astype(np.float32)[:, None] + rays[:, some] * along[..., None]
     lengths = np.linalg.norm(rays[:, some], axis=2, keepdims=True)
     hidden = shows & (depth[:, some] > before[:, some])
+
     top = float(scene.obstacles[:, 2].max())
     chance = chance_of_sight(
         scene.seen,
@@ -347,13 +360,14 @@ def _clear(
         scene.floor,
         top,
     )
+
     coarse = chance.reshape(views, -(-side // UNSEEN_EVERY), -1)
     fine = coarse.repeat(UNSEEN_EVERY, 1).repeat(UNSEEN_EVERY, 2)
     return fine[:, :side, :side].reshape(views, pixels)
 
 
 def _support_shows(scene: SeenSurroundings, origins: Float, rays: Float32) -> Mask:
-    """Where the support was seen behind the thing, (V, P) bool."""
+    """Pixels with the measured support surface in the background, (V, P) bool."""
     if not np.isfinite(scene.floor) or scene.reach == 0:
         return np.zeros(rays.shape[:2], bool)
     height = origins[:, 2] - scene.floor

@@ -1,12 +1,12 @@
-"""What the verifier is expected to say of two hypotheses in views that were not taken yet.
+"""Expected log-likelihood ratios of two hypotheses in views that were not taken yet.
 
-If a hypothesis is true, the depth that is measured is its own, under the noise of the sensor, with
-holes where the surface is seen at a grazing angle. ``verification.likelihood`` then judges this
-depth given each other hypothesis; what it will say on average is computed here without drawing any
-image.
+If a hypothesis is true, the measured depth is that of its surface with the noise of the sensor, and
+with holes where the surface is seen at grazing incidence. ``verification.likelihood`` then
+evaluates this depth under each other hypothesis. This module computes the mean of that result
+without sampling images.
 
-Both directions of a difference count: a handle that only the rival has shows as surface that is
-missing, and a handle that only the leading hypothesis has as surface that no rival explains.
+Both directions of a difference count: a handle that only the rival has is missing surface, and a
+handle that only the leading hypothesis has is surface that the rival does not explain.
 """
 
 from dataclasses import dataclass
@@ -23,28 +23,29 @@ from nextview.things.registration import SCAN_ERROR, RegistrationPrior
 from nextview.things.verification import PixelModel
 from nextview.types import Float, Float32, Index, Mask
 
-# every so many pixels take part in the fit of one hypothesis to another
+# stride of the pixels in the fit of one hypothesis to another
 FITTED_EVERY = 3
-FITTED_REACH = 0.004  # metres of deviation at which a pixel of this fit counts half
-# of incidence, below which holes become usual: see the cameras of simulation
+FITTED_REACH = 0.004  # residual at which a pixel of this fit has half weight, metres
+# cosine of incidence below which holes are frequent: see the simulated cameras
 GRAZING_COSINE = 0.3
-# metres by which a surface is off from its scan, in this fit
+# deviation of a surface from its scan in this fit, metres
 FITTED_SURFACE_ERROR = 0.001
-LARGEST_DEVIATION = 12.0  # standard deviations, beyond which a pixel is an outlier
-TABLE_STEPS = 20  # entries of a table per standard deviation
+# residual beyond which a pixel is an outlier, standard deviations
+LARGEST_DEVIATION = 12.0
+TABLE_STEPS = 20  # table entries per standard deviation
 
 
 def _displaced(images: HypothesisImages, prior: RegistrationPrior) -> Float:
-    """By how much each camera may see the thing displaced along each axis, (V,), metres.
+    """Standard deviation of the displacement that each camera's pose error causes, (V,), metres.
 
-    As ``RegistrationPrior.displaced`` says of views that were taken.
+    It corresponds to ``RegistrationPrior.displaced`` for views that were taken.
     """
     away = np.linalg.norm(images.origins - images.centre, axis=1).astype(np.float64)
     return np.hypot(prior.camera, prior.aim * away)
 
 
 def _pairs(count: int) -> tuple[Index, Index]:
-    """Rows of all pairs of hypotheses, each once."""
+    """Indices of all unordered pairs of hypotheses."""
     first, second = np.triu_indices(count, 1)
     return first, second
 
@@ -54,7 +55,7 @@ def depth_variance(
     sensor: ExpectedSensor,
     pixels: PixelModel,
 ) -> Float32:
-    """Variance of the depth that is measured of each hypothesis.
+    """Variance of the measured depth of each hypothesis.
 
     Args:
         images: the hypotheses as each view would show them.
@@ -76,19 +77,19 @@ def gaps_after_alignment(
     sensor: ExpectedSensor,
     prior: RegistrationPrior,
 ) -> Float32:
-    """Return the depth difference of each pair of hypotheses that remains after alignment.
+    """Depth differences of all pairs of hypotheses that remain after registration.
 
-    When the view is there, all hypotheses are aligned anew, and each camera may be displaced, so
-    what a small motion removes is no information. One Gauss-Newton step, held near zero by the
-    prior, is what registration would do.
+    The registration of the new view will move all hypotheses and estimate the pose error of the
+    camera. Differences that a small motion removes are therefore no information. One Gauss-Newton
+    step with the prior of the registration approximates this.
 
     Args:
-        images: the hypotheses as each view would show them.
-        sensor: its expected noise.
-        prior: of the registration.
+        images: renderings of the hypotheses in each view.
+        sensor: expected noise of the camera.
+        prior: prior of the registration.
 
     Returns:
-        Differences, (V, pairs, P) float32, metres; 0 where not both are visible.
+        Differences, (V, pairs, P) float32, metres; 0 where at least one of the two is not visible.
     """
     first, second = _pairs(images.depth.shape[1])
     depth_a = images.depth[:, first]
@@ -99,7 +100,7 @@ def gaps_after_alignment(
     if not len(first):
         return gap
 
-    # A symmetric Jacobian: the surface halfway between the two.
+    # Symmetric Jacobian: linearised at the surface halfway between the two.
     axes = [images.normals[..., k] for k in range(3)]
     normals = [axis[:, first] + axis[:, second] for axis in axes]
     scale = both / np.sqrt(normals[0] ** 2 + normals[1] ** 2 + normals[2] ** 2 + 1e-12)
@@ -108,6 +109,7 @@ def gaps_after_alignment(
     start = images.origins - images.centre
     rays = [images.rays[..., k] for k in range(3)]
     arms = [start[:, k, None, None] + rays[k][:, None] * middle for k in range(3)]
+
     columns = [
         arms[1] * normals[2] - arms[2] * normals[1],
         arms[2] * normals[0] - arms[0] * normals[2],
@@ -126,9 +128,11 @@ def gaps_after_alignment(
     weights = (weights * np.minimum(1, prior.pixels / used)).astype(np.float32)
     thinned = np.stack([column[..., some] for column in columns], 2)
     weighted = thinned * weights[:, :, None]
+
     held = np.zeros((len(images.origins), 1, 6))
     held[..., :3] = 1 / prior.tilt**2
     held[..., 3:] = 1 / _displaced(images, prior)[:, None, None] ** 2
+
     left = (weighted @ thinned.swapaxes(2, 3)).astype(np.float64)
     left += held[..., None] * np.eye(6)
     right = (weighted @ distance[..., None]).astype(np.float64)
@@ -145,17 +149,17 @@ def divergences(
     pixels: PixelModel,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Return the expected difference of two hypotheses' mean log-likelihood, and of their pixels.
+    """Expected differences of the mean log-likelihood of two hypotheses, and of their pixels.
 
     Args:
-        images: the hypotheses as each view would show them.
-        gaps: see ``gaps_after_alignment``.
-        sensor: its expected noise.
+        images: renderings of the hypotheses in each view.
+        gaps: depth differences, see ``gaps_after_alignment``.
+        sensor: expected noise of the camera.
         pixels: model of the pixels.
-        prior: of the registration.
+        prior: prior of the registration.
 
     Returns:
-        Mean of both directions, (V, H, H), and the share of their pixels that differ, (V, H, H).
+        Mean of both directions, (V, H, H), and share of the pixels that differ, (V, H, H).
     """
     views, count = images.depth.shape[:2]
     first, second = _pairs(count)
@@ -182,16 +186,16 @@ def different_pixels(
     pixels: PixelModel,
     prior: RegistrationPrior,
 ) -> Mask:
-    """Where the first two hypotheses differ by more than the noise, once they are aligned.
+    """Pixels in which two registered hypotheses differ by more than the noise.
 
     Args:
-        images: of two hypotheses.
+        images: renderings of two hypotheses.
         sensor: the camera.
-        pixels: how a pixel is judged.
-        prior: by how much a hypothesis and a camera may still be moved.
+        pixels: model of the pixels.
+        prior: prior of the registration.
 
     Returns:
-        (V, P) bool.
+        Mask, (V, P) bool.
     """
     first, second = _pairs(2)
     gaps = gaps_after_alignment(images, sensor, prior)
@@ -201,21 +205,22 @@ def different_pixels(
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """What the judgement of pixels rests on, (V, H, P) each if not said otherwise.
+    """Inputs of the pixel likelihoods, (V, H, P) each unless noted otherwise.
 
     Attributes:
-        shows: where a hypothesis shows, bool.
-        lost: chance that nothing is measured there.
-        deviation: standard deviation of the depth there, metres.
-        hole: log-likelihood of a hole there.
-        missing: log-likelihood of a pixel of the thing that shows nothing of another hypothesis.
-        apart: how surely a pixel beside a hypothesis is beside it after it is aligned anew, 0 to
-            1.
-        behind: whether something is measured where a hypothesis does not show, (V, 1, P).
-        clear: how likely nothing that no view has shown stands before a pixel, (V, 1, P).
-        area: pixels of the camera in one of these, (V, 1).
-        enough: pixels of the camera from which on a view counts in full.
-        matches: expected log-likelihood of a depth by its deviation, see ``_match_table``.
+        shows: pixels in which a hypothesis is visible, bool.
+        lost: probability of a hole.
+        deviation: standard deviation of the depth, metres.
+        hole: log-likelihood of a hole.
+        missing: log-likelihood of a thing pixel that another hypothesis does not cover.
+        apart: weight of a pixel outside a hypothesis, by how clearly it remains outside after
+            registration, 0 to 1.
+        behind: whether a background is measured where a hypothesis is absent, (V, 1, P).
+        clear: probability that no unobserved obstacle occludes a pixel, (V, 1, P).
+        area: number of camera pixels in one rendered pixel, (V, 1).
+        enough: number of camera pixels from which a view has full weight.
+        outlier: log-likelihood of an outlier.
+        matches: expected log-likelihood of a depth by its residual, see ``_match_table``.
     """
 
     shows: Mask
@@ -239,19 +244,19 @@ class _Judged:
         pixels: PixelModel,
         prior: RegistrationPrior,
     ) -> "_Judged":
-        """Prepare the judgement of the pixels of each view.
+        """Prepare the likelihoods of the pixels of each view.
 
         Args:
-            images: the hypotheses as each view would show them.
-            sensor: its expected noise.
+            images: renderings of the hypotheses in each view.
+            sensor: expected noise of the camera.
             pixels: model of the pixels.
-            prior: of the registration.
+            prior: prior of the registration.
 
         Returns:
-            The judgement.
+            The inputs of the likelihoods.
         """
         shows = np.isfinite(images.depth)
-        size = images.step / sensor.pitch  # of a pixel here, pixels of the camera
+        size = images.step / sensor.pitch  # size of a rendered pixel, camera pixels
         within, beside = _rings(shows, images.side)
         deep = np.clip(within * size.mean(1)[:, None, None] / pixels.edge, 0.1, 1)
 
@@ -275,11 +280,11 @@ class _Judged:
         )
 
     def ratio(self, true: Index, other: Index, gaps: Float32) -> Float:
-        """Return the expected mean log-likelihood of true hypotheses less that of others.
+        """Expected mean log-likelihood of true hypotheses minus that of their rivals.
 
         Args:
             true: the true hypotheses, (K,) int64.
-            other: the others, (K,) int64.
+            other: the rivals, (K,) int64.
             gaps: depth differences of the pairs, (V, K, P), metres.
 
         Returns:
@@ -290,19 +295,19 @@ class _Judged:
         lost = self.lost[:, true]
         kept = shows * (1 - lost)
 
-        # Where both show.
+        # Both are visible.
         off = np.abs(gaps) / self.deviation[:, other] * TABLE_STEPS
         match = self.matches[np.minimum(off, len(self.matches) - 1).astype(np.int32)]
         hole = self.hole[:, other]
         judged = np.where(rival, kept * match + lost * hole, 0)
-        # Where only the true one shows: surface that the other one does not explain.
+        # Only the true one is visible: surface that the rival does not explain.
         alone = shows & ~rival
         judged += np.where(
             alone,
             kept * self.missing[:, true] * self.apart[:, other],
             0,
         )
-        # Where only the other one shows: what is behind is seen through it, or nothing is measured.
+        # Only the rival is visible: the camera measures the background instead, or nothing.
         through = rival & ~shows
         seen_through = self.outlier * self.apart[:, true]
         judged += np.where(through, np.where(self.behind, seen_through, hole), 0)
@@ -322,15 +327,15 @@ class _Judged:
         )
 
     def different(self, first: Index, second: Index, gaps: Float32) -> Mask:
-        """Return the pixels in which two hypotheses differ by more than the noise.
+        """Pixels in which two hypotheses differ by more than the noise.
 
         Args:
-            first: the one hypotheses, (K,) int64.
-            second: the other hypotheses, (K,) int64.
+            first: first hypothesis of each pair, (K,) int64.
+            second: second hypothesis of each pair, (K,) int64.
             gaps: depth differences of the pairs, (V, K, P), metres.
 
         Returns:
-            Pixels, (V, K, P) bool.
+            Mask, (V, K, P) bool.
         """
         shows = self.shows[:, first]
         rival = self.shows[:, second]
@@ -341,10 +346,10 @@ class _Judged:
 
 @lru_cache(maxsize=4)
 def _match_table(outlier: float) -> Float32:
-    """Expected log-likelihood of a depth by its deviation from the surface, standard deviations.
+    """Expected log-likelihood of a depth by its residual in standard deviations.
 
-    The expectation of ``verification.likelihood``'s mixture over Gaussian noise, by Gauss-Hermite
-    quadrature; one entry for every 1 / TABLE_STEPS.
+    It is the expectation of the mixture of ``verification.likelihood`` over Gaussian noise, by
+    Gauss-Hermite quadrature, with one entry for every 1 / TABLE_STEPS.
     """
     nodes, shares = np.polynomial.hermite_e.hermegauss(40)
     deviations = np.arange(int(LARGEST_DEVIATION * TABLE_STEPS) + 1) / TABLE_STEPS
@@ -354,7 +359,7 @@ def _match_table(outlier: float) -> Float32:
 
 
 def _rings(shows: Mask, side: int) -> tuple[Float32, Float32]:
-    """Distance to the outline within it, and beside it, (V, H, P) each, pixels; at most 2.5."""
+    """Distance to the outline inside and outside it, (V, H, P) each, pixels; at most 2.5."""
     image = shows.reshape(*shows.shape[:2], side, side)
     within = np.full(image.shape, 0.5, np.float32)
     beside = np.full(image.shape, 0.5, np.float32)

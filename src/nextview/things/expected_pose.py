@@ -1,7 +1,7 @@
-"""How much better the pose of a thing is expected to be known after views that were not taken yet.
+"""Expected reduction of the pose error by views that were not taken yet.
 
-What counts is how far the surface is from where it is believed, along its normals, as the next
-camera sees it: so turns of a round thing about its axis, which nothing can tell, do not count.
+The measure is the displacement of the surface along its normals as the next camera sees it.
+Rotations of a round thing about its axis, which no view determines, do not count.
 """
 
 from functools import lru_cache
@@ -18,14 +18,16 @@ from nextview.things.registration import (
 from nextview.things.surface import Surface
 from nextview.types import Float, Float32, Mask
 
-LEAST_SURFACE_ERROR = 1e-6  # metres: nearer no camera knows where a surface is
+# smallest surface error, metres: below the accuracy of all cameras
+LEAST_SURFACE_ERROR = 1e-6
 
 
 @lru_cache(maxsize=256)
 def _normal_displacements(surface: Surface) -> Float:
-    """Mean square of the surface's displacement along its normal, of turn and place, (6, 6).
+    """Mean square displacement of the surface along its normals by rotation and translation, (6,
+    6).
 
-    Axes are those of the scan file; the turn is about the centre of the surface.
+    The axes are those of the scan file; the rotation is about the centre of the surface.
     """
     corners = surface.vertices[surface.faces].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -37,17 +39,22 @@ def _normal_displacements(surface: Surface) -> Float:
 
 
 def surface_errors(surface: Surface, rotation: Float, covariances: Float) -> Float:
-    """Standard deviation of a surface's displacement along its normals, (...) float64, metres.
+    """Standard deviation of the displacement of a surface along its normals.
 
     Args:
-        surface: of the thing.
+        surface: surface of the thing.
         rotation: from the axes of the scan file to the object frame, (3, 3).
-        covariances: of turn, about the centre of the surface, and place, object frame, (..., 6, 6).
+        covariances: covariances of rotation, about the centre of the surface, and translation,
+            object frame, (..., 6, 6).
+
+    Returns:
+        Standard deviations, (...) float64, metres.
     """
     turned = np.kron(np.eye(2), rotation)
     displaced = turned @ _normal_displacements(surface) @ turned.T
     variances = np.einsum("ij,...ji->...", displaced, covariances)
-    # rounding makes the variance of what is known exactly negative, and a zero has no logarithm
+    # rounding can make the variance of an exact pose negative, and the logarithm needs a positive
+    # value
     return np.sqrt(np.maximum(variances, LEAST_SURFACE_ERROR**2))
 
 
@@ -60,19 +67,22 @@ def sharper_poses(
     prior: RegistrationPrior,
     taken: int,
 ) -> Float:
-    """Return the logarithm by which the surface's error is smaller after each view, (V,) float64.
+    """Logarithm of the reduction of the surface error by each view.
 
-    A camera that sees little of the thing hardly tells how far it is displaced itself, so the
-    error can also be larger in a new view than in the last one.
+    A camera that sees little of the thing hardly determines its own pose error, so the error can
+    also be larger in a new view than in the last one.
 
     Args:
-        images: what each view would show; the first hypothesis is the one that is believed.
-        surface: of its thing.
-        pose: of it, (4, 4).
-        covariance: of turn and place by the views so far, (6, 6).
+        images: renderings for each view; the first hypothesis is the likeliest.
+        surface: surface of its thing.
+        pose: its pose, (4, 4).
+        covariance: covariance of rotation and translation after the views so far, (6, 6).
         sensor: the camera.
-        prior: how far a camera may be displaced.
-        taken: how many views there are.
+        prior: prior of the camera poses.
+        taken: number of views so far.
+
+    Returns:
+        Logarithms, (V,) float64; positive where the error becomes smaller.
     """
     rotation = pose[:3, :3]
     centre = rotation @ surface.centre.astype(np.float64) + pose[:3, 3]
@@ -94,7 +104,9 @@ def _information(
     sensor: ExpectedSensor,
     prior: RegistrationPrior,
 ) -> Float:
-    """What each view tells of turn and place of the first hypothesis, (V, 6, 6)."""
+    """Fisher information of each view about rotation and translation of the first hypothesis, (V,
+    6, 6).
+    """
     shows = np.isfinite(images.depth[:, 0])
     depth = np.where(shows, images.depth[:, 0], 0)
     points = images.origins[:, None] + images.rays * depth[..., None]
@@ -121,11 +133,11 @@ def _summed(
     pixels: Float32,
     prior: RegistrationPrior,
 ) -> Float:
-    """Information of pixels that hold a thing in some directions, (V, 6, 6)."""
+    """Fisher information of pixels that constrain a thing in some directions, (V, 6, 6)."""
     moved = np.concatenate([np.cross(arms, directions), directions], 2).astype(
         np.float64
     )
-    # As in registration: neighbouring pixels err together.
+    # As in the registration: the errors of neighbouring pixels are correlated.
     count = np.minimum(pixels.sum(1), prior.pixels) / np.maximum(
         (weights > 0).sum(1),
         1,
@@ -135,9 +147,9 @@ def _summed(
 
 
 def _outward(images: HypothesisImages, shows: Mask) -> Float32:
-    """Directions out of the outline, (V, P, 3) float32: unit vectors at the rim, else zero.
+    """Outward normals of the outline, (V, P, 3) float32: unit vectors at the rim, zero elsewhere.
 
-    Where something stands before the thing, its outline is not its own.
+    The border to an occluder is no outline of the thing.
     """
     side = images.side
     views = len(shows)

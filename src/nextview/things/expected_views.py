@@ -1,9 +1,9 @@
-"""What candidate views are expected to tell of the leading hypotheses, and which tells most.
+"""Expected information of candidate views about the leading hypotheses.
 
-A view is worth the information that it is expected to give about the thing, or about thing and pose
-(Denzler and Brown, "Information theoretic sensor data selection", IEEE TPAMI 2002), under the
-verifier's own likelihood: ``expected_images`` renders the hypotheses, ``expected_likelihood`` says
-how far apart the verifier will find them.
+The value of a view is its expected information about the thing, or about thing and pose (Denzler
+and Brown, "Information theoretic sensor data selection", IEEE TPAMI 2002), under the likelihood of
+the verifier. ``expected_images`` renders the hypotheses, and ``expected_likelihood`` predicts their
+log-likelihood ratios.
 """
 
 from collections.abc import Sequence
@@ -42,28 +42,29 @@ from nextview.types import Float, Index, Mask
 
 Goal = Literal["thing", "pose"]
 
-SENSOR_SIDE = 24  # rows and columns of a view by which the camera's noise is judged
+SENSOR_SIDE = 24  # rows and columns of a view for the estimate of the camera's noise
 RENDERED_SIDE = 18  # rows and columns of the rendered images
-PICTURE_SIDE = 64  # rows and columns of pictures to look at
-BHATTACHARYYA = 0.25  # of two equally wide Gaussians, as a share of their divergence
-# pixels of the camera that show the thing, at which half of what they tell counts
+PICTURE_SIDE = 64  # rows and columns of the pictures for display
+# Bhattacharyya distance of two Gaussians of equal variance, as a share of their divergence
+BHATTACHARYYA = 0.25
+# thing pixels at which half of the information counts
 HALF_FOUND = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedViews:
-    """What candidate views are expected to tell.
+    """Expected information of V candidate views.
 
     Attributes:
-        hypotheses: what was rendered.
+        hypotheses: the rendered hypotheses.
         divergence: expected log-likelihood ratio of two hypotheses after each view if one of them
-            is true, the mean of both directions, (V, H, H) float64, 0 or more.
-        different: share of the pixels that show either of two hypotheses in which they differ by
-            more than the noise, (V, H, H) float64.
-        found: share of the information that each view is trusted to give, (V,) float64, 0 to 1. The
-            fewer pixels show the thing, the sooner it is missed.
-        sharper: see ``expected_pose.sharper_poses``, (V,) float64; zeros where it was not asked
-            for.
+            is true, mean of both directions, (V, H, H) float64, 0 or more.
+        different: share of the pixels of two hypotheses in which they differ by more than the
+            noise, (V, H, H) float64.
+        found: share of the information that each view is trusted to give, (V,) float64, 0 to 1. A
+            view with few pixels of the thing is more likely to miss it.
+        sharper: reduction of the pose error, see ``expected_pose.sharper_poses``, (V,) float64;
+            zeros if it was not requested.
     """
 
     hypotheses: Hypotheses
@@ -73,15 +74,17 @@ class ExpectedViews:
     sharper: Float
 
     def information(self, goal: Goal = "thing") -> Float:
-        """Expected information of each view, (V,) float64, natural units (nats).
+        """Expected information of each view, nats.
 
-        The expected entropy of the belief after a view is that of a mixture of Gaussians, which is
-        bounded by the distances of Bhattacharyya between its parts (Kolchinsky and Tracey,
-        "Estimating mixture entropy with pairwise distances", Entropy 2017).
+        The expected entropy of the belief after a view is the entropy of a mixture of Gaussians.
+        Pairwise Bhattacharyya distances bound it (Kolchinsky and Tracey, "Estimating mixture
+        entropy with pairwise distances", Entropy 2017).
 
         Args:
-            goal: "thing" values what is told of which thing it is; "pose" what is told of thing and
-                pose.
+            goal: "thing" for the information about the thing; "pose" for that about thing and pose.
+
+        Returns:
+            Information, (V,) float64, nats.
         """
         belief = self.hypotheses.belief
         possible = np.flatnonzero(belief)
@@ -89,13 +92,16 @@ class ExpectedViews:
         return self.found * np.maximum(gains @ belief[possible], 0)
 
     def worth(self, goal: Goal = "thing") -> Float:
-        """What each view is worth, (V,) float64, natural units.
+        """Value of each view, nats.
 
-        For the pose it is the information about thing and pose, and how much better the pose of the
-        likeliest hypothesis will be known.
+        For the goal "pose", it is the information about thing and pose plus the expected reduction
+        of the pose error of the likeliest hypothesis.
 
         Args:
-            goal: what is to be told.
+            goal: "thing" or "pose".
+
+        Returns:
+            Values, (V,) float64, nats.
         """
         information = self.information(goal)
         return (
@@ -103,11 +109,14 @@ class ExpectedViews:
         )
 
     def gain(self, truth: int, goal: Goal = "thing") -> Float:
-        """Gain of the log-belief in the right answer with each view, (V,) float64.
+        """Increase of the log-belief in the true answer by each view.
 
         Args:
-            truth: which hypothesis is true; the belief in it is not zero.
+            truth: index of the true hypothesis; the belief in it is not zero.
             goal: whether the answer is a thing, or a thing and its pose.
+
+        Returns:
+            Gains, (V,) float64, nats.
         """
         belief = self.hypotheses.belief
         kept = belief * np.exp(-BHATTACHARYYA * self.divergence[:, truth])
@@ -117,7 +126,14 @@ class ExpectedViews:
         return np.log((kept[:, same].sum(1) / kept.sum(1)) / belief[same].sum())
 
     def entropy(self, goal: Goal = "thing") -> float:
-        """Entropy of the present belief, nats: the most that a view can tell."""
+        """Entropy of the present belief: an upper bound of the information of a view.
+
+        Args:
+            goal: "thing" or "pose".
+
+        Returns:
+            Entropy, nats.
+        """
         belief = self.hypotheses.belief
         if goal == "thing":
             belief = np.bincount(self.hypotheses.things, belief).astype(np.float64)
@@ -125,10 +141,13 @@ class ExpectedViews:
         return float(-(some * np.log(some)).sum())
 
     def told_apart(self, view: int) -> tuple[int, int] | None:
-        """The two hypotheses of different things that a view is expected to tell apart most.
+        """The two hypotheses of different things that a view separates best.
+
+        Args:
+            view: index of the candidate view.
 
         Returns:
-            Their rows, the likelier one first; None if there is only one thing.
+            Their indices, the likelier one first; None if there is only one thing.
         """
         belief = self.hypotheses.belief
         things = self.hypotheses.things
@@ -142,12 +161,15 @@ class ExpectedViews:
         return pair if belief[first] >= belief[second] else pair[::-1]
 
     def words(self, view: int, names: Sequence[str], goal: Goal = "thing") -> str:
-        """What a view is expected to settle, as a phrase.
+        """Describe in a phrase which question a view is expected to settle.
 
         Args:
-            view: which candidate.
-            names: of the things.
-            goal: what is to be told.
+            view: index of the candidate view.
+            names: names of the things.
+            goal: "thing" or "pose".
+
+        Returns:
+            The phrase.
         """
         entropy = self.entropy(goal)
         share = (
@@ -183,26 +205,26 @@ def expected_views(
     side: int = RENDERED_SIDE,
     covariance: Float | None = None,
 ) -> ExpectedViews:
-    """Expect what candidate views would tell, with the verifier's own weights.
+    """Predict the information of candidate views, with the weights of the verifier.
 
     Args:
-        caster: the surfaces.
+        caster: surfaces of the things.
         hypotheses: the leading hypotheses.
         cameras: candidate camera poses, camera-to-world, (V, 4, 4), object frame, metres, OpenCV
             axes.
         sensor: the camera.
-        surroundings: what may stand before the thing and behind it; nothing by default.
-        taken: how many views there are already. More views count less each, see
+        surroundings: occluders and background; none by default.
+        taken: number of views so far. Further views have less weight, see
             ``EvidenceWeights.correlation``.
-        weights: how much geometry counts.
-        pixels: how a pixel is judged.
-        prior: by how much a hypothesis and a camera may still be moved when the view is there.
+        weights: weight of the geometry.
+        pixels: model of the pixels.
+        prior: prior of the registration.
         side: rows and columns of the rendered images.
-        covariance: of turn and place of the first hypothesis, (6, 6), where it is asked how much
-            better its pose will be known.
+        covariance: covariance of rotation and translation of the first hypothesis, (6, 6), if the
+            reduction of its pose error is requested.
 
     Returns:
-        What each view would tell of each pair of hypotheses.
+        Expected information of each view.
     """
     cameras = np.asarray(cameras, np.float64)
     scene = SeenSurroundings.nothing() if surroundings is None else surroundings
@@ -232,11 +254,11 @@ def expected_views(
 
 @dataclass(frozen=True, eq=False)
 class RivalPictures:
-    """The two leading hypotheses as one camera would see them.
+    """Renderings of the two leading hypotheses from one camera.
 
     Attributes:
         things: number of the surface of each, (2,) int64.
-        pictures: of each, as a headlight would show it, (2, S, S) uint8, 0 where it does not show.
+        pictures: rendering of each with a headlight, (2, S, S) uint8, 0 for background.
         different: pixels in which they differ by more than the noise, (S, S) bool.
     """
 
@@ -246,26 +268,26 @@ class RivalPictures:
 
     @property
     def share(self) -> float:
-        """Share of the pixels that show either of them in which they differ."""
+        """Share of the pixels of the two hypotheses in which they differ."""
         return float(self.different.sum() / max(1, self.pictures.any(0).sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """All that is known when the next view of a thing is to be chosen.
+    """The state from which the next view of a thing is chosen.
 
     Attributes:
-        caster: the surfaces.
+        caster: surfaces of the things.
         hypotheses: the leading hypotheses.
         sensor: the camera.
-        surroundings: what is known of the scene.
-        place: of the last camera, (3,) float64, object frame, metres.
-        taken: how many views there are.
-        weights: how much geometry counts.
-        pixels: how a pixel is judged.
-        prior: by how much a hypothesis and a camera may still be moved.
-        likeliest: the first hypothesis, as it was aligned.
-        views: those so far, as it was aligned with them.
+        surroundings: measured surroundings of the thing.
+        place: position of the last camera, (3,) float64, object frame, metres.
+        taken: number of views so far.
+        weights: weight of the geometry.
+        pixels: model of the pixels.
+        prior: prior of the registration.
+        likeliest: registration of the first hypothesis.
+        views: the registered views.
     """
 
     caster: SurfaceCaster
@@ -287,13 +309,16 @@ class Outlook:
         verified: Verified,
         observations: Sequence[Observation],
     ) -> "Outlook":
-        """Gather what some views have shown.
+        """Collect the state after some views.
 
         Args:
-            verifier: of the surfaces.
-            verified: what it found in the views.
-            observations: the views, the last one last; those that do not show the thing are left
-                out.
+            verifier: verifier of the surfaces.
+            verified: its result for the views.
+            observations: the views in the order in which they were taken; those that do not show
+                the thing are ignored.
+
+        Returns:
+            The state.
 
         Raises:
             ObservationError: no view shows the thing, or its scale is not known.
@@ -323,13 +348,13 @@ class Outlook:
 
     @cached_property
     def covariance(self) -> Float:
-        """Of turn and place of the first hypothesis by the views so far, (6, 6) float64."""
+        """Covariance of rotation and translation of the first hypothesis, (6, 6) float64."""
         found = pose_covariances(self.caster, self.likeliest, self.views, self.prior)
         return found[0]
 
     @property
     def distance(self) -> float:
-        """Of the last camera from the origin of the object frame, metres."""
+        """Distance of the last camera from the origin of the object frame, metres."""
         return float(np.linalg.norm(self.place))
 
     @property
@@ -338,7 +363,7 @@ class Outlook:
         return self.place / self.distance
 
     def cameras(self, directions: Float) -> Float:
-        """Level cameras in some directions, as far away as the last one.
+        """Level cameras in the given directions, at the distance of the last camera.
 
         Args:
             directions: unit vectors from the object, (V, 3).
@@ -353,7 +378,8 @@ class Outlook:
         )
 
     def rivals(self, camera: Float, side: int = PICTURE_SIDE) -> RivalPictures | None:
-        """Draw the two leading hypotheses, of two things if there are two, and their difference.
+        """Render the two leading hypotheses, of different things if there are any, and their
+        difference.
 
         Args:
             camera: camera-to-world pose, (4, 4), object frame, metres.
@@ -387,11 +413,14 @@ class Outlook:
         )
 
     def expect(self, cameras: Float, goal: Goal = "thing") -> ExpectedViews:
-        """Expect what views from some cameras would tell.
+        """Predict the information of views from some cameras.
 
         Args:
             cameras: camera-to-world poses, (V, 4, 4), object frame, metres.
-            goal: for the pose it is also asked how much better it will be known.
+            goal: "pose" also predicts the reduction of the pose error.
+
+        Returns:
+            Expected information of each view.
         """
         return expected_views(
             self.caster,

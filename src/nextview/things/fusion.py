@@ -1,11 +1,12 @@
-"""The surface of a thing from depth frames of it: small squares where the frames measured it.
+"""The surface of a thing from depth frames, as a set of small squares (surfels).
 
-The planes that were fitted to the pixels of all frames are averaged in small cells, and a square
-stands for each. So the noise of many frames averages out, as in surfel maps (Pfister et al.,
-"Surfels", SIGGRAPH 2000; Keller et al., "Real-time 3D reconstruction in dynamic scenes using
-point-based fusion", 3DV 2013). Where no frame saw anything there is no surface. On simulated frames
-through a stereo camera the squares lay 0.3 and 0.5 mm from the scans of a mug and a drill in the
-mean, the marching cubes of a truncated signed distance 0.7 and 1.6 mm: it blurs thin walls.
+The local planes of the pixels of all frames are averaged in small cells, and each cell becomes a
+square. The noise of many frames averages out, as in surfel maps (Pfister et al., "Surfels",
+SIGGRAPH 2000; Keller et al., "Real-time 3D reconstruction in dynamic scenes using point-based
+fusion", 3DV 2013). There is no surface where no frame measured one. On simulated frames of a stereo
+camera, the mean distance of the squares from the scans of a mug and a drill was 0.3 and 0.5 mm;
+that of marching cubes on a truncated signed distance was 0.7 and 1.6 mm, because it blurs thin
+walls.
 """
 
 from collections.abc import Sequence
@@ -16,26 +17,27 @@ from nextview.sensing.sighting import Sighting
 from nextview.things.surface import Surface
 from nextview.types import Float
 
-FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
-CELLS = 45.0  # in a radius, of a large thing
+FINEST_CELL = 0.0015  # smallest cell, metres: the resolution of depth cameras
+CELLS = 45.0  # cells per radius of a large thing
 SQUARE = 0.75  # half the side of a square, cells: neighbours overlap
-MOST_FUSED_POINTS = 20_000  # of a frame; an even choice of more is taken
-# cosine of the angle of incidence below which a pixel does not count
+MOST_FUSED_POINTS = 20_000  # most points of a frame; more are thinned evenly
+# cosine of the angle of incidence below which a pixel is ignored
 STEEPEST_COSINE = 0.25
-FEW_SHARE = 0.1  # of what a usual cell was seen, below which it is an error
+# share of the median weight of the cells, below which a cell is an error
+FEW_SHARE = 0.1
 FEWEST_SQUARES = 50
 
 
 def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | None:
-    """Fuse what frames show of a thing.
+    """Fuse sightings of a thing to a surface.
 
     Args:
-        sightings: of the thing, all in one world.
-        radius: of the thing, metres.
-        name: what it is called.
+        sightings: sightings of the thing in one world frame.
+        radius: radius of the thing, metres.
+        name: name of the thing.
 
     Returns:
-        Its surface, in the frame of the world, metres; None if too little was measured.
+        The surface in the world frame, metres; None if too little was measured.
     """
     seen = [_measured(sighting) for sighting in sightings]
     points, normals, weights = (
@@ -45,7 +47,7 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
         return None
 
     cell = max(FINEST_CELL, radius / CELLS)
-    # The two sides of a thin wall lie in one cell: they are told apart by where they look.
+    # Both sides of a thin wall lie in one cell: the normals separate them.
     side = np.abs(normals).argmax(1)
     towards = 2 * side + (normals[np.arange(len(side)), side] > 0)
     keys = np.column_stack([np.floor(points / cell).astype(np.int64), towards])
@@ -63,7 +65,7 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
 
 
 def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:
-    """Points of the thing, (N, 3), their normals towards the camera, and how much they count."""
+    """Points of the thing, (N, 3), their normals towards the camera, (N, 3), and weights, (N,)."""
     facets = sighting.facets
     step = 1 + len(facets.rows) // MOST_FUSED_POINTS
     facets = facets.some(slice(None, None, step))
@@ -82,7 +84,7 @@ def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:
 
 
 def _squares(middle: Float, normal: Float, half: float, name: str) -> Surface:
-    """A square across each normal, (N, 3), about each middle, (N, 3)."""
+    """A square perpendicular to each normal, (N, 3), around each centre, (N, 3)."""
     helper = np.eye(3)[np.abs(normal).argmin(1)]
     along = np.cross(normal, helper)
     along *= half / np.linalg.norm(along, axis=1, keepdims=True)

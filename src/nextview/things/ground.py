@@ -1,4 +1,4 @@
-"""The plane that a thing stands on, as one view shows it beside the thing."""
+"""The support plane of a thing, fitted to the depth beside it in one view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,26 +7,26 @@ import numpy as np
 
 from nextview.types import Float, Floats
 
-FEWEST_PLANE_POINTS = 50  # on the plane
-LEAST_PLANE_SHARE = 0.1  # of what is measured beside the thing
-# thickness of the layer that the plane is looked for in, half sizes of the thing
+FEWEST_PLANE_POINTS = 50  # fewest points on the plane
+LEAST_PLANE_SHARE = 0.1  # smallest share of the points beside the thing
+# thickness of the horizontal layer in the search, half sizes of the thing
 PLANE_LAYER = 0.15
 THINNEST_LAYER = 0.006  # metres
-# vertical part of the normal: the vertical is known up to this
+# smallest vertical component of the normal: the vertical is known to 15 degrees
 LEAST_VERTICAL = np.cos(np.radians(15.0))
 FITS = 4
-NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal number
+NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The plane that a thing stands on.
+    """The plane that supports a thing.
 
     Attributes:
         normal: unit vector upwards, object frame, (3,) float64.
-        offset: height of the object frame's origin above it, metres.
-        noise: deviation of what is measured of it, as inverse depth, 1/metres. It holds the errors
-            that neighbouring pixels have in common.
+        offset: height of the origin of the object frame above the plane, metres.
+        noise: standard deviation of the inverse depth on the plane, 1/metres, including errors that
+            neighbouring pixels share.
     """
 
     normal: Float
@@ -34,7 +34,14 @@ class Ground:
     noise: float
 
     def heights(self, points: Floats) -> Floats:
-        """Height of points, (..., 3), object frame, above the plane, (...,), metres."""
+        """Heights of points above the plane.
+
+        Args:
+            points: object frame, (..., 3), metres.
+
+        Returns:
+            Heights, (...,), metres.
+        """
         normal = self.normal.astype(points.dtype)
         return points @ normal + points.dtype.type(self.offset)
 
@@ -45,19 +52,20 @@ def find_ground(
     origin: Float,
     axis: Float,
 ) -> Ground | None:
-    """Find the plane that a thing stands on in what is measured beside it.
+    """Find the support plane of a thing in the depth beside it.
 
-    It is the highest level plane, at the bottom of what is seen of the thing or below, that a good
-    part of the points lies on: a floor below a small table may fill more of the image.
+    It is the highest level plane at or below the bottom of the visible part of the thing that
+    contains a sufficient share of the points: the floor below a small table may fill more of the
+    image.
 
     Args:
-        beside: what is measured beside the thing, object frame, (N, 3), metres.
-        thing: what is measured of the thing, (M, 3).
-        origin: where the camera stands, (3,).
-        axis: the direction that it looks in, (3,).
+        beside: measured points beside the thing, object frame, (N, 3), metres.
+        thing: measured points of the thing, (M, 3).
+        origin: position of the camera, (3,).
+        axis: optical axis of the camera, (3,).
 
     Returns:
-        The plane; None where too few of the points lie on one.
+        The plane; None if too few of the points lie on one.
     """
     enough = max(FEWEST_PLANE_POINTS, LEAST_PLANE_SHARE * len(beside))
     if len(beside) < enough or not len(thing):
@@ -78,6 +86,7 @@ def find_ground(
     level = np.column_stack([(beside - centre)[:, :2], np.ones(len(beside))])
     plane = np.zeros(3)
     off = np.zeros(len(beside))
+
     for _ in range(FITS):
         if near.sum() < enough:
             return None
@@ -106,23 +115,25 @@ def _noise(
     origin: Float,
     axis: Float,
 ) -> float:
-    """Deviation of inverse depth from a plane, 1/metres, of points by their heights, (N,)."""
+    """Standard deviation of the inverse depth from a plane, 1/metres, given heights of points,
+    (N,).
+    """
     away = points - origin
     depth = away @ axis
-    # by how much a metre of depth changes the height
+    # change of the height per metre of depth
     along = np.abs(away @ normal) / depth
     deviation = np.abs(off) / np.maximum(along, 0.05) / depth**2
     return float(np.median(deviation)) / NORMAL_MEDIAN
 
 
 def levelling(grounds: Sequence[Ground]) -> Float:
-    """The smallest turn after which the grounds, as some views show them, are level in the mean.
+    """The smallest rotation that levels the mean of some ground planes.
 
     Args:
-        grounds: none or more.
+        grounds: ground planes of some views, none or more.
 
     Returns:
-        A rotation matrix, (3, 3); that of no turn without a ground.
+        Rotation matrix, (3, 3); the identity without a ground.
     """
     if not grounds:
         return np.eye(3)

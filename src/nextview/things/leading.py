@@ -1,4 +1,4 @@
-"""The leading hypotheses: the things, in poses, that a next view has to tell apart."""
+"""The leading hypotheses, things in poses, that the next view has to separate."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,9 @@ import numpy as np
 from nextview.things.verifier import Verified
 from nextview.types import Float, Index
 
-MOST_LEADING = 10  # hypotheses that are rendered
-FEW_THINGS = 5  # likeliest things whose best hypothesis is always among them
-# of the likeliest hypothesis' belief, below which one does not count
+MOST_LEADING = 10  # most hypotheses that are rendered
+FEW_THINGS = 5  # likeliest things that always contribute their best hypothesis
+# smallest belief relative to the likeliest hypothesis
 LEAST_LEADING_SHARE = 1e-4
 
 
@@ -19,8 +19,8 @@ class Hypotheses:
 
     Attributes:
         things: number of the surface of each, (H,) int64.
-        poses: of the scan files' frames in the object frame, (H, 4, 4) float64, metres.
-        belief: in each, (H,) float64, sums to 1.
+        poses: poses of the scan files' frames in the object frame, (H, 4, 4) float64, metres.
+        belief: belief in each, (H,) float64, sums to 1.
     """
 
     things: Index
@@ -29,14 +29,14 @@ class Hypotheses:
 
     @classmethod
     def leading(cls, verified: Verified, most: int = MOST_LEADING) -> "Hypotheses":
-        """Choose the likeliest hypotheses, among them the best one of each likely thing.
+        """Choose the likeliest hypotheses, including the best one of each likely thing.
 
         Args:
-            verified: what the verifier found.
-            most: how many at most.
+            verified: result of the verifier.
+            most: largest number of hypotheses.
 
         Returns:
-            The hypotheses. The belief in a thing is shared among its hypotheses.
+            The hypotheses. The belief in a thing is divided among its hypotheses.
         """
         in_thing = np.bincount(
             verified.things,
@@ -46,7 +46,7 @@ class Hypotheses:
         share = verified.probabilities / np.maximum(in_thing[verified.things], 1e-300)
         belief = verified.belief[verified.things] * share
 
-        # the best hypothesis of each
+        # best hypothesis of each thing
         first = np.unique(verified.things, return_index=True)[1]
         first = first[
             np.argsort(-verified.belief[verified.things[first]], kind="stable")

@@ -1,4 +1,4 @@
-"""The memory of taught things: what each looks like, and how likely a view is given each."""
+"""The memory of taught things: their stored views, and the likelihood of a view given each."""
 
 import hashlib
 from collections.abc import Sequence
@@ -23,37 +23,36 @@ from nextview.things.approximate import NearestViews, is_large
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.types import Float32, Floats, Index
 
-RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
-AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
+RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the stored views, degrees
+AZIMUTHS = 16  # stored views on a ring: the azimuth bins of a memory
 THING_PICTURE = 64  # side of the picture of a thing, pixels
-# of a thing, metres; nothing as large is looked at from around
+# metres: a camera cannot go around a larger thing
 LARGEST_THING_RADIUS = 1e4
-# in the file of a memory, of a thing whose unit of length is not known: NaN would be damage
+# entry of a memory file for an unknown radius: NaN would mean damage
 NO_RADIUS = 0.0
-LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
+LARGEST_LOGIT = 700.0  # largest logit of a head: the exponential of more overflows
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What T things look like, each in one or more resting poses: H of these, sorted by class.
+    """Stored appearance of T things in H resting poses, sorted by class.
 
-    Things whose geometry is known, each of a class of its own, are recognised by it alone: their
-    memory holds no embeddings, and F and K are 0.
+    Geometry alone recognises things of known size that are each a class of their own. Their memory
+    contains no embeddings, and F and K are 0.
 
     Attributes:
-        views: Embedding of each remembered view, unit vectors, (H, rings, azimuths, F); zero where
-            nothing is remembered.
-        thing: Which thing each resting pose is of, ascending, (H,) int64.
-        rotations: Of each resting pose, from the file's axes, (H, 3, 3) float32.
-        held_out: Embeddings of views through a sensor that are not remembered, K of each thing in
-            one of its resting poses, (T, K, F): what calibration and reports are made of. Zero
-            where nothing was seen.
-        held_out_views: Elevation and azimuth of each of these, radians, (T, K, 2) float32.
-        radii: Object radius of each thing, metres, (T,) float32; NaN where it is not known.
+        views: Embeddings of the stored views, unit vectors, (H, rings, azimuths, F); zero for a
+            missing view.
+        thing: Thing of each resting pose, ascending, (H,) int64.
+        rotations: Rotation from the axes of the file to each resting pose, (H, 3, 3) float32.
+        held_out: Embeddings of K held-out views of each thing through a sensor, in one of its
+            resting poses, (T, K, F), for calibration and reports; zero where nothing was visible.
+        held_out_views: Elevation and azimuth of each held-out view, radians, (T, K, 2) float32.
+        radii: Object radius of each thing, metres, (T,) float32; NaN if unknown.
         pictures: A picture of each thing, (T, 64, 64) uint8.
         head: Weights of a linear classifier of embeddings for classes of several things, (F, C).
-        head_bias: What it adds for each class, (C,).
-        surfaces: Of the things, in metres, in the frames of their scan files.
+        head_bias: Its biases, (C,).
+        surfaces: Surfaces of the things, in metres, in the frames of their scan files.
     """
 
     views: Floats
@@ -73,11 +72,11 @@ class Memory:
 
     @property
     def has_features(self) -> bool:
-        """Whether it holds embeddings of views."""
+        """Whether the memory contains embeddings of views."""
         return self.views.shape[-1] > 0
 
     def _check_shapes(self) -> None:
-        """See that all arrays are finite numbers of the right kinds, and that their shapes fit."""
+        """Check that all arrays are finite, and that their types and shapes agree."""
         check_array("its thing", self.thing, np.integer, (None,))
         check_array("its radii", self.radii, np.floating, (None,), finite=False)
         poses = len(self.thing)
@@ -102,7 +101,7 @@ class Memory:
         )
         held_out = self.held_out.shape[1]
         if (held_out > 0) != self.has_features:
-            raise ModelError("its held_out are of other features than its views")
+            raise ModelError("its held_out and its views have different features")
         check_array(
             "its held_out_views",
             self.held_out_views,
@@ -124,11 +123,9 @@ class Memory:
             )
 
     def _check_values(self) -> None:
-        """See that the numbers can be what they stand for."""
+        """Check that the values are valid."""
         if np.unique(self.thing).tolist() != list(range(len(self.radii))):
-            raise ModelError(
-                "its thing names things that are not there, or not all that are"
-            )
+            raise ModelError("its thing refers to missing things, or omits some")
         if (np.diff(self.thing) < 0).any():
             raise ModelError("its thing does not ascend")
 
@@ -141,7 +138,7 @@ class Memory:
         nameless = np.isnan(self.radii) & (self.surfaces.counts[:, 0] > 0)
         if nameless.any():
             raise ModelError(
-                "its radii lack that of a thing whose surface is known in metres"
+                "its radii lack the radius of a thing with a surface in metres"
             )
 
         head = self.head.astype(np.float64)
@@ -151,13 +148,13 @@ class Memory:
         )
         if largest.max() > LARGEST_LOGIT:
             raise ModelError(
-                f"its head says more than {LARGEST_LOGIT:g} of a view, which no chance has"
+                f"its head gives logits above {LARGEST_LOGIT:g}, whose exponentials overflow"
             )
 
         for name in ("views", "held_out"):
             lengths = np.linalg.norm(getattr(self, name).astype(np.float32), axis=-1)
             if (np.minimum(lengths, np.abs(lengths - 1)) > ROUNDED).any():
-                raise ModelError(f"its {name} are no unit vectors")
+                raise ModelError(f"its {name} are not unit vectors")
 
         rotations = self.rotations.astype(np.float64)
         products = rotations @ rotations.swapaxes(1, 2)
@@ -166,11 +163,11 @@ class Memory:
             and (np.linalg.det(rotations) > 0).all()
         )
         if not turned:
-            raise ModelError("its rotations are no rotations")
+            raise ModelError("its rotations are not rotation matrices")
 
         if not self.has_features and not (self.surfaces.counts[:, 0] > 0).all():
             raise ModelError(
-                "it holds neither views nor the surface of one of its things"
+                "it contains neither views nor a surface of one of its things"
             )
 
         if (np.abs(self.held_out_views[..., 0]) > np.pi / 2 + ROUNDED).any():
@@ -180,7 +177,7 @@ class Memory:
         """Write the memory to a .safetensors file, with embeddings in half precision.
 
         Args:
-            path: of the file.
+            path: path of the file.
             overwrite: whether to replace an existing file.
 
         Returns:
@@ -211,14 +208,14 @@ def read_memory(path: Path, sha256: str) -> Memory:
     """Read a file that ``Memory.save`` wrote.
 
     Args:
-        path: of the file.
-        sha256: that its content must have.
+        path: path of the file.
+        sha256: expected hash of its content.
 
     Returns:
         The memory.
 
     Raises:
-        ModelError: the file is missing, has another hash, is of an earlier version without
+        ModelError: the file is missing, has another hash, comes from an earlier version without
             geometry, or contains an invalid value.
     """
     content = checked_bytes(path, sha256, "a memory")
@@ -241,7 +238,7 @@ def read_memory(path: Path, sha256: str) -> Memory:
 
 
 def _radii_of(stored: Floats) -> Floats:
-    """The radii of a file, (T,); NaN where they are not known.
+    """The radii of a file, (T,); NaN where they are unknown.
 
     Raises:
         ModelError: they are no numbers.
@@ -255,18 +252,21 @@ def _radii_of(stored: Floats) -> Floats:
 
 
 def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
-    """The card of a memory of taught things and the memory itself, which fit together.
+    """Open the card of a memory of taught things and the memory, and check that they agree.
 
     Args:
-        model: The name of a bundled memory, or the path of a card.
+        model: name of a bundled memory, or the path of its card.
+
+    Returns:
+        The card and the memory.
 
     Raises:
-        ModelError: one of them is missing, damaged, of other features than those that the package
-            has now, or they do not fit together.
+        ModelError: one of them is missing or damaged, the memory uses other features than this
+            version of the package, or the two do not agree.
     """
     card = find_card(model)
     if card.memory is None:
-        raise ModelError(f"{card.card_path}: is no memory of things")
+        raise ModelError(f"{card.card_path}: is not a memory of things")
 
     features = find_card(FEATURE_NETWORK)
     if card.memory.features_sha256 not in (None, features.sha256):
@@ -288,7 +288,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
     if memory.has_features != has_features:
         holds = "holds" if memory.has_features else "holds no"
         raise ModelError(
-            f"{card.path}: {holds} features, and its card, {card.card_path}, says otherwise"
+            f"{card.path}: {holds} features, and its card, {card.card_path}, disagrees"
         )
     if memory.thing.tolist() != list(card.memory.poses):
         raise ModelError(
@@ -304,15 +304,15 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
 
 
 def check_features(card: ModelCard, memory: Memory, size: int) -> None:
-    """Check that the embeddings of a memory, if it holds any, have the size of the features.
+    """Check that the embeddings of a memory, if there are any, have the size of the features.
 
     Args:
-        card: of the memory, for messages.
+        card: card of the memory, for error messages.
         memory: the memory.
-        size: numbers of an embedding.
+        size: number of components of an embedding.
 
     Raises:
-        ModelError: they have another size.
+        ModelError: the sizes differ.
     """
     if memory.has_features and memory.views.shape[-1] != size:
         raise ModelError(
@@ -321,15 +321,15 @@ def check_features(card: ModelCard, memory: Memory, size: int) -> None:
 
 
 def similarities(views: Floats, embeddings: Floats, elevations: Floats) -> Float32:
-    """How alike views are to what is remembered, between two rings interpolated.
+    """Cosine similarities of views with the stored views, interpolated between two rings.
 
     Args:
-        views: of the memory, ring by ring, (rings, H * azimuths, F) float32.
-        embeddings: of the views, unit vectors, (B, F) float32.
-        elevations: from which the views were taken, radians, (B,).
+        views: stored views, ring by ring, (rings, H * azimuths, F) float32.
+        embeddings: embeddings of the views, unit vectors, (B, F) float32.
+        elevations: elevations of the views, radians, (B,).
 
     Returns:
-        Cosines, (B, H, azimuths) float32.
+        Similarities, (B, H, azimuths) float32.
     """
     shares = ring_shares(elevations)
     found = np.zeros((len(embeddings), views.shape[1]), np.float32)
@@ -341,21 +341,28 @@ def similarities(views: Floats, embeddings: Floats, elevations: Floats) -> Float
 
 
 def ring_shares(elevations: Floats) -> Float32:
-    """How much each ring counts for views from elevations, (B,), radians: (B, rings)."""
+    """Interpolation weights of the rings.
+
+    Args:
+        elevations: elevations of the views, radians, (B,).
+
+    Returns:
+        Weights, (B, rings) float32, at most two of which are positive for a view.
+    """
     place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
     shares = np.maximum(1 - np.abs(place[:, None] - np.arange(len(RINGS))), 0)
     return np.where(shares > 1e-6, shares, 0).astype(np.float32)
 
 
 class TaughtRecogniser(NetworkRecogniser):
-    """Recognises taught things in each view by what is remembered of them."""
+    """Recognises taught things in each view by comparison with their stored views."""
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
         """Open a memory.
 
         Args:
-            model: The name of a bundled memory, or the path of its card.
-            threads: That the features may take; 0 for all.
+            model: name of a bundled memory, or the path of its card.
+            threads: number of threads of the feature network; 0 for one on each core.
 
         Raises:
             ModelError: see ``open_memory``.
@@ -388,7 +395,14 @@ class TaughtRecogniser(NetworkRecogniser):
             )
 
     def by_shape(self, observations: Sequence[Observation]) -> Evidence:
-        """Return the evidence of B views by what is remembered of others; even without features."""
+        """Evidence of views by shape alone; uniform without features.
+
+        Args:
+            observations: B views.
+
+        Returns:
+            Their evidence.
+        """
         if self._features is None:
             return self._even(len(observations))
         return super().by_shape(observations)
@@ -398,14 +412,14 @@ class TaughtRecogniser(NetworkRecogniser):
         inputs: NDArray[Any],
         elevations: Floats | None = None,
     ) -> Evidence:
-        """Judge views by shape alone.
+        """Evidence of network inputs by shape alone.
 
         Args:
-            inputs: What the network takes, (B, ...).
-            elevations: Of the cameras, radians, (B,).
+            inputs: inputs of the feature network, (B, ...).
+            elevations: elevations of the cameras, radians, (B,).
 
         Returns:
-            Their evidence; even if the memory holds no features.
+            Their evidence; uniform if the memory contains no features.
 
         Raises:
             ModelError: the elevations are missing.
@@ -417,18 +431,18 @@ class TaughtRecogniser(NetworkRecogniser):
         return self.evidence(self._features(inputs), elevations)
 
     def _even(self, count: int) -> Evidence:
-        """Evidence of views that speaks for nothing."""
+        """Uniform evidence of some views."""
         return Evidence(np.zeros((count, len(self.classes)), np.float32))
 
     def evidence(self, embeddings: Floats, elevations: Floats) -> Evidence:
-        """Return the evidence of views by their embeddings.
+        """Evidence of views by their embeddings.
 
         Args:
             embeddings: unit vectors, (B, F).
-            elevations: of the cameras, radians, (B,).
+            elevations: elevations of the cameras, radians, (B,).
 
         Returns:
-            The evidence.
+            Their evidence.
         """
         assert self.card.memory is not None
         if self._nearest is None:
@@ -441,7 +455,14 @@ class TaughtRecogniser(NetworkRecogniser):
 
 
 def by_ring(views: Floats) -> Float32:
-    """Sort remembered views, (H, rings, azimuths, F), by ring: (rings, H * azimuths, F) float32."""
+    """Sort stored views by ring.
+
+    Args:
+        views: stored views, (H, rings, azimuths, F).
+
+    Returns:
+        The same views, (rings, H * azimuths, F) float32.
+    """
     h, rings, azimuths, f = views.shape
     return np.ascontiguousarray(
         views.swapaxes(0, 1).reshape(rings, h * azimuths, f),
@@ -450,7 +471,7 @@ def by_ring(views: Floats) -> Float32:
 
 
 def joined(clean: Floats, sensed: Floats) -> Float32:
-    """Return the mean of clean and sensed embeddings, which is what a memory holds.
+    """Mean of clean and sensed embeddings, as a memory stores it.
 
     Args:
         clean: embeddings of views without sensor errors, (..., F).

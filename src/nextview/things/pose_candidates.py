@@ -1,4 +1,4 @@
-"""What was found of poses, as a result gives it: each pose once, with how sure it is."""
+"""Candidate poses of a result: each distinct pose once, with its probability and uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,8 +14,8 @@ from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 from nextview.types import Index
 
-CAMERA_DIRECTIONS = 3  # along each of which a camera's place errs
-LEAST_PROBABILITY = 0.01  # of a pose that is named beside the likeliest one
+CAMERA_DIRECTIONS = 3  # axes along which the position of a camera is uncertain
+LEAST_PROBABILITY = 0.01  # smallest probability of a pose beside the likeliest one
 
 
 def candidates_of(
@@ -24,18 +24,18 @@ def candidates_of(
     observations: Sequence[Observation],
     labels: NDArray[np.integer],
 ) -> tuple[tuple[PoseCandidate, ...], float]:
-    """The poses that a thing may have, the likeliest first, in the object frame.
+    """Candidate poses of an object in the object frame, the likeliest first.
 
     Args:
-        things: what found them.
-        found: what they found.
-        observations: the views that they were asked with.
+        things: the taught things.
+        found: verification of the views.
+        observations: the verified views.
         labels: class of each of the things, (T,).
 
     Returns:
-        Different poses of one or several things, also those in which a nearly symmetric thing looks
-        almost the same; and by how much errors of the cameras' places displace them all,
-        millimetres, one standard deviation.
+        Distinct poses of one or several things, including those that differ by a near symmetry; and
+        the standard deviation of their common displacement by errors of the camera positions,
+        millimetres.
     """
     shown = [depth_view(observation, FINE_SIDE) for observation in observations]
     views = [view for view in shown if view is not None]
@@ -86,7 +86,10 @@ def _camera_error(
     observations: Sequence[Observation],
     views: Sequence[DepthView],
 ) -> float:
-    """By how much errors of the cameras' places displace a pose, millimetres; 0 for exact ones."""
+    """Standard deviation of a pose due to errors of the camera positions, millimetres.
+
+    It is 0 for exact cameras.
+    """
     if all(observation.exact for observation in observations):
         return 0.0
     variances = CAMERA_DIRECTIONS * verifier.prior.displaced(views) ** 2
@@ -99,7 +102,7 @@ def _deviations(
     views: Sequence[DepthView],
     rows: Index,
 ) -> list[tuple[float, float]]:
-    """Standard deviations of turn, degrees, and place, millimetres, of some hypotheses."""
+    """Standard deviations of rotation, degrees, and translation, millimetres, of hypotheses."""
     alignment = found.alignment(rows, verifier)
     covariances = pose_covariances(verifier.caster, alignment, views, verifier.prior)
     turns = np.degrees(np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)))

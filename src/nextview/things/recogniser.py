@@ -1,4 +1,4 @@
-"""Taught things as a recogniser: by features alone, or verified by their geometry."""
+"""Recogniser of taught things by features alone, or verified by their geometry."""
 
 from __future__ import annotations
 
@@ -24,38 +24,44 @@ from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 from nextview.types import Float, Floats, Index
 
-MADE = ("things", "in_any_orientation")  # of the memory, and lead back to it
+# derived attributes that refer back to the recogniser
+MADE = ("things", "in_any_orientation")
 NO_SCALE = "the scale of the views is not known in metres"
 
 
 class VerifiedRecogniser(TaughtRecogniser):
-    """Recognises taught things in all views together, by their geometry.
+    """Recognises taught things in all views jointly, by their geometry.
 
-    The evidence of single views, which policies use, comes from the memory's features and sizes.
+    The evidence of single views, which policies use, comes from the features and sizes of the
+    memory.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
-        """Open a memory that holds surfaces.
+        """Open a memory with surfaces.
 
         Args:
             model: name of a bundled memory, or the path of its card.
-            threads: of ONNX Runtime, 0 for one on each core.
+            threads: number of threads of ONNX Runtime, 0 for one on each core.
 
         Raises:
-            ModelError: see ``open_memory``, or the memory knows no geometry.
+            ModelError: see ``open_memory``, or the memory contains no geometry.
         """
         super().__init__(model, threads)
         self.prior = RegistrationPrior()
-        # now: what is wrong with it is said when it is opened, and the first frame does not wait
+        # prepared now: errors appear when the memory is opened, and the first frame is not delayed
         self.things.verifier.prepare(threads)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what is made of the memory, and leads back to it."""
+        """The attributes without those that are derived and refer back to the recogniser."""
         return {name: value for name, value in vars(self).items() if name not in MADE}
 
     @cached_property
     def things(self) -> TaughtThings:
-        """The things whose geometry is known, ready to be compared with what is seen."""
+        """The things of known geometry, ready for verification.
+
+        Raises:
+            ModelError: the memory contains no geometry.
+        """
         found = TaughtThings.of(self)
         if found is None:
             raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
@@ -63,11 +69,14 @@ class VerifiedRecogniser(TaughtRecogniser):
         return found
 
     def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
-        """The same for cameras whose poses are known this well.
+        """The same recogniser for cameras with another pose accuracy.
 
         Args:
-            place: standard deviation of a camera's place along each axis, metres.
-            aim: of the direction in which it looks, radians.
+            place: standard deviation of the position of a camera along each axis, metres.
+            aim: standard deviation of its viewing direction, radians.
+
+        Returns:
+            A copy that shares the memory.
         """
         other = copy(self)
         vars(other).pop("in_any_orientation", None)
@@ -77,14 +86,14 @@ class VerifiedRecogniser(TaughtRecogniser):
 
     @cached_property
     def in_any_orientation(self) -> VerifiedRecogniser:
-        """The same for things that may be held or fly: the ground does not count."""
+        """The same recogniser for things in a gripper or in the air: the ground is ignored."""
         tilted = copy(self)
         tilted.things = self.things.in_any_orientation()
         return tilted
 
     @cached_property
     def labels(self) -> Index:
-        """Class of each thing whose geometry is known, (T,) int64."""
+        """Class of each thing of known geometry, (T,) int64."""
         of_hypotheses = np.array(self.calibration.hypotheses)[self.things.rows]
         labels = np.zeros(len(self.things.names), np.int64)
         labels[self.things.owners] = of_hypotheses
@@ -96,23 +105,23 @@ class VerifiedRecogniser(TaughtRecogniser):
         total: Floats,
         counted: int,
     ) -> JointBelief:
-        """What is believed of an object by all views of it.
+        """Belief about an object, given all its views.
 
         Args:
-            observations: the views, in one object frame; something is seen in each.
+            observations: the views, in one object frame; each shows the object.
             total: sum of their log-evidence, (D,).
-            counted: how many they are.
+            counted: number of views.
 
         Returns:
-            The belief in each class and the poses. By features alone, with the reason why, where
-            the scale is not known, or all that is likely has no known geometry.
+            The belief in each class and the candidate poses. If the scale is not known, or no
+            likely thing has known geometry, the belief by features alone and the reason.
         """
         classes = len(self.classes)
         alone = self.calibration.belief(total, counted, classes)
         if any(observation.radius is None for observation in observations):
             return self._unexplained(alone, NO_SCALE)
 
-        of_things = None  # by features and size
+        of_things = None  # belief by features and size
         others = np.zeros(classes)
         if self.memory.has_features:
             joint = self.calibration.joint(total, counted, classes, np.zeros(()))
@@ -122,6 +131,7 @@ class VerifiedRecogniser(TaughtRecogniser):
             np.add.at(others, list(self.calibration.hypotheses), of_hypotheses)
             if of_things.sum() <= 0:
                 return self._unexplained(alone, self._no_geometry(alone))
+
         try:
             found = self.things.judge(observations, of_things)
         except ObservationError as error:
@@ -129,7 +139,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         return self._believed(observations, found, others)
 
     def _unexplained(self, belief: Float, why: str) -> JointBelief:
-        """A belief by features and size, which is not confident where there are no features."""
+        """A belief by features and size; it is not confident if the memory has no features."""
         doubt = "" if self.memory.has_features else why
         return JointBelief(belief, why_no_pose=why, doubt=doubt)
 
@@ -139,10 +149,10 @@ class VerifiedRecogniser(TaughtRecogniser):
         found: Verified,
         others: Float,
     ) -> JointBelief:
-        """The belief in classes that follows from that in things.
+        """Convert the belief in things to a belief in classes.
 
-        Geometry decides among the things whose surfaces are known. What features and size believe
-        of all others, (classes,), stays.
+        Geometry decides among the things with known surfaces. The belief by features and size in
+        all others, (classes,), stays.
         """
         belief = others.copy()
         np.add.at(belief, self.labels, (1 - others.sum()) * found.belief)
@@ -161,6 +171,7 @@ class VerifiedRecogniser(TaughtRecogniser):
             observations,
             self.labels,
         )
+
         doubt = doubt_of(
             found,
             poses,
@@ -181,26 +192,26 @@ class VerifiedRecogniser(TaughtRecogniser):
         observations: Sequence[Observation],
         joint: JointBelief,
     ) -> Outlook | None:
-        """What is known when the next view is to be chosen.
+        """The state from which the next view is chosen.
 
         Args:
-            observations: the views, in one object frame; something is seen in each.
-            joint: what ``together`` said of them.
+            observations: the views, in one object frame; each shows the object.
+            joint: result of ``together`` for them.
 
         Returns:
-            The leading hypotheses and their surroundings; None where geometry said nothing.
+            The leading hypotheses and their surroundings; None without a verification by geometry.
         """
         if not isinstance(joint.found, Verified):
             return None
         return Outlook.of(self.things.verifier, joint.found, observations)
 
     def _no_geometry(self, belief: Float) -> str:
-        """Why there is no pose of the class believed most, in words."""
+        """Explain why the likeliest class has no pose."""
         return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
 
 
 def _most_pixels(observations: Sequence[Observation]) -> int:
-    """Pixels of a frame that show the thing, in the frame that shows most of it."""
+    """Number of pixels of the object in the frame that shows most of it."""
     counts = [
         int(one.depth.astype(bool).sum()) for one in observations if one.scene is None
     ]
@@ -214,11 +225,14 @@ def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
     """Open a recogniser, or a memory of taught things.
 
     Args:
-        model: The name of a bundled model, or the path of a card.
-        threads: That the network may take; 0 for all.
+        model: name of a bundled model, or the path of its card.
+        threads: number of threads; 0 for one on each core.
+
+    Returns:
+        The recogniser that the card describes.
 
     Raises:
-        ModelError: it is missing or damaged.
+        ModelError: the model is missing or damaged.
     """
     if find_card(model).memory is None:
         return NetworkRecogniser(model, threads)

@@ -1,11 +1,11 @@
-"""Align surfaces with all views of a thing at once, many hypotheses at a time.
+"""Registration of surfaces with all views of a thing at once, for many hypotheses.
 
-Every hypothesis is a surface in some pose. A Gauss-Newton step casts the rays of all views at it,
-and draws it towards what was measured: along the surface's normals where the ray meets it and a
+Each hypothesis is a surface in a pose. A Gauss-Newton step casts the rays of all views at it and
+minimises two kinds of residuals: along the normal of the surface, where the ray meets it and a
 depth was measured (point to plane, Chen and Medioni, "Object modelling by registration of multiple
-range images", 1992, projected along the ray as in Blais and Levine 1995), and within the image
-where it sticks out of the thing's outline. Weights are robust (Cauchy), and come down from coarse
-to fine. A prior holds the error of each camera's place near zero.
+range images", 1992, with correspondences along the ray as in Blais and Levine 1995), and in the
+image plane, where the hypothesis exceeds the outline of the thing. Robust weights (Cauchy) have a
+scale that decreases from coarse to fine. A prior limits the position error of each camera.
 """
 
 from collections.abc import Sequence
@@ -28,31 +28,31 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 TURN = slice(0, 3)
 PLACE = slice(3, 6)
 POSE = 6
-"""Unknowns of a step: turn and place of a hypothesis; the errors of the cameras follow."""
+"""Unknowns of a step: rotation and translation of a hypothesis; the camera errors follow."""
 
-FREE_WEIGHT = 1e-3  # weight of one that nothing is known of
-SHIFT_LIMIT = 0.25  # radii that a step moves a hypothesis at most
-TURN_LIMIT = 0.3  # radians that a step turns it at most
+FREE_WEIGHT = 1e-3  # weight of the prior of an unknown without prior knowledge
+SHIFT_LIMIT = 0.25  # largest translation of a step, radii
+TURN_LIMIT = 0.3  # largest rotation of a step, radians
 TURN_TOLERANCE = np.radians(3.0)
 PLACE_TOLERANCE = 0.03  # radii
-"""Hypotheses of one thing that are not farther apart are one."""
+"""Hypotheses of one thing within both tolerances are duplicates."""
 
 
-# metres: a camera that stands as exactly as that is held in its place
+# lower bound of a camera's position error, metres: a more accurate camera counts as exact
 LEAST_CAMERA_ERROR = 1e-4
 
 
 @dataclass(frozen=True)
 class RegistrationPrior:
-    """How far off things may be before anything was aligned: standard deviations.
+    """Standard deviations of the unknowns before the registration.
 
     Attributes:
         tilt: of the vertical, radians.
         place: of the centre, object radii.
-        camera: of the place of each camera, metres.
-        aim: of the direction in which each camera looks, radians. It displaces what is seen by so
-            many times the distance, and is aligned as an error of the camera's place.
-        pixels: how many pixels of a view are as good as so many that err independently.
+        camera: of the position of each camera, metres.
+        aim: of the viewing direction of each camera, radians. It displaces the thing by this angle
+            times the distance, and is estimated as an error of the camera position.
+        pixels: effective number of independent pixels of a view.
     """
 
     tilt: float = 0.04
@@ -62,30 +62,40 @@ class RegistrationPrior:
     pixels: float = 60.0
 
     def for_cameras(self, place: float, aim: float) -> "RegistrationPrior":
-        """The same for cameras of another accuracy.
+        """The same prior for cameras with another pose accuracy.
 
         Args:
-            place: standard deviation of the place of each camera along each axis, metres.
-            aim: of the direction in which it looks, radians.
+            place: standard deviation of the position of each camera along each axis, metres.
+            aim: standard deviation of its viewing direction, radians.
+
+        Returns:
+            The prior.
         """
         return replace(self, camera=max(place, LEAST_CAMERA_ERROR), aim=aim)
 
     def displaced(self, views: Sequence[DepthView]) -> Float:
-        """How far off each view may see the thing along each axis, (V,) float64, metres."""
+        """Standard deviation of the displacement of the thing in each view along each axis.
+
+        Args:
+            views: V views of the thing.
+
+        Returns:
+            Standard deviations, (V,) float64, metres.
+        """
         distances = np.array([np.linalg.norm(view.origin) for view in views])
         return np.hypot(self.camera, self.aim * distances)
 
 
 @dataclass(frozen=True)
 class Level:
-    """Some steps of a registration, and how far off the hypotheses still are.
+    """Some steps of a registration, and the expected residuals of the hypotheses.
 
-    A pixel that deviates by as much counts half.
+    A pixel with a residual of this size has half weight.
 
     Attributes:
-        steps: how many.
-        off: by which part of its radius a surface is off.
-        displaced: by which part of what it may be a view is still displaced.
+        steps: number of steps.
+        off: expected error of a surface, relative to its radius.
+        displaced: remaining displacement of a view, relative to its prior.
     """
 
     steps: int
@@ -93,11 +103,14 @@ class Level:
     displaced: float
 
     def reach(self, radii: Float32, displaced: float) -> Float32:
-        """Deviation to be expected of each hypothesis, (H,) float32, metres, without noise.
+        """Expected residual of each hypothesis without noise.
 
         Args:
-            radii: of the surfaces of the hypotheses, (H,), metres.
-            displaced: how far off the view may see them, metres.
+            radii: radii of the surfaces of the hypotheses, (H,), metres.
+            displaced: standard deviation of their displacement in the view, metres.
+
+        Returns:
+            Residuals, (H,) float32, metres.
         """
         return np.hypot(self.off * radii, np.float32(self.displaced * displaced))
 
@@ -114,9 +127,9 @@ class Alignment:
     Attributes:
         things: number of the surface of each hypothesis, (H,) int64.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3) float64.
-        centres: where the centre of the surface lies, (H, 3) float64.
-        cameras: by how much each view sees the thing displaced, because of an error of the camera's
-            place, (H, V, 3) float64.
+        centres: positions of the centres of the surfaces, (H, 3) float64.
+        cameras: displacement of each hypothesis in each view by the error of the camera position,
+            (H, V, 3) float64.
     """
 
     things: Index
@@ -125,10 +138,13 @@ class Alignment:
     cameras: Float
 
     def turned(self, rotation: Float) -> "Alignment":
-        """The same in an object frame that is turned about its origin.
+        """The same poses in an object frame that is rotated about its origin.
 
         Args:
-            rotation: from the axes so far to the new ones, (3, 3).
+            rotation: from the old axes to the new axes, (3, 3).
+
+        Returns:
+            The rotated poses.
         """
         return replace(
             self,
@@ -142,7 +158,14 @@ class Alignment:
         return len(self.things)
 
     def select(self, rows: NDArray) -> "Alignment":
-        """Some of the hypotheses, by index or mask."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices or mask.
+
+        Returns:
+            The selected hypotheses.
+        """
         return Alignment(
             things=self.things[rows],
             rotations=self.rotations[rows],
@@ -151,7 +174,14 @@ class Alignment:
         )
 
     def poses(self, caster: SurfaceCaster) -> Float:
-        """Poses of the scan files' frames in the object frame, (H, 4, 4) float64, metres."""
+        """Poses of the scan files' frames in the object frame.
+
+        Args:
+            caster: all surfaces.
+
+        Returns:
+            Poses, (H, 4, 4) float64, metres.
+        """
         poses = np.tile(np.eye(4), (len(self), 1, 1))
         poses[:, :3, :3] = self.rotations
         own_centres = caster.centres[self.things].astype(np.float64)
@@ -168,7 +198,10 @@ def joined(first: Alignment, second: Alignment) -> Alignment:
 
     Args:
         first: H hypotheses.
-        second: K more.
+        second: K hypotheses.
+
+    Returns:
+        H + K hypotheses.
     """
     parts = {
         field.name: np.concatenate(
@@ -185,16 +218,16 @@ def start(
     centres: Float,
     views: int,
 ) -> Alignment:
-    """Hypotheses before anything is aligned.
+    """Initial alignment of hypotheses.
 
     Args:
         things: number of the surface of each, (H,) int.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3).
-        centres: of the surfaces in the object frame, (H, 3), metres.
-        views: how many views there are.
+        centres: centres of the surfaces in the object frame, (H, 3), metres.
+        views: number of views.
 
     Returns:
-        The hypotheses, with no error of any camera.
+        The hypotheses, with exact cameras.
     """
     return Alignment(
         things=np.asarray(things, np.int64),
@@ -204,27 +237,34 @@ def start(
     )
 
 
-SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
-# and a part of its radius: large things are scanned less exactly
+SCAN_ERROR = 0.0007  # standard deviation of a scan from the thing, metres
+# the same relative to the radius: scans of large things are less accurate
 RELATIVE_SCAN_ERROR = 0.005
-SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
-# deviations of the noise at which a pixel counts half, however fine the level
+SUNK = 0.005  # tolerated depth below the ground beside the errors of the scan, metres
+# standard deviations of the noise at which a pixel has half weight, at any level
 NOISE_REACH = 2.0
 
 
 def scan_errors(radii: Float32 | float) -> Floats:
-    """Deviation of surfaces of these radii, metres, from the things themselves, metres."""
+    """Standard deviation of scans from the things.
+
+    Args:
+        radii: radii of the surfaces, metres.
+
+    Returns:
+        Standard deviations, metres.
+    """
     return np.hypot(SCAN_ERROR, RELATIVE_SCAN_ERROR * radii)
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """What one view would see of H hypotheses, object frame, metres.
+    """Rendering of H hypotheses in one view, object frame, metres.
 
     Attributes:
-        depth: (H, P) float32, infinity where a hypothesis does not show.
-        normals: towards the camera, (H, P, 3) float32.
-        radii: of the surfaces, (H,) float32.
+        depth: depth of each hypothesis, (H, P) float32, infinity where it is absent.
+        normals: surface normals towards the camera, (H, P, 3) float32.
+        radii: radii of the surfaces, (H,) float32.
     """
 
     depth: Float32
@@ -232,7 +272,14 @@ class Rendered:
     radii: Float32
 
     def sunk(self, view: DepthView) -> Mask:
-        """Where a hypothesis shows below the ground, (H, P) bool: nothing can be there."""
+        """Pixels where a hypothesis lies below the ground, which is impossible.
+
+        Args:
+            view: the rendered view.
+
+        Returns:
+            Mask, (H, P) bool.
+        """
         if view.ground is None:
             return np.zeros(self.depth.shape, bool)
         shows = np.isfinite(self.depth)
@@ -244,22 +291,36 @@ class Rendered:
 
     @property
     def errors(self) -> Float32:
-        """Deviation of each surface from the thing itself, (H,) float32, metres."""
+        """Standard deviation of each surface from the thing, (H,) float32, metres."""
         return scan_errors(self.radii).astype(np.float32)
 
     def hidden(self, view: DepthView) -> Mask:
-        """Where something else stands before a hypothesis, (H, P) bool."""
+        """Pixels where something else occludes a hypothesis.
+
+        Args:
+            view: the rendered view.
+
+        Returns:
+            Mask, (H, P) bool.
+        """
         before = self.depth - self._apart(view)
         return (view.kind == ELSEWHERE) & (view.depth < before)
 
     def seen_behind(self, view: DepthView) -> Mask:
-        """Where something is measured behind a hypothesis that should hide it, (H, P) bool."""
+        """Pixels with a measurement behind a hypothesis, which should occlude it.
+
+        Args:
+            view: the rendered view.
+
+        Returns:
+            Mask, (H, P) bool.
+        """
         shows = np.isfinite(self.depth)
         behind = np.where(shows, self.depth, 0) + self._apart(view)
         return shows & (view.kind == ELSEWHERE) & (view.depth > behind)
 
     def _apart(self, view: DepthView) -> Float32:
-        """Metres from which on depth is before or behind the hypotheses, (H, P)."""
+        """Smallest significant depth difference to the hypotheses, (H, P), metres."""
         return np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]
 
 
@@ -272,13 +333,13 @@ def render(
     """Cast the rays of a view at all hypotheses.
 
     Args:
-        caster: of all surfaces.
+        caster: all surfaces.
         alignment: the hypotheses.
-        view: the view, which is the one of this ``number``.
-        number: decides which of the cameras' errors is its own.
+        view: the view.
+        number: index of the view, which selects its camera error.
 
     Returns:
-        What shows of each hypothesis alone, as if the others were not there.
+        Rendering of each hypothesis on its own, without the others.
     """
     centres = alignment.centres + alignment.cameras[:, number]
     from_centre = np.einsum("hji,hj->hi", alignment.rotations, view.origin - centres)
@@ -296,17 +357,17 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class Pulls:
-    """By how much, and in which direction, pixels of one view draw hypotheses: N pulls.
+    """N residuals of one view, each of which pulls a hypothesis in a direction.
 
     Attributes:
-        hypotheses: row of the hypothesis that is drawn, ascending, (N,) int64.
-        arms: from the centre of the hypothesis to what is drawn, (N, 3).
+        hypotheses: index of the hypothesis, ascending, (N,) int64.
+        arms: from the centre of the hypothesis to the point on its surface, (N, 3).
         directions: unit vectors, (N, 3).
-        distances: metres, (N,).
+        distances: residuals, metres, (N,).
         weights: inverse variances, (N,).
-        inside: how far within the outline of the thing the depth lies that draws, pixels of the
-            image, (N,); infinity where an outline draws.
-        count: of all hypotheses.
+        inside: distance of a depth pixel to the outline of the thing from inside, pixels of the
+            image, (N,); infinity for a residual of the outline.
+        count: number of hypotheses.
     """
 
     hypotheses: Index
@@ -318,7 +379,7 @@ class Pulls:
     count: int
 
 
-OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
+OUTLINE_PIXELS = 1.5  # standard deviation of an outline, pixels
 
 
 def pulls_of(
@@ -327,22 +388,24 @@ def pulls_of(
     centres: Float,
     reach: Float32,
 ) -> Pulls:
-    """Compute the pulls of one view on hypotheses.
+    """Compute the residuals of hypotheses in one view.
 
     Args:
         view: the view.
-        rendered: what it would show of the H hypotheses.
-        centres: of the hypotheses, (H, 3), object frame, metres.
-        reach: expected deviation of each hypothesis beside the noise, (H,), metres.
+        rendered: rendering of the H hypotheses in it.
+        centres: centres of the hypotheses, (H, 3), object frame, metres.
+        reach: expected residual of each hypothesis beside the noise, (H,), metres.
+
+    Returns:
+        The residuals.
     """
     shows = np.isfinite(rendered.depth)
-    # Where the thing was measured: along the normal.
+    # Depth was measured on the thing: residual along the normal.
     measured = shows & (view.kind == THING)
-    # Where the hypothesis shows, and the outline says that it does not: towards the outline.
+    # The hypothesis exceeds the outline of the thing: residual towards the outline.
     elsewhere = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
     beyond = elsewhere & ~(view.level & ~rendered.seen_behind(view))
-    # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
-    # drawn there.
+    # The hypothesis does not cover a thing pixel: its nearest pixel is pulled there.
     shows_somewhere = shows.any(1, keepdims=True)
     missing = ~shows & (view.kind == THING) & ~view.level & shows_somewhere
 
@@ -355,6 +418,7 @@ def pulls_of(
         hypotheses[absent],
         pixels[absent],
     )
+
     drawn = pixels.copy()
     drawn[absent] = nearest
     depth = rendered.depth[hypotheses, drawn]
@@ -391,7 +455,7 @@ def pulls_of(
     )
 
 
-FAR_ROW = 1_000_000  # in place of a row where a column has none
+FAR_ROW = 1_000_000  # placeholder for a column without a pixel
 
 
 def _nearest_shown(
@@ -400,15 +464,15 @@ def _nearest_shown(
     hypotheses: Index,
     pixels: Index,
 ) -> tuple[Index, Float32, Float32]:
-    """For N pixels the nearest one where a hypothesis, which shows somewhere, shows, (N,).
+    """Nearest pixel of a hypothesis to each of N pixels, (N,).
 
-    And the distance from there to the pixel, (N,), pixels of the image, and its direction, (N, 3),
-    object frame.
+    The hypothesis covers at least one pixel. The distance from there to the pixel, (N,), pixels of
+    the image, and its direction, (N, 3), object frame, are returned as well.
     """
     rows, columns = np.divmod(pixels, view.shape[1])
     some, image = np.unique(hypotheses, return_inverse=True)
     images = shows[some].reshape(-1, *view.shape)
-    # In each column the nearest row, then among these the nearest of all columns.
+    # The nearest row of each column, then the nearest column.
     every = np.arange(view.shape[0])[:, None]
     above = np.maximum.accumulate(np.where(images, every, -FAR_ROW), axis=1)
     from_below = np.where(images, every, FAR_ROW)[:, ::-1]
@@ -437,17 +501,17 @@ def align(
     levels: Sequence[Level],
     prior: RegistrationPrior = RegistrationPrior(),
 ) -> Alignment:
-    """Align hypotheses with all views at once.
+    """Register hypotheses with all views at once.
 
     Args:
-        caster: of all surfaces.
-        alignment: the hypotheses as they are so far.
+        caster: all surfaces.
+        alignment: initial hypotheses.
         views: the views, in the order of ``alignment.cameras``.
         levels: steps from coarse to fine.
-        prior: what is held near zero.
+        prior: prior of the unknowns.
 
     Returns:
-        The same hypotheses in better poses.
+        The same hypotheses in refined poses.
     """
     for level in levels:
         for _ in range(level.steps):
@@ -462,10 +526,10 @@ def _step(
     level: Level,
     prior: RegistrationPrior,
 ) -> Alignment:
-    """One Gauss-Newton step: turn, place and, with several views, the cameras' errors."""
+    """One Gauss-Newton step: rotation, translation and, with several views, the camera errors."""
     left, right = _equations(caster, alignment, views, level, prior)
-    # Damped: an outline that fits holds nothing in place, and few pixels beside it would move it
-    # farther than it can be off.
+    # Damped: an outline that fits gives no constraint, and a few pixels beside it would move the
+    # hypothesis by more than its possible error.
     farthest = level.reach(caster.radii[alignment.things], prior.displaced(views).max())
     for unknown in range(POSE):
         off = level.off if unknown < PLACE.start else farthest
@@ -494,7 +558,7 @@ def _equations(
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
     """Matrices, (H, U, U), and right-hand sides, (H, U), of a step with U unknowns."""
-    errors_too = len(views) > 1  # one camera's error is the same as one of the place
+    errors_too = len(views) > 1  # the error of a single camera equals a translation
     unknowns = POSE + 3 * len(views) if errors_too else POSE
     left = np.zeros((len(alignment), unknowns, unknowns))
     right = np.zeros((len(alignment), unknowns))
@@ -511,8 +575,7 @@ def _equations(
         left[:, :POSE, :POSE] += square
         right[:, :POSE] += towards
         if errors_too:
-            # A view that sees the thing displaced is the same, to itself, as a thing in another
-            # place.
+            # Within one view, a displacement by the camera error equals a translation of the thing.
             own = slice(POSE + 3 * number, POSE + 3 * number + 3)
             left[:, own, own] += square[:, PLACE, PLACE]
             left[:, :POSE, own] += square[:, :, PLACE]
@@ -531,14 +594,14 @@ def _equations(
 
 
 def different_poses(caster: SurfaceCaster, alignment: Alignment) -> Index:
-    """Leave out hypotheses that have come to the pose of an earlier one.
+    """Remove hypotheses that have converged to the pose of an earlier one.
 
     Args:
-        caster: of all surfaces.
+        caster: all surfaces.
         alignment: hypotheses, the best ones first.
 
     Returns:
-        Indices of those that are left, ascending.
+        Indices of the remaining hypotheses, ascending.
     """
     rotations = alignment.rotations.reshape(len(alignment), 9)
     apart = np.linalg.norm(alignment.centres[:, None] - alignment.centres, axis=-1)
@@ -559,21 +622,20 @@ def pose_covariances(
     views: Sequence[DepthView],
     prior: RegistrationPrior = RegistrationPrior(),
 ) -> Float:
-    """How well the views determine the poses of aligned hypotheses, given the cameras.
+    """Covariances of the poses of registered hypotheses, given the cameras.
 
-    It is the inverse of the matrix of a fine step, without what is unknown of the cameras. Where a
-    hypothesis lies right its outline draws it nowhere, but would if it were displaced: so the
-    outline is added.
+    They are the inverses of the matrices of a fine step without the camera errors. An outline that
+    fits has no residual, but would have one after a displacement, so its information is added.
 
     Args:
-        caster: of all surfaces.
-        alignment: the hypotheses, aligned.
+        caster: all surfaces.
+        alignment: the registered hypotheses.
         views: the views, in the order of ``alignment.cameras``.
-        prior: how far off things may be before anything was aligned.
+        prior: prior of the unknowns.
 
     Returns:
-        Covariances of turn, radians, about the centre of each surface, and place of that centre,
-        metres, both in the object frame, (H, 6, 6) float64.
+        Covariances of rotation, radians, about the centre of each surface, and position of that
+        centre, metres, both in the object frame, (H, 6, 6) float64.
     """
     level = FINE[-1]
     displaced = prior.displaced(views)
@@ -593,13 +655,19 @@ def pose_covariances(
 
 
 def inverses(information: Float) -> Float:
-    """Inverses of symmetric matrices, (H, N, N), none of which has a negative variance.
+    """Inverses of symmetric matrices without negative variances.
 
-    In single precision a direction that is hardly determined may get a zero or negative
-    eigenvalue: it counts as determined as little as that precision tells.
+    In single precision, a hardly determined direction may get a zero or negative eigenvalue. It is
+    raised to the resolution of single precision.
+
+    Args:
+        information: matrices, (H, N, N).
+
+    Returns:
+        Inverses, (H, N, N) float64.
     """
     scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE_WEIGHT))
-    # turns and places have other units
+    # rotations and translations have different units
     scaled = information / (scale[:, :, None] * scale[:, None])
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     values = np.maximum(values, np.finfo(np.float32).eps)
@@ -608,15 +676,18 @@ def inverses(information: Float) -> Float:
 
 
 def pulls_of_outline(view: DepthView, rendered: Rendered, centres: Float) -> Pulls:
-    """Compute the pulls that hold hypotheses in their right poses at the thing's outline.
+    """Compute the constraints of the outline of the thing on well registered hypotheses.
 
-    These are the pixels of the thing next to others where something farther, or nothing, shows:
-    the thing ends there, and is not hidden.
+    They come from thing pixels next to pixels with a larger depth or free background: the thing
+    ends there and is not occluded.
 
     Args:
         view: the view.
-        rendered: what it would show of the H hypotheses.
-        centres: of the hypotheses, (H, 3), object frame, metres.
+        rendered: rendering of the H hypotheses in it.
+        centres: centres of the hypotheses, (H, 3), object frame, metres.
+
+    Returns:
+        Constraints with zero residuals.
     """
     thing = (view.kind == THING).reshape(view.shape)
     depth = np.where(view.kind == NOT_MEASURED, 0, view.depth).reshape(view.shape)
@@ -634,6 +705,7 @@ def pulls_of_outline(view: DepthView, rendered: Rendered, centres: Float) -> Pul
     aside = in_image @ view.camera_axes[:, :2].T.astype(np.float32)
 
     hypotheses, pixels = np.nonzero(rim)
+
     depth = rendered.depth[hypotheses, pixels]
     points = view.origin.astype(np.float32) + view.rays[pixels] * depth[:, None]
     arms = points - centres.astype(np.float32)[hypotheses]
@@ -654,13 +726,13 @@ def _normal_equations(
     pulls: Pulls,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
+    """Normal equations of one view: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
     turning = np.cross(pulls.arms, pulls.directions)
     jacobian = np.concatenate(
         [turning, pulls.directions, pulls.distances[:, None]],
         axis=1,
     )
-    # Neighbouring pixels err together.
+    # The errors of neighbouring pixels are correlated.
     first = np.searchsorted(pulls.hypotheses, np.arange(pulls.count + 1))
     share = np.minimum(1, prior.pixels / np.maximum(np.diff(first), 1))
     weights = pulls.weights * share.astype(np.float32)[pulls.hypotheses]
@@ -680,14 +752,14 @@ def priors_of(
     displaced: Float | None,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Return weights that hold unknowns near zero, and their present values.
+    """Weights of the priors of the unknowns, and present values of the unknowns.
 
     Args:
-        caster: of all surfaces.
+        caster: all surfaces.
         alignment: H hypotheses.
-        displaced: standard deviation of the place in which each view sees them, (V,), metres; None
-            if the errors of the cameras are no unknowns.
-        prior: how far off things may be before anything was aligned.
+        displaced: standard deviation of the displacement in each view, (V,), metres; None if the
+            camera errors are no unknowns.
+        prior: prior of the unknowns.
 
     Returns:
         Weights and values, (H, unknowns) float64 each.
@@ -708,7 +780,14 @@ def priors_of(
 
 
 def rotations_of(vectors: Float) -> Float:
-    """Rotation matrices, (H, 3, 3), of rotation vectors, (H, 3), radians."""
+    """Rotation matrices of rotation vectors.
+
+    Args:
+        vectors: rotation vectors, (H, 3), radians.
+
+    Returns:
+        Rotation matrices, (H, 3, 3).
+    """
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(vectors).as_matrix()
@@ -719,12 +798,15 @@ def camera_cost(
     views: Sequence[DepthView],
     prior: RegistrationPrior = RegistrationPrior(),
 ) -> Float:
-    """Half the squared deviations of the cameras' places, (H, V) float64: a cost.
+    """Half the squared normalised camera errors.
 
     Args:
         alignment: the hypotheses.
         views: the views, in the order of ``alignment.cameras``.
-        prior: how far off cameras may be.
+        prior: prior of the camera errors.
+
+    Returns:
+        Costs, (H, V) float64.
     """
     squared = (alignment.cameras**2).sum(-1)
     return np.asarray(0.5 * squared / prior.displaced(views) ** 2, np.float64)

@@ -1,4 +1,4 @@
-"""Several collections at once: taught things by their geometry, and the classes of a network."""
+"""Several collections in one recogniser: memories of taught things, and classes of a network."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.types import Floats
 
-EXPLAINED = 0.02  # p-value from which on a scan explains what is seen
-OTHERS = 1e-3  # share of the belief that is left to all but the collection that answers
-LEAST_MODEL_BELIEF = 1e-12  # where the logarithm of a belief is taken
+EXPLAINED = 0.02  # p-value from which a scan explains the views
+OTHERS = 1e-3  # share of the belief for all collections except the one that answers
+LEAST_MODEL_BELIEF = 1e-12  # lower bound of a belief before its logarithm
 
 
 class SeveralRecognisers:
-    """Names a taught thing if its geometry explains what is seen; else the classes answer.
+    """Answers with a taught thing if its geometry explains the views, otherwise with a class.
 
     Attributes:
-        name: of all collections together.
-        classes: names of things and classes, those of each collection after the other. What two
-            collections know by one name is told apart by the name of the collection.
-        azimuth_bins: 0: collections tell apart azimuths of their own.
-        calibration: the plain sum; each collection has its own.
-        novelty: None: how novel an object is follows from all views together.
+        name: name of all collections together.
+        classes: names of things and classes, concatenated over the collections. A name that occurs
+            in two collections is followed by the name of its collection.
+        azimuth_bins: 0: each collection has its own azimuth bins.
+        calibration: the plain sum; each collection has its own calibration.
+        novelty: None: the novelty of an object follows from all views together.
         members: the recognisers, the memories before the network.
     """
 
@@ -44,14 +44,14 @@ class SeveralRecognisers:
     calibration: Calibration = PLAIN_SUM
 
     def __init__(self, members: dict[str, NetworkRecogniser]) -> None:
-        """Put collections together.
+        """Combine collections.
 
         Args:
-            members: by the names of the collections: memories of things with their geometry, and
-                at most one network, which comes last, however it is given.
+            members: recognisers by the names of their collections: memories of things with
+                geometry, and at most one network, which is moved to the end.
 
         Raises:
-            ModelError: two networks, no memory, or a memory without geometry.
+            ModelError: there are two networks, no memory, or a memory without geometry.
         """
         memories: dict[str, VerifiedRecogniser] = {}
         networks: dict[str, NetworkRecogniser] = {}
@@ -88,7 +88,9 @@ class SeveralRecognisers:
         self._novelties: WeakKeyDictionary[Observation, float] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what was said of observations so far, and what is made of the memories."""
+        """The attributes without the cached evidence of observations and without derived
+        recognisers.
+        """
         left_out = ("_said", "_novelties", "in_any_orientation")
         return {
             name: value for name, value in vars(self).items() if name not in left_out
@@ -103,7 +105,7 @@ class SeveralRecognisers:
 
     @cached_property
     def in_any_orientation(self) -> SeveralRecognisers:
-        """The same for things that may be held, lean or fly: they need not rest."""
+        """The same recogniser for things in a gripper, leaning or in the air."""
         tilted: dict[str, NetworkRecogniser] = {}
         for name, member in self._collections.items():
             if isinstance(member, VerifiedRecogniser):
@@ -113,11 +115,14 @@ class SeveralRecognisers:
         return SeveralRecognisers(tilted)
 
     def for_cameras(self, place: float, aim: float) -> SeveralRecognisers:
-        """The same for cameras whose poses are known this well.
+        """The same recogniser for cameras with another pose accuracy.
 
         Args:
-            place: standard deviation of a camera's place along each axis, metres.
-            aim: of the direction in which it looks, radians.
+            place: standard deviation of the position of a camera along each axis, metres.
+            aim: standard deviation of its viewing direction, radians.
+
+        Returns:
+            A copy that shares the memories.
         """
         members: dict[str, NetworkRecogniser] = {}
         for name, member in self._collections.items():
@@ -128,7 +133,14 @@ class SeveralRecognisers:
         return SeveralRecognisers(members)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """What each view speaks for, each collection being as likely: for policies alone."""
+        """Evidence of each view, with equal prior for each collection; only policies use it.
+
+        Args:
+            observations: the views.
+
+        Returns:
+            Their evidence.
+        """
         directions = np.stack(
             [direction_of(observation.pose) for observation in observations]
         )
@@ -154,12 +166,15 @@ class SeveralRecognisers:
         total: Floats,
         counted: int,
     ) -> JointBelief:
-        """What is believed of an object by all views of it.
+        """Belief about an object, given all its views.
 
         Args:
-            observations: the views, in one object frame; something is seen in each.
-            total: is not used: each collection sums its own evidence.
-            counted: how many they are.
+            observations: the views, in one object frame; each shows the object.
+            total: not used: each collection sums its own evidence.
+            counted: number of views.
+
+        Returns:
+            The belief in the classes of all collections, and the candidate poses.
         """
         unknown = [
             observation for observation in observations if observation not in self._said
@@ -195,11 +210,11 @@ class SeveralRecognisers:
         return self._placed(len(self.memories), joint)
 
     def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Any:
-        """Return what can be foreseen by the memory that answers.
+        """The state from which the memory that answers chooses the next view.
 
         Args:
             observations: the views.
-            joint: what they say together.
+            joint: result of ``together`` for them.
 
         Returns:
             The outlook; None if a class answers.
@@ -210,7 +225,7 @@ class SeveralRecognisers:
         return None if own is None else self.memories[member].outlook(observations, own)
 
     def _placed(self, member: int, joint: JointBelief) -> JointBelief:
-        """What one collection believes, as a belief in the classes of all."""
+        """Embed the belief of one collection in the classes of all."""
         sizes = [len(one.classes) for one in self.members]
         first = sum(sizes[:member])
         others = sum(sizes) - sizes[member]
@@ -231,7 +246,9 @@ class SeveralRecognisers:
         )
 
     def _p_value_of_class(self, observations: Sequence[Observation]) -> float | None:
-        """Share of objects of the network's classes that are as novel; None if it does not tell."""
+        """p-value of the novelty among objects of the network's classes; None without a novelty
+        score.
+        """
         network = self.network
         assert network is not None
         if not isinstance(network.novelty, Novelty):
@@ -248,12 +265,12 @@ class SeveralRecognisers:
 
 
 def _why_no_pose(joint: JointBelief) -> str:
-    """Why no taught thing is named, in words."""
+    """Explain why no taught thing is the answer."""
     return joint.why_no_pose or "it is a class, and none of the taught things"
 
 
 def _told_apart(classes: dict[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Names of all classes; what several collections know is followed by the collection."""
+    """Names of all classes; a name that occurs twice is followed by its collection."""
     every = [name for names in classes.values() for name in names]
     twice = {name for name in every if every.count(name) > 1}
     return tuple(

@@ -1,8 +1,8 @@
-"""How hypotheses stand: none reaches through the ground, and few float or would fall over.
+"""Physical plausibility of hypotheses: penetration of the ground, floating, and toppling.
 
-A thing at rest touches what carries it, and its centroid lies above what it touches. It touches the
-ground, or other things: measured points beside its outline that are not its own lie on its surface.
-Where no view shows whether the space below it is empty, something may carry it there too.
+A thing at rest touches its support, and its centroid lies above the contact area. It touches the
+ground or other things: measured points beside its outline, which belong to others, lie on its
+surface. Unobserved space below it may also contain a support.
 """
 
 from collections.abc import Sequence
@@ -15,25 +15,25 @@ from nextview.things.registration import SUNK, Alignment, Rendered, scan_errors
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Index, Mask
 
-# radians beyond a half turn in which nothing supports a thing that stands: its centroid lies on an
-# edge of what touches the ground, and is not known exactly
+# largest gap between contact directions beyond a half turn, radians: the centroid of a standing
+# thing may lie on an edge of the contact area, and is not known exactly
 LARGEST_OVERHANG = 0.2
-# pixels of the image around an outline in which cameras mix the depths on both of its sides
+# pixels around an outline in which cameras mix the depths of both sides
 MIXED = 3.0
-# part of the way from a corner to the middle, by which the corner is passed on its inner side
+# offset of a ray from a hull corner towards the centre, relative to their distance
 WITHIN = 0.05
-FEWEST_TOUCHED = 2  # pixels that show what carries a thing
+FEWEST_TOUCHED = 2  # fewest pixels that show a support
 
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """How H hypotheses stand on the ground, up to noise, tilt and errors of the scans.
+    """Stability of H hypotheses on the ground, up to noise, tilt and errors of the scans.
 
     Attributes:
-        below: share of the surface that lies below the ground, (H,) float64, 0 to 1.
-        depth: of the lowest point below the ground, (H,) float64, metres; 0 where nothing lies
+        below: share of the surface below the ground, (H,) float64, 0 to 1.
+        depth: depth of the lowest point below the ground, (H,) float64, metres; 0 if no point lies
             below it.
-        stands: whether it touches the ground, and would not fall over, (H,) bool; True where no
+        stands: whether the hypothesis touches the ground and does not topple, (H,) bool; True if no
             view shows the ground.
     """
 
@@ -42,7 +42,14 @@ class Stability:
     stands: Mask
 
     def select(self, rows: Index) -> "Stability":
-        """Some of the hypotheses, by index."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices, (N,).
+
+        Returns:
+            Stability of the selected hypotheses.
+        """
         return Stability(self.below[rows], self.depth[rows], self.stands[rows])
 
 
@@ -52,19 +59,19 @@ def standing(
     views: Sequence[DepthView],
     tilt: float,
 ) -> Stability:
-    """Measure what of hypotheses lies below the ground, visible or not, and which of them stand.
+    """Measure how far hypotheses penetrate the ground, and which of them stand on it.
 
-    Where views disagree on the ground, the lowest counts: the others show the top of something that
-    stands around the thing.
+    If views disagree on the ground, the lowest plane counts: the others show the top of something
+    beside the thing.
 
     Args:
-        caster: of all surfaces.
-        alignment: the hypotheses, in a frame that is level.
-        views: the views that show the ground, or not.
+        caster: all surfaces.
+        alignment: the hypotheses, in a level frame.
+        views: the views, with or without a ground.
         tilt: standard deviation of the vertical, radians.
 
     Returns:
-        How they stand; nothing speaks against any of them where no view shows the ground.
+        Stability of the hypotheses; all are stable if no view shows the ground.
     """
     below = np.zeros(len(alignment))
     depth = np.zeros(len(alignment))
@@ -102,20 +109,20 @@ def carried(
     rendered: Sequence[Rendered],
     rows: Index,
 ) -> Mask:
-    """Find which of some hypotheses, which do not stand on the ground alone, others carry.
+    """Find the hypotheses that other things support, among some that do not stand on the ground.
 
-    What carries them is measured beside their outlines, where none of their own surface shows: it
-    lies on their surface, up to the noise, the error of the scan and what cameras mix.
+    Supporting points are measured outside the outlines of a hypothesis and lie on its surface,
+    within the noise, the error of the scan and the mixed pixels of the camera.
 
     Args:
-        caster: of all surfaces.
-        alignment: the hypotheses, in a frame that is level.
-        views: of the thing.
-        rendered: the hypotheses in each view.
-        rows: which of the hypotheses are looked at.
+        caster: all surfaces.
+        alignment: the hypotheses, in a level frame.
+        views: views of the thing.
+        rendered: rendering of the hypotheses in each view.
+        rows: indices of the hypotheses to be examined.
 
     Returns:
-        Whether others carry each hypothesis, (H,) bool; False where that is not looked at.
+        Whether others support each hypothesis, (H,) bool; False for those that are not examined.
     """
     stable = np.zeros(len(alignment), bool)
     for row in rows:
@@ -129,6 +136,7 @@ def carried(
             of_others.append(touched[~level])
             of_ground.append(touched[level])
             low = low[~_seen_empty(low + displaced, view)]
+
         others = np.concatenate(of_others)
         seen = np.concatenate([others, *of_ground])
         below = np.count_nonzero(seen[:, 2] < 0)
@@ -152,25 +160,25 @@ def _touched(
     view: DepthView,
     beside: Mask,
 ) -> tuple[Float, Mask]:
-    """What a view shows of others on the surface of a hypothesis.
+    """Points of other objects in one view that touch the surface of a hypothesis.
 
     Args:
-        caster: of all surfaces.
+        caster: all surfaces.
         one: the hypothesis.
-        displaced: by how much the view sees it displaced, (3,), metres.
+        displaced: its displacement in the view, (3,), metres.
         view: the view.
-        beside: pixels in which the hypothesis does not show, (P,).
+        beside: pixels in which the hypothesis is absent, (P,).
 
     Returns:
-        Points from the centroid of the hypothesis, (N, 3), metres, and which of them are of the
-        ground, (N,).
+        Points relative to the centroid of the hypothesis, (N, 3), metres, and whether each belongs
+        to the ground, (N,).
     """
     surface = caster.surfaces[one.things[0]]
     others = beside & (view.kind == ELSEWHERE) & (view.edge > MIXED)
     others &= (view.depth > 0) & np.isfinite(view.depth)
     depth = view.depth[others].astype(np.float64)
     points = view.origin + view.rays[others] * depth[:, None] - displaced
-    # what is beside the outline is off by the pixels that are left out there, and by the grid's
+    # distance of the pixels beside the outline from it: the ignored pixels and the grid spacing
     apart = (view.step.max() + MIXED) * view.pitch * depth
     errors = SUNK + scan_errors(surface.radius) + HIDING_NOISE * view.noise[others]
     reach = np.asarray(np.hypot(apart, errors), np.float64)
@@ -184,10 +192,11 @@ def _touched(
 
 
 def _underside(caster: SurfaceCaster, one: Alignment) -> Float:
-    """Corners of the hull of a hypothesis below which nothing of it lies, (N, 3), metres."""
+    """Hull corners of a hypothesis without any part of it below them, (N, 3), metres."""
     surface = caster.surfaces[one.things[0]]
     down = -one.rotations[0, 2]
-    inwards = WITHIN * (surface.centre - surface.hull)  # not down along a vertical side
+    # avoids rays along a vertical side
+    inwards = WITHIN * (surface.centre - surface.hull)
     starts = (surface.hull + inwards + SUNK * down).astype(np.float32)
     rays = np.tile(down.astype(np.float32), (len(starts), 1, 1))
     free = ~np.isfinite(caster.depths(int(one.things[0]), starts, rays)[:, 0])
@@ -196,7 +205,7 @@ def _underside(caster: SurfaceCaster, one: Alignment) -> Float:
 
 
 def _seen_empty(corners: Float, view: DepthView) -> Mask:
-    """Below which corners, (N, 3), metres, a view sees that nothing is, (N,) bool."""
+    """Corners, (N, 3), metres, below which a view observes free space, (N,) bool."""
     below = (corners - (0, 0, SUNK) - view.origin) @ view.camera_axes
     slopes = (view.rays @ view.camera_axes).reshape(*view.shape, 3)
     ahead = np.maximum(below[:, 2], 1e-6)
@@ -210,17 +219,21 @@ def _seen_empty(corners: Float, view: DepthView) -> Mask:
 
 
 def _nearest(grid: Float, values: Float) -> Index:
-    """Which of some ascending slopes is nearest to each value; -1 for one beyond their ends."""
+    """Index of the nearest of some ascending slopes for each value; -1 beyond their ends."""
     middles = (grid[1:] + grid[:-1]) / 2
     inside = (values >= grid[0]) & (values <= grid[-1])
     return np.where(inside, np.searchsorted(middles, values), -1)
 
 
 def is_stable(touching: Float) -> bool:
-    """Whether a body would stay as it stands: its centroid lies above what it touches.
+    """Whether a body keeps its pose: its centroid lies above its contact area.
 
     Args:
-        touching: where it touches others, from its centroid, horizontally, (2 or 3, N), metres.
+        touching: contact points relative to the centroid, horizontal coordinates first, (2 or 3,
+            N), metres.
+
+    Returns:
+        True if it does not topple.
     """
     x, y = touching[:2]
     around = np.sort(np.arctan2(y, x))
@@ -229,6 +242,13 @@ def is_stable(touching: Float) -> bool:
 
 
 def ground_height(view: DepthView) -> float:
-    """Height of the ground of a view that shows it, below the middle of the object frame."""
+    """Height of the ground below the origin of the object frame.
+
+    Args:
+        view: a view with a ground.
+
+    Returns:
+        Height, metres; negative if the ground lies below the origin.
+    """
     assert view.ground is not None
     return -view.ground.offset / float(view.ground.normal[2])

@@ -1,4 +1,4 @@
-"""Surfaces as a file of taught things holds them: 16 bits a coordinate in the box of each thing."""
+"""Compact storage of surfaces: 16-bit coordinates in the bounding box of each thing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from nextview.errors import ModelError
 from nextview.things.surface import Surface
 from nextview.types import Float, Index
 
-BOX_STEPS = 65535  # of a box along each axis: 5 micrometres for a thing of 30 cm
-SHORT = 65536  # vertices of a thing whose indices need no more than 16 bits
-LARGEST_EXTENT = 1e4  # metres, of a box and of its distance from the origin
+BOX_STEPS = 65535  # steps of a box along each axis: 5 micrometres for a thing of 30 cm
+SHORT = 65536  # most vertices with 16-bit indices
+LARGEST_EXTENT = 1e4  # largest extent of a box, and distance from the origin, metres
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSurfaces:
-    """The surfaces of T things, one after the other.
+    """Surfaces of T things, concatenated.
 
     Attributes:
-        places: of all vertices, in steps of their thing's box, (V, 3) uint16.
-        faces: indices among the vertices of the thing, (F, 3) uint16 or uint32.
-        counts: number of vertices and of faces of each thing, (T, 2) int64; zero and zero where
-            its geometry is not known.
-        boxes: lowest corner and extents of the box around each thing, in the frame of its scan
+        places: coordinates of all vertices, in steps of the box of their thing, (V, 3) uint16.
+        faces: indices of vertices within the thing, (F, 3) uint16 or uint32.
+        counts: number of vertices and of faces of each thing, (T, 2) int64; zeros for unknown
+            geometry.
+        boxes: lowest corner and extents of the bounding box of each thing, in the frame of its scan
             file, (T, 2, 3) float64, metres.
     """
 
@@ -43,25 +43,25 @@ class StoredSurfaces:
         if (self.counts < 0).any() or (
             (self.counts == 0).any(1) != (self.counts == 0).all(1)
         ).any():
-            raise ModelError("its counts are not those of surfaces")
+            raise ModelError("its counts are not valid for surfaces")
         totals = (len(self.places), len(self.faces))
         if _sums(self.counts) != totals:
             raise ModelError("its counts do not add up to its places and faces")
 
         extents = self.boxes[:, 1]
         if (np.abs(self.boxes) > LARGEST_EXTENT).any() or (extents < 0).any():
-            raise ModelError("its boxes are not those of things")
+            raise ModelError("its boxes have invalid sizes or positions")
         if (extents[self.counts[:, 0] > 0].max(1) == 0).any():
-            raise ModelError("its boxes hold things without extent")
+            raise ModelError("its boxes contain things without extent")
 
         limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
         if (self.faces >= limits[:, None]).any():
-            raise ModelError("its faces name vertices that are not there")
+            raise ModelError("its faces refer to missing vertices")
         for thing in np.flatnonzero(self.counts[:, 0]).tolist():
             self._check_surface(thing)
 
     def _check_surface(self, thing: int) -> None:
-        """See that a surface fills its box and has an area: else nothing can be aligned with it."""
+        """Check that a surface fills its box and has an area, as the registration requires."""
         places, faces = self._of(thing)
         extents = self.boxes[thing, 1]
         steps = np.where(extents > 0, BOX_STEPS, 0)
@@ -73,7 +73,7 @@ class StoredSurfaces:
             raise ModelError("its faces have no area")
 
     def _of(self, thing: int) -> tuple[NDArray[np.uint16], NDArray[np.unsignedinteger]]:
-        """The places and the faces of a thing."""
+        """Coordinates and faces of a thing."""
         vertices, faces = self.counts[thing].tolist()
         vertex, face = self.counts[:thing].sum(0).tolist()
         return self.places[vertex : vertex + vertices], self.faces[face : face + faces]
@@ -83,10 +83,10 @@ class StoredSurfaces:
         """Store surfaces.
 
         Args:
-            surfaces: of each thing; None where its geometry is not known.
+            surfaces: surface of each thing; None for unknown geometry.
 
         Returns:
-            The same, rounded to the steps of their boxes.
+            The surfaces, rounded to the steps of their boxes.
         """
         places = [np.zeros((0, 3), np.uint16)]
         faces = [np.zeros((0, 3), np.uint32)]
@@ -124,11 +124,11 @@ class StoredSurfaces:
         """Restore the surface of a thing.
 
         Args:
-            thing: its number.
-            name: what it is called.
+            thing: number of the thing.
+            name: name of the thing.
 
         Returns:
-            Its surface; None if its geometry is not known.
+            The surface; None for unknown geometry.
         """
         places, faces = self._of(thing)
         if not len(places):
@@ -143,6 +143,6 @@ class StoredSurfaces:
 
 
 def _sums(counts: Index) -> tuple[int, int]:
-    """Sums of counts, (T, 2), of any size: Python's integers do not overflow."""
+    """Sums of counts, (T, 2); Python integers do not overflow."""
     vertices, faces = counts.T.tolist()
     return sum(vertices), sum(faces)

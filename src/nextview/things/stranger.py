@@ -1,15 +1,15 @@
-"""Whether views show a taught thing, or a stranger that has its shape in another size.
+"""Comparison of a taught thing with a stranger: a thing of the same shape in another size.
 
-The rival of a hypothesis is its own scan, stretched along the scan's axes: a box of other sides, a
-can of another height, a bottle with a wider belly. The stretch is estimated together with the pose,
-by the steps of the registration with three further unknowns. Then two priors are compared at this
-estimate: a taught thing is not stretched, but for the errors of its scan and of the camera's scale;
-a stranger is, by any amount that is usual. The ratio of the two probabilities is a Bayes factor
-(MacKay 2003, "Information theory, inference, and learning algorithms", chapter 28; the posterior
-is taken as normal, after Laplace).
+The rival of a hypothesis is its own scan, stretched along the axes of the scan: a box with other
+sides, a can of another height, a bottle with a wider belly. Steps of the registration with three
+further unknowns estimate the stretch together with the pose. Two priors are compared at this
+estimate: a taught thing has no stretch except for the errors of its scan and the scale error of the
+camera; a stranger has a stretch of any usual amount. The ratio of the two probabilities is a Bayes
+factor (MacKay 2003, "Information theory, inference, and learning algorithms", chapter 28), with a
+Laplace approximation of the posterior.
 
-Noise makes the estimate less certain, so that it says less for either. It cannot excuse an outline
-or a depth that is off in one direction over a whole side, as it can excuse a residual.
+Noise makes the estimate less certain and weakens the evidence for both. Unlike a residual, a
+systematic offset of an outline or a depth over a whole side has no explanation by noise.
 """
 
 from collections.abc import Sequence
@@ -42,40 +42,41 @@ from nextview.things.verification import PixelModel, likelihood
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float
 
-# of the things that a scan explains best: so many are another thing of its shape
+# prior probability that the best matching scan belongs to another thing of its shape
 STRANGERS = 1 / 3
-# deviation of the logarithm by which a stranger is stretched along each axis
+# standard deviation of a stranger's log-stretch along each axis
 UNLIKE = 0.2
-# by which part of its size a camera sees everything larger or smaller
+# relative scale error of a camera
 CAMERA_SCALE = 0.015
-# metres by which a thing that stands on the ground is seen above or below it
+# standard deviation of the height of a standing thing above the ground, metres
 BOTTOM_NOISE = 0.004
-ON_OTHERS = 0.1  # share of the things that stand on something else
-OTHERS_HEIGHT = 0.1  # metres of what these stand on: other things, books, trays
-# pixels of the image over which cameras mix depths on both sides of an outline: they match windows
+ON_OTHERS = 0.1  # share of the things that stand on other things
+# typical height of such a support, metres: other things, books, trays
+OTHERS_HEIGHT = 0.1
+# pixels over which cameras mix the depths of both sides of an outline, with window matching
 BLUR = 8.0
-LEAST_INSIDE = 0.1  # weight of a depth at the very outline, as a root
+LEAST_INSIDE = 0.1  # square root of the weight of a depth at the outline
 
 STRETCH = slice(POSE, POSE + 3)
 UNKNOWNS = POSE + 3
-"""Unknowns of a step: turn, place and stretch of the hypothesis; the cameras' errors follow."""
+"""Unknowns of a step: rotation, translation and stretch of the hypothesis, then camera errors."""
 
 STRETCH_LEVELS = (Level(5, 0.05, 0.5), Level(5, 0.02, 0.1))
-# logarithm by which a step stretches at most, and by which it is damped
+# largest log-stretch of a step, and scale of its damping
 STRETCH_STEP = 0.1
-UNTOLD = 1.0  # deviation of a stretch that the views tell nothing of
+UNTOLD = 1.0  # standard deviation of a stretch that the views do not determine
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What hypotheses are compared with, and how.
+    """Inputs of a comparison.
 
     Attributes:
-        caster: of all surfaces.
-        views: of the thing, in a frame that is level.
-        prior: how far off cameras and the vertical may be.
-        weights: how much pixels and errors of cameras count.
-        pixels: what pixels are like if a hypothesis is true.
+        caster: all surfaces.
+        views: views of the thing, in a level frame.
+        prior: prior of the cameras and the vertical.
+        weights: weights of pixels and camera errors.
+        pixels: model of the pixels.
     """
 
     caster: SurfaceCaster
@@ -90,22 +91,22 @@ class Stretched:
     """A hypothesis whose scan is stretched about the centre of its surface.
 
     Attributes:
-        alignment: the one hypothesis.
-        factors: along the axes of the scan file, (3,) float64.
+        alignment: the hypothesis.
+        factors: stretch along the axes of the scan file, (3,) float64.
     """
 
     alignment: Alignment
     factors: Float
 
     def render(self, comparison: Comparison, number: int) -> Rendered:
-        """Render it for a view.
+        """Render it in a view.
 
         Args:
-            comparison: with the views and the surfaces.
-            number: of the view.
+            comparison: the views and surfaces.
+            number: index of the view.
 
         Returns:
-            Depth and normals of the one hypothesis.
+            Depth and normals of the hypothesis.
         """
         view = comparison.views[number]
         aligned = self.alignment
@@ -128,9 +129,13 @@ class Stretched:
         return Rendered(depth, across.astype(np.float32), radii)
 
     def bottom(self, comparison: Comparison) -> tuple[float, Float] | None:
-        """Height of its lowest point above the ground, metres; None where no view shows the ground.
+        """Height of its lowest point above the ground, and its derivatives by the unknowns.
 
-        And how the height changes with each unknown of a step, (UNKNOWNS,).
+        Args:
+            comparison: the views and surfaces.
+
+        Returns:
+            Height, metres, and derivatives, (UNKNOWNS,); None if no view shows the ground.
         """
         grounds = [
             ground_height(one) for one in comparison.views if one.ground is not None
@@ -139,7 +144,7 @@ class Stretched:
             return None
         aligned = self.alignment
         surface = comparison.caster.surfaces[aligned.things[0]]
-        up = aligned.rotations[0, 2]  # in the axes of the scan
+        up = aligned.rotations[0, 2]  # up in the axes of the scan
         points = (surface.vertices - surface.centre) * self.factors
         heights = points @ up
         lowest = int(heights.argmin())
@@ -151,14 +156,14 @@ class Stretched:
 
 
 def log_odds_of_stranger(comparison: Comparison, alignment: Alignment) -> float:
-    """How much likelier a stranger of a thing's shape is than the thing, as a logarithm.
+    """Log-odds of a stranger of a thing's shape against the thing.
 
     Args:
         comparison: the views.
-        alignment: the one hypothesis that is likeliest, aligned with them.
+        alignment: the likeliest hypothesis, registered with them.
 
     Returns:
-        Log-odds, nats: positive where a stranger is likelier than the thing itself.
+        Log-odds, nats: positive if a stranger is likelier than the thing.
     """
     itself = Stretched(alignment, np.ones(3))
     rivals = [_fitted(comparison, itself, False)]
@@ -177,7 +182,7 @@ def log_odds_of_stranger(comparison: Comparison, alignment: Alignment) -> float:
 
 
 def _fitted(comparison: Comparison, rival: Stretched, standing: bool) -> Stretched:
-    """A rival stretched and moved to where it explains the views, drawn to the ground or not."""
+    """Register and stretch a rival, with or without a pull to the ground."""
     for level in STRETCH_LEVELS:
         for _ in range(level.steps):
             rival = _step(comparison, rival, level, standing)
@@ -190,23 +195,25 @@ def _step(
     level: Level,
     standing: bool,
 ) -> Stretched:
-    """One Gauss-Newton step, damped like those of the registration."""
+    """One Gauss-Newton step, damped as in the registration."""
     left, right = _equations(comparison, rival, level)
     aligned = rival.alignment
     right[STRETCH] -= np.log(rival.factors) / UNLIKE**2
     radii = comparison.caster.radii[aligned.things]
     farthest = level.reach(radii, comparison.prior.displaced(comparison.views).max())[0]
+
     damped = np.zeros(len(left))
     damped[TURN] = 1 / level.off**2
     damped[3:POSE] = 1 / farthest**2
     damped[STRETCH] = 1 / STRETCH_STEP**2 + 1 / UNLIKE**2
     left[np.diag_indices(len(left))] += damped
+
     ends = rival.bottom(comparison) if standing else None
     if ends is not None:
         height, change = ends
         weight = 1 / (
             BOTTOM_NOISE**2 + (height / 3) ** 2
-        )  # what stands on others is not held
+        )  # a robust weight: a thing on other things is not pulled to the ground
         left[:UNKNOWNS, :UNKNOWNS] += weight * np.outer(change, change)
         right[:UNKNOWNS] -= weight * height * change
 
@@ -232,8 +239,7 @@ def _equations(
 ) -> tuple[Float, Float]:
     """Matrix, (U, U), and right-hand side, (U,), without a prior of the stretch.
 
-    ``outlines`` says whether an outline that fits is added to the matrix: it would draw the
-    hypothesis, if that were displaced.
+    ``outlines`` adds the information of outlines that fit, which have no residual.
     """
     views = comparison.views
     aligned = rival.alignment
@@ -241,11 +247,12 @@ def _equations(
     of_cameras = 3 * len(views) if len(views) > 1 else 0
     left = np.zeros((UNKNOWNS + of_cameras, UNKNOWNS + of_cameras))
     right = np.zeros(len(left))
+
     for number, view in enumerate(views):
         rendered = rival.render(comparison, number)
         centres = aligned.centres + aligned.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
-        # A view that sees the thing displaced is the same, to itself, as a thing in another place.
+        # Within one view, a displacement by the camera error equals a translation of the thing.
         own = np.arange(UNKNOWNS)
         if of_cameras:
             own = np.append(own, UNKNOWNS + 3 * number + np.arange(3))
@@ -270,7 +277,7 @@ def _normal_equations(
     aligned: Alignment,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """What one view says of turn, place, stretch and, once more, of the place.
+    """Normal equations of one view for rotation, translation, stretch and camera error.
 
     Returns:
         Matrix, (UNKNOWNS + 3, UNKNOWNS + 3), and right-hand side, (UNKNOWNS + 3,).
@@ -280,7 +287,7 @@ def _normal_equations(
     turning = np.cross(pulls.arms, pulls.directions)
     columns = [turning, pulls.directions, along_axes, pulls.directions]
     jacobian = np.concatenate(columns, axis=1).astype(np.float64)
-    # Neighbouring pixels err together, and depths beside an outline are those of both its sides.
+    # The errors of neighbouring pixels are correlated, and depths beside an outline mix both sides.
     share = min(1, prior.pixels / max(len(jacobian), 1))
     clear = np.clip(pulls.inside / BLUR, LEAST_INSIDE, 1) ** 2
     weighted = jacobian * (share * pulls.weights * clear)[:, None]
@@ -292,10 +299,10 @@ def _best(
     itself: Stretched,
     rivals: Sequence[Stretched],
 ) -> Stretched:
-    """The most probable of the rivals that explain the views better than the thing itself.
+    """The most probable rival among those that explain the views better than the thing.
 
-    The thing itself where none does: what stands on others is not drawn to the ground, and fits
-    that ended in a worse place do not count.
+    The result is the unstretched thing if there is none: a thing on other things is not pulled to
+    the ground, and fits that ended in a worse optimum are discarded.
     """
     explained = [_explains(comparison, rival) for rival in (itself, *rivals)]
     best, highest = itself, -np.inf
@@ -322,11 +329,11 @@ def _explains(comparison: Comparison, rival: Stretched) -> float:
 
 
 def _estimate(comparison: Comparison, rival: Stretched) -> tuple[Float, Float]:
-    """What the views alone say of the stretch, and of the height of the bottom above the ground.
+    """Estimate of the stretch, and of the height above the ground, from the views alone.
 
     Returns:
-        Logarithms along three axes and, if the ground is seen, metres: mean, (3,) or (4,), and
-        covariance.
+        Mean, (3,) or (4,), and covariance of the log-stretch along three axes and, if the ground is
+        visible, of the height, metres.
     """
     left, right = _equations(comparison, rival, FINE[-1], outlines=True)
     left[STRETCH, STRETCH] += np.eye(3) / UNTOLD**2
@@ -347,8 +354,8 @@ def _estimate(comparison: Comparison, rival: Stretched) -> tuple[Float, Float]:
 def _log_density(found: Float, covariance: Float, stretch: Float) -> float:
     """Log-density of an estimate if the stretch is normal with some covariance, (S, S).
 
-    If there is one more number, it is the height of the bottom: most things stand on the ground,
-    some stand on others.
+    A further component is the height of the bottom: most things stand on the ground, some stand on
+    other things.
     """
     size = len(stretch)
     if len(found) == size:
@@ -363,7 +370,7 @@ def _log_density(found: Float, covariance: Float, stretch: Float) -> float:
 
 
 def _log_normal(values: Float, covariance: Float) -> float:
-    """Log-density of numbers, (N,), that are normal about zero."""
+    """Log-density of values, (N,), under a zero-mean normal distribution."""
     scaled = values @ np.linalg.solve(covariance, values)
     volume = np.linalg.slogdet(2 * np.pi * covariance)[1]
     return float(-0.5 * (scaled + volume))

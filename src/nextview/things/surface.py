@@ -1,4 +1,4 @@
-"""Surfaces of taught things, in metres, at which many rays can be cast in one call."""
+"""Surfaces of taught things in metres, with ray casting in batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import embree_scene
 from nextview.types import Float, Float32, Index
 
-# a simplified surface has at least so many triangles, if it had as many
+# fewest triangles after simplification, unless the scan has fewer
 FEWEST_FACES = 500
-# metres by which a simplified surface may be off: less than depth cameras measure
+# tolerated error of a simplified surface, metres: below the resolution of depth cameras
 FINEST_ERROR = 0.0004
-SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
-LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
-# points of a simplified surface that others are looked for beside
+SURFACE_SAMPLES = 2000  # sample points of the error of a simplified surface
+LARGEST_ERROR = 5.0  # largest tolerated error of any point, multiples of the tolerance
+# sample points of a simplified surface for nearest-neighbour queries
 NEARBY_SAMPLES = 50_000
-MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
+MISSED = np.float32(np.inf)  # depth along a ray without a hit
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface of one thing in its own frame, which is that of the scan file.
+    """The surface of one thing in the frame of its scan file.
 
     Attributes:
-        name: what the thing is called.
+        name: name of the thing.
         vertices: (V, 3) float32, metres, with the origin and the axes of the scan file.
         faces: (F, 3) int32, indices of the vertices.
     """
@@ -41,12 +41,12 @@ class Surface:
 
     @classmethod
     def from_mesh(cls, mesh: Mesh, name: str) -> "Surface":
-        """Take over a mesh whose unit is known.
+        """Convert a mesh of known unit.
 
         Args:
-            mesh: in the object frame; its ``centre`` and ``radius`` lead back to the frame of its
-                file.
-            name: what the thing is called.
+            mesh: mesh in the object frame; its ``centre`` and ``radius`` lead back to the frame of
+                its file.
+            name: name of the thing.
 
         Returns:
             The surface in metres, in the frame of the mesh file.
@@ -56,7 +56,7 @@ class Surface:
         """
         if mesh.unit is None:
             raise MeshError(
-                f"{mesh.name}: the unit of length is not known; say it with --unit"
+                f"{mesh.name}: the unit of length is not known; give --unit"
             )
 
         vertices = (mesh.vertices * mesh.radius + mesh.centre).astype(np.float32)
@@ -69,7 +69,7 @@ class Surface:
 
     @cached_property
     def hull(self) -> Float32:
-        """Corners of the convex hull, (N, 3) float32, metres; all vertices of what is flat."""
+        """Vertices of the convex hull, (N, 3) float32, metres; all vertices of a flat surface."""
         from scipy.spatial import ConvexHull, QhullError
 
         try:
@@ -84,7 +84,7 @@ class Surface:
 
     @cached_property
     def centroid(self) -> Float:
-        """Mean of all points of the surface, (3,) float64, metres, in the frame of the scan file.
+        """Centroid of the surface area, (3,) float64, metres, in the frame of the scan file.
 
         It lies on every axis of symmetry, and a small part hardly moves it.
         """
@@ -108,17 +108,17 @@ class Surface:
         return float(pdist(corners).max())
 
     def simplified(self, error: float = FINEST_ERROR) -> "Surface":
-        """Reduce the number of triangles as far as the surface stays the same to a depth camera.
+        """Reduce the number of triangles within the resolution of a depth camera.
 
-        The triangles are halved (quadric error metric, ``fast_simplification``) until 5 % of the
-        points on the original are no longer within ``error`` of the simplified surface, or one of
-        them is far from it; the last one that was near enough is taken.
+        Quadric error simplification (``fast_simplification``) halves the triangles repeatedly. It
+        stops before more than 5 % of the points on the original exceed ``error``, or one of them is
+        far from the simplified surface.
 
         Args:
-            error: metres by which the surface may be off.
+            error: tolerated error of the surface, metres.
 
         Returns:
-            A surface in the same frame, with fewer triangles or the same.
+            A surface in the same frame, with at most as many triangles.
         """
         from fast_simplification import simplify
 
@@ -139,12 +139,12 @@ class Surface:
 
     @cached_property
     def nearby(self) -> cKDTree:
-        """Points spread over the surface, ``spacing`` apart, to look up what lies beside it."""
+        """Search tree of points on the surface, about ``spacing`` apart."""
         return cKDTree(self.sample(SURFACE_SAMPLES, np.random.default_rng(0)))
 
     @property
     def spacing(self) -> float:
-        """Distance within which a point of ``nearby`` is usual, metres."""
+        """Typical distance between points of ``nearby``, metres."""
         return float(np.sqrt(self.area / SURFACE_SAMPLES))
 
     @cached_property
@@ -163,11 +163,11 @@ class Surface:
 
     @property
     def area(self) -> float:
-        """Square metres."""
+        """Area, square metres."""
         return float(self._areas.sum())
 
     def triangles_by_area(self, count: int, rng: np.random.Generator) -> Index:
-        """Draw triangles with probabilities in proportion to their areas.
+        """Draw triangles with probabilities proportional to their areas.
 
         Args:
             count: number of triangles.
@@ -179,11 +179,11 @@ class Surface:
         return rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
 
     def sample(self, count: int, rng: np.random.Generator) -> Float:
-        """Draw points that are spread evenly over the surface.
+        """Draw points uniformly on the surface.
 
         Args:
             count: number of points.
-            rng: decides where they lie.
+            rng: source of all random numbers.
 
         Returns:
             Points in the frame of the scan file, (count, 3) float64, metres.
@@ -193,19 +193,19 @@ class Surface:
         chosen = self.triangles_by_area(count, rng)
 
         shares = rng.random((count, 2))
-        # of the triangle, in the other half of the parallelogram
+        # points in the other half of the parallelogram are reflected
         outside = shares.sum(1) > 1
         shares[outside] = 1 - shares[outside]
         return corners[chosen, 0] + (shares[:, :, None] * edges[chosen]).sum(1)
 
 
 def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
-    """Whether a simplified surface is nowhere far from its original, and seldom off by the error.
+    """Whether a simplified surface stays close to its original.
 
-    Points are drawn evenly over the original, and as many on triangles of any size, which are most
-    numerous where there is detail. 95 % of each half have to lie within the error, along their
-    normals. And all have to lie within LARGEST_ERROR errors, along their normals or in any
-    direction: so a small part, such as a knob, is not lost.
+    Half of the sample points are uniform over the area of the original, half over its triangles,
+    which are most numerous where there is detail. 95 % of each half must lie within the error along
+    their normals. All must lie within LARGEST_ERROR errors, along their normals or in any
+    direction, so that no small part such as a knob is lost.
     """
     rng = np.random.default_rng(0)
     evenly = surface.triangles_by_area(SURFACE_SAMPLES, rng)
@@ -227,7 +227,7 @@ def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
         if np.quantile(half, 0.95, method="lower") > error:
             return False
 
-    # Along its normal a point at a crease may miss what is right beside it.
+    # The ray along the normal of a point at a crease may miss the surface beside it.
     far = along > LARGEST_ERROR * error
     if not far.any():
         return True
@@ -240,8 +240,7 @@ def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
 class SurfaceCaster:
     """Casts rays at many surfaces in one call.
 
-    Each surface gets an Embree scene of its own when it is first needed: of a thousand things few
-    are ever likely enough.
+    The Embree scene of a surface is built on first use: of a thousand things, few become likely.
 
     Attributes:
         surfaces: the surfaces, by their number.
@@ -250,7 +249,7 @@ class SurfaceCaster:
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
-        """Take over the surfaces.
+        """Store the surfaces.
 
         Args:
             surfaces: at least one.
@@ -261,31 +260,30 @@ class SurfaceCaster:
         self._scenes: dict[int, Any] = {}
 
     def __reduce__(self) -> tuple[type["SurfaceCaster"], tuple[tuple[Surface, ...]]]:
-        """Pickled as its surfaces: Embree's scenes are built again."""
+        """Pickle the surfaces only: Embree scenes are rebuilt."""
         return SurfaceCaster, (self.surfaces,)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "SurfaceCaster":
-        """Itself: what it answers never changes."""
+        """The same object: it is immutable."""
         return self
 
     def _scene(self, thing: int) -> Any:
-        """The Embree scene of the surface of this number."""
+        """The Embree scene of the surface with this number."""
         if thing not in self._scenes:
             surface = self.surfaces[thing]
             self._scenes[thing] = embree_scene([(surface.vertices, surface.faces)])
         return self._scenes[thing]
 
     def depths(self, thing: int, origins: Float32, directions: Float32) -> Float32:
-        """Cast the same number of rays from each of some places at one surface.
+        """Cast P rays from each of N origins at one surface.
 
         Args:
             thing: number of the surface.
-            origins: the places, in the frame of the surface, (N, 3) float32, metres.
-            directions: of the rays, of any length, (N, P, 3) float32.
+            origins: origins in the frame of the surface, (N, 3) float32, metres.
+            directions: directions of the rays, of any length, (N, P, 3) float32.
 
         Returns:
-            How many times its length each ray goes, (N, P) float32, infinity where it meets
-            nothing.
+            Distance to the first hit, in lengths of the ray, (N, P) float32; infinity for a miss.
         """
         rays = np.ascontiguousarray(directions.reshape(-1, 3))
         starts = np.repeat(origins, directions.shape[1], 0)
@@ -299,18 +297,17 @@ class SurfaceCaster:
         origins: Float32,
         directions: Float32,
     ) -> tuple[Float32, Float32]:
-        """Cast the same number of rays at each of some surfaces.
+        """Cast P rays at each of H surfaces.
 
         Args:
-            things: which surface each row of rays is cast at, (H,) int.
-            origins: where the rays of a row start, in the frame of its surface, (H, 3) float32,
-                metres.
-            directions: of the rays, of any length, (H, P, 3) float32.
+            things: number of the surface of each row of rays, (H,) int.
+            origins: origin of each row, in the frame of its surface, (H, 3) float32, metres.
+            directions: directions of the rays, of any length, (H, P, 3) float32.
 
         Returns:
-            How many times its length each ray goes, (H, P) float32, infinity where it meets
-            nothing; and the unit normal of the surface there, towards the origin, (H, P, 3)
-            float32, in the frame of the surface, zero where a ray meets nothing.
+            Distance to the first hit, in lengths of the ray, (H, P) float32, infinity for a miss;
+            and the unit normal towards the origin, (H, P, 3) float32, in the frame of the surface,
+            zero for a miss.
         """
         directions = np.ascontiguousarray(directions, np.float32)
         starts = np.repeat(

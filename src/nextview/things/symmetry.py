@@ -1,12 +1,12 @@
-"""Symmetries of a surface: axes about which it can be turned and stays the same.
+"""Rotational symmetries of a surface: axes and angles that map it to itself.
 
-A turn is a symmetry where hardly any of the surface lies beside its turned copy. How far beside is
-a small part of the diameter, and as much more as the surface itself is inexact: an exact mesh comes
-back to itself to within its facets, a scan to within its errors, and these show in the median of
-the distances. What remains is judged by its area and not by a quantile that a hole or a keyway
-escapes. The BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCV
-workshops 2020) allows the larger of 15 mm and a tenth of the diameter everywhere, which is the
-tolerance of people who look at pictures; a depth camera sees the holes of a flange.
+A rotation is a symmetry if hardly any of the surface deviates from its rotated copy. The tolerance
+is a small part of the diameter plus the inexactness of the surface itself: an exact mesh maps to
+itself to within its facets, a scan to within its errors, which the median of the distances shows.
+The criterion is the area of the deviating parts, not a quantile, which would miss a hole or a
+keyway. The BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCV
+workshops 2020) uses the larger of 15 mm and a tenth of the diameter, the tolerance of people who
+look at pictures; a depth camera resolves the holes of a flange.
 """
 
 import math
@@ -26,51 +26,54 @@ from nextview.things.surface import Surface
 from nextview.things.view_templates import spread_directions
 from nextview.types import Float, Mask
 
-# of the diameter: facets of a circle with 16 corners, and what a camera sees from five radii away
+# relative to the diameter: facets of a circle with 16 corners, and the resolution of a camera at
+# five radii
 SYMMETRY_TOLERANCE = 0.01
-# of the diameter, median distance of a surface from its turned copy
+# median distance of a surface from its rotated copy, relative to the diameter
 SAME_MEDIAN = 0.01
-# median distances that a tenth of a scan may be off, as by bulges and seams
+# tolerance of a tenth of a scan, in median distances, as for bulges and seams
 USUAL_ERRORS = 8.0
 USUAL_SHARE = 0.1
-# and that hardly any of it may be off, as the inside of a cup that no scanner looks into
+# tolerance of all but MOVED_SHARE, as for the inside of a cup that no scanner reaches
 LOCAL_ERRORS = 40.0
 LARGEST_LOCAL_ERROR = 0.08  # of the diameter
-MOVED_SHARE = 0.0075  # hardly any: the walls of a keyway are twice as much of a gear
-# the same of near symmetries, after which a part of a thing is elsewhere
+# share of the surface that may exceed it: the walls of a keyway are twice as much of a gear
+MOVED_SHARE = 0.0075
+# bounds of near symmetries, for which a part of the thing deviates
 NEAR_MEDIAN = 0.025
 NEAR_SHARE = 0.15
 MEDIAN_BOUNDS = {"same": SAME_MEDIAN, "nearly": NEAR_MEDIAN}
 BESIDE_BOUNDS = {"same": USUAL_SHARE, "nearly": NEAR_SHARE}
-HIGHEST_ORDER = 40  # of a symmetry: as many teeth as a gear has
+HIGHEST_ORDER = 40  # highest order of a symmetry, such as the number of teeth of a gear
 # powers of primes up to the highest order
 POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
-# of a full turn, that are tried for a symmetry of any angle
+# tested rotations for continuous symmetry, in full turns
 ANY_TURNS = np.arange(23, 0, -2) / 48
-# of the surface: what is near is looked for among the triangles that they are on
+# sample points of the surface, whose triangles are candidates for the nearest one
 SAMPLE_POINTS = 20_000
-COARSE_POINTS = 4000  # of these, to which a turned copy is fitted
-COPIED_POINTS = 3000  # of its turned copy
-GUESSED_POINTS = 400  # of it, that show quickly that a turn is no symmetry
-# of these, that lie near the surface however badly the axis is known
+COARSE_POINTS = 4000  # of these, targets of the fit of a rotated copy
+COPIED_POINTS = 3000  # sample points of the rotated copy
+GUESSED_POINTS = 400  # of these, points of a quick test that rejects most rotations
+# share of them that lies near the surface even for an inaccurate axis
 GUESSED_SHARE = 0.9
-GUESSED_DISTANCE = 0.06  # of the diameter, that is near
-# times the bounds of a symmetry, from which the guessed points decide that it is none
+GUESSED_DISTANCE = 0.06  # distance that counts as near, relative to the diameter
+# multiple of the bounds beyond which the quick test decides
 CLEARLY_BESIDE = 1.5
-NEAREST_TRIANGLES = 4  # among which the nearest one is looked for
-FITTED_STEPS = 5  # in which a turned copy is moved to where it fits
-REFINED_STEPS = 2  # the same of one whose few points were moved there already
-# share of the weights that holds a tilt of which the surface says nothing
+NEAREST_TRIANGLES = 4  # candidate triangles of each point
+FITTED_STEPS = 5  # steps of the fit of a rotated copy
+REFINED_STEPS = 2  # further steps after a fit of few points
+# weight of the prior of a tilt that the surface does not determine
 FREE_TILT = 1e-3
-# of a full turn: far from what a symmetry of order 2, 3 or 4 takes back to itself
+# full turns: far from the rotations of symmetries of order 2, 3 and 4
 TELLING_TURN = 0.37
 LEAST_APART = 1e-9  # metres
-SEEN_FROM = 48  # directions from one of which a point has to be seen to count
-ABOVE = 1e-3  # of the diameter, that it is seen from above the surface
-MOST_AXES = 3  # that are named: all others of a cube follow from three
-STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry
-AXIS_TOLERANCE = np.radians(20)  # axes within this angle are one
-SAME_CANDIDATE = np.radians(1)  # axes to be tried within this angle are one
+SEEN_FROM = 48  # directions from which the visibility of a point is tested
+ABOVE = 1e-3  # offset of a visible point from the surface, relative to the diameter
+MOST_AXES = 3  # most reported axes: all others of a cube follow from three
+# step between candidate axes perpendicular to an axis of symmetry
+STEP_ACROSS = np.radians(5)
+AXIS_TOLERANCE = np.radians(20)  # axes within this angle are duplicates
+SAME_CANDIDATE = np.radians(1)  # candidate axes within this angle are duplicates
 
 
 def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
@@ -78,14 +81,14 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
 
     The candidate axes pass through the centroid of the surface, which every symmetry leaves fixed.
     They are the axes of the file, the principal axes and those of the smallest bounding box; each
-    is corrected to where the turned copy fits best. If the surface is symmetric by any angle about
-    one axis, only one of the axes perpendicular to it is returned, because the others follow.
+    is refined to the best fit of the rotated copy. If the surface has a continuous symmetry about
+    one axis, only one of the perpendicular axes is returned, because the others follow.
 
     Args:
-        surface: of a thing.
+        surface: surface of a thing.
 
     Returns:
-        Its symmetries: first those of any angle, then the others by their order.
+        Its symmetries: continuous ones first, then the others by their order.
     """
     compared = _compared(surface)
     found = _found(compared, "same")
@@ -98,30 +101,31 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
 
 
 def find_near_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
-    """Find axes about which a surface can be turned and hardly looks different.
+    """Find axes about which a rotated surface looks almost the same.
 
-    Views that do not show where it differs leave open which of these poses it has.
+    Views that do not show the differences leave the choice between these poses open.
 
     Args:
-        surface: of a thing.
+        surface: surface of a thing.
 
     Returns:
-        Axes and orders as those of symmetries, which are among them.
+        Axes and orders, including those of exact symmetries.
     """
     return tuple(_distinct(_found(_compared(surface), "nearly")))
 
 
-Kind = Literal["same", "nearly"]  # hardly any, or little, of the surface lies beside
+# at most a tiny, or a small, part of the surface deviates
+Kind = Literal["same", "nearly"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A surface beside its turned copy.
+    """Comparison of a surface with its rotated copy.
 
     Attributes:
-        median: distance of the points of the copy from the surface, metres.
-        fits: whether the turn is a symmetry of the kind that was looked for.
-        axis: about which it was turned, corrected to where it fits best, (3,).
+        median: median distance of the points of the copy from the surface, metres.
+        fits: whether the rotation is a symmetry of the requested kind.
+        axis: axis of the rotation after the fit, (3,).
     """
 
     median: float
@@ -131,12 +135,12 @@ class _Turned:
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """A turned copy of few points, moved to where it fits best.
+    """A rotated copy of few points after the fit.
 
     Attributes:
-        rotation: of the copy; None where it lies beside however it is tilted.
-        median: distance of the points from the surface, of the diameter.
-        beside: share of the points that lie farther from it than is usual.
+        rotation: rotation of the copy; None if no tilt makes it fit.
+        median: median distance of the points from the surface, relative to the diameter.
+        beside: share of the points whose distance is larger than usual.
     """
 
     rotation: Rotation | None
@@ -145,9 +149,9 @@ class _Guess:
 
 
 class _Compared:
-    """What can be seen of a surface, which its turned copies are compared with.
+    """The visible part of a surface, prepared for comparisons with its rotated copies.
 
-    Its centroid is the origin. Comparisons are kept: orders share turns, and exact and near
+    Its centroid is the origin. Comparisons are cached: orders share rotations, and exact and near
     symmetries share guesses.
     """
 
@@ -176,12 +180,12 @@ class _Compared:
         self._exactly = dict[tuple[bytes, float], tuple[Float, Float]]()
 
     def _seen(self, surface: Surface) -> Mask:
-        """Which of the points a camera can see from outside, (N,): not faces inside of a solid."""
+        """Points that a camera outside can see, (N,), as opposed to faces inside a solid."""
         scene = embree_scene(
             [(self._corners.reshape(-1, 3), _each_on_its_own(surface))]
         )
         above = ABOVE * self.diameter * self._normals
-        left = np.arange(len(self._points))  # not seen so far
+        left = np.arange(len(self._points))  # invisible so far
 
         for direction in spread_directions(SEEN_FROM):
             side = np.sign(self._normals[left] @ direction)[:, None]
@@ -199,12 +203,12 @@ class _Compared:
         return seen if seen.any() else ~seen
 
     def turned(self, axis: Float, turn: float, kind: Kind) -> _Turned:
-        """Compare with the copy that is turned about an axis.
+        """Compare with the copy that is rotated about an axis.
 
         Args:
             axis: unit vector, (3,).
-            turn: of a full turn.
-            kind: of symmetry that is looked for.
+            turn: angle, full turns.
+            kind: kind of symmetry.
         """
         key = (axis.tobytes(), turn)
         if key not in self._known:
@@ -225,6 +229,7 @@ class _Compared:
             rotation = self._fitted(guess.rotation, axis, some, REFINED_STEPS)
             copied = rotation.apply(self._points[:COPIED_POINTS])
             self._exactly[key] = _axis_of(rotation), self._distances(copied)
+
         fitted, distances = self._exactly[key]
         median = float(np.median(distances))
         fits = (
@@ -237,7 +242,7 @@ class _Compared:
         return _Turned(median * self.diameter, fits, fitted)
 
     def _guessed(self, axis: Float, turn: float) -> _Guess:
-        """Turn few points about an axis, and tilt them to where they fit."""
+        """Rotate few points about an axis, and fit the tilt."""
         rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
         few = self._points[:GUESSED_POINTS]
         apart = self._coarse.query(rotation.apply(few))[0] / self.diameter
@@ -256,10 +261,10 @@ class _Compared:
         points: Float,
         steps: int = FITTED_STEPS,
     ) -> Rotation:
-        """Tilt a turned copy to where it fits best, without turning it farther about the axis.
+        """Fit the tilt of a rotated copy, without further rotation about the axis.
 
-        Point to plane, from some points, (N, 3), to the nearest sampled ones; what lies beside
-        hardly counts.
+        Point-to-plane registration of some points, (N, 3), with the nearest sample points;
+        deviating parts have little weight.
         """
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
@@ -274,14 +279,14 @@ class _Compared:
             )
             tilting = np.cross(copy, normals) @ across.T
             left = (tilting * weights[:, None]).T @ tilting
-            # Of a ball nothing is drawn anywhere.
+            # The tilt of a ball is undetermined.
             left += FREE_TILT * weights.sum() * self.diameter**2 * np.eye(2)
             change = np.linalg.solve(left, tilting.T @ (weights * along))
             rotation = Rotation.from_rotvec(change @ across) * rotation
         return rotation
 
     def _distances(self, points: Float) -> Float:
-        """Distances of points from the surface, (N,), of the diameter."""
+        """Distances of points from the surface, (N,), relative to the diameter."""
         nearest = self._tree.query(points, k=NEAREST_TRIANGLES)[1]
         corners = self._corners[self._triangles[nearest]]
         return _from_triangles(points[:, None], corners).min(1) / self.diameter
@@ -289,23 +294,23 @@ class _Compared:
 
 @lru_cache(maxsize=1)
 def _compared(surface: Surface) -> _Compared:
-    """A surface, ready to be compared with its turned copies; the last one is kept."""
+    """A surface prepared for comparisons with its rotated copies; the last one is cached."""
     return _Compared(surface)
 
 
 def _beside(distances: Float, median: float) -> float:
-    """Share of distances that are larger than is usual, all of the diameter."""
+    """Share of distances that are larger than usual, given the median; relative to the diameter."""
     return float((distances > SYMMETRY_TOLERANCE + USUAL_ERRORS * median).mean())
 
 
 def _axis_of(rotation: Rotation) -> Float:
-    """The axis of a rotation, (3,)."""
+    """Axis of a rotation, unit vector, (3,)."""
     vector = rotation.as_rotvec()
     return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _each_on_its_own(surface: Surface) -> NDArray[np.int32]:
-    """Triangles, (F, 3), of as many corners one after the other."""
+    """Triangles, (F, 3), without shared corners."""
     return np.arange(3 * len(surface.faces), dtype=np.int32).reshape(-1, 3)
 
 
@@ -334,7 +339,7 @@ def _from_triangles(points: Float, corners: Float) -> Float:
 
 
 def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
-    """A symmetry of half a turn about an axis across another one; its direction may be any."""
+    """Find a two-fold symmetry about an axis perpendicular to another one."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     angles = np.arange(0, np.pi, STEP_ACROSS)[:, None]
@@ -346,7 +351,7 @@ def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
 
 
 def _is_ball(axes: Sequence[Float]) -> bool:
-    """Whether some axes of symmetries of any angle are not all one."""
+    """Whether the axes of continuous symmetries differ."""
     return any(abs(axis @ axes[0]) < np.cos(AXIS_TOLERANCE) for axis in axes)
 
 
@@ -354,21 +359,21 @@ def _found(
     compared: _Compared,
     kind: Kind,
 ) -> list[tuple[Float, int]]:
-    """Axes and orders of a kind of symmetry: any angle first, then high orders, then exact ones."""
+    """Axes and orders of a kind of symmetry: continuous first, then by order, then by accuracy."""
     found = []
     for axis in compared.axes:
         order, deviation, fitted = _order(compared, axis, kind)
         if order != 1:
             found.append((order, deviation, fitted))
         if kind == "same" and _is_ball([axis for order, _, axis in found if not order]):
-            break  # no axis of a ball differs from another one
+            break  # all axes of a ball are equivalent
 
     found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
     return [(axis, order) for order, _, axis in found]
 
 
 def _axes(surface: Surface) -> list[Float]:
-    """Unit vectors that are tried, (3,) each."""
+    """Candidate axes, unit vectors, (3,) each."""
     tried: list[Float] = []
     for axis in np.concatenate([np.eye(3), _box_axes(surface), _principal(surface)]):
         if all(abs(axis @ other) < np.cos(SAME_CANDIDATE) for other in tried):
@@ -377,7 +382,7 @@ def _axes(surface: Surface) -> list[Float]:
 
 
 def _principal(surface: Surface) -> Float:
-    """The principal axes of a surface, (3, 3), exactly: also where two moments nearly agree."""
+    """Principal axes of a surface, (3, 3), exact even if two moments nearly agree."""
     corners = surface.vertices[surface.faces].astype(np.float64) - surface.centroid
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(across, axis=1)
@@ -388,7 +393,7 @@ def _principal(surface: Surface) -> Float:
 
 
 def _box_axes(surface: Surface) -> Float:
-    """The axes of the smallest box around a surface, (N, 3); none of a flat surface."""
+    """Axes of the smallest bounding box of a surface, (N, 3); none for a flat surface."""
     from trimesh.bounds import oriented_bounds
 
     try:
@@ -396,7 +401,7 @@ def _box_axes(surface: Surface) -> Float:
     except (
         QhullError,
         ValueError,
-    ):  # of points in one plane, and of such that nearly are
+    ):  # coplanar or nearly coplanar points
         return np.zeros((0, 3))
     return np.asarray(to_box, np.float64)[:3, :3]
 
@@ -406,24 +411,24 @@ def _order(
     axis: Float,
     kind: Kind,
 ) -> tuple[int, float, Float]:
-    """The highest order of a symmetry about an axis, how exact it is, metres, and the axis.
+    """Highest order of a symmetry about an axis, its median distance, metres, and the axis.
 
-    The order is 0 for any angle, and 1 for none.
+    The order is 0 for a continuous symmetry, and 1 for none.
     """
     largest = compared.turned(axis, float(ANY_TURNS[0]), kind)
     worst = _worst(compared, largest.axis, ANY_TURNS, kind) if largest.fits else None
     if worst is not None:
         return 0, worst, largest.axis
 
-    # Turns by 1/4 and 1/3 of a full one make one by 1/12: powers of primes are tried, and what they
-    # make up.
+    # Rotations by 1/4 and 1/3 of a full turn generate one by 1/12: powers of primes are tested,
+    # then their products.
     tried = {power: compared.turned(axis, _telling(power), kind) for power in POWERS}
     possible = {power: turned for power, turned in tried.items() if turned.fits}
     if not possible:
         return 1, np.inf, axis
     fitted = min(possible.values(), key=lambda turned: turned.median).axis
     for order in _orders(math.lcm(*possible)):
-        # A turn back is as good as one forth.
+        # Rotations in both directions are equivalent.
         turns = _tellingly(np.arange(1, order // 2 + 1) / order)
         worst = _worst(compared, fitted, turns, kind)
         if worst is not None:
@@ -432,20 +437,21 @@ def _order(
 
 
 def _telling(order: int) -> float:
-    """The turn of an order, and of no lower one, that a lower one is the least likely to allow."""
+    """The rotation of an order that lower orders are least likely to allow, full turns."""
     steps = [step for step in range(1, order) if np.gcd(step, order) == 1]
     return float(_tellingly(np.array(steps) / order)[0])
 
 
 def _tellingly(turns: Float) -> Float:
-    """Turns, (N,), in the order in which they are likely to show that there is no symmetry."""
+    """Rotations, (N,), sorted by how likely they are to refute a symmetry."""
     return turns[np.abs(turns - TELLING_TURN).argsort(kind="stable")]
 
 
 def _orders(whole: int) -> Sequence[int]:
-    """Orders that may be the highest one, this first, where all symmetries together make up one.
+    """Candidates of the highest order, highest first, given the product of all symmetries found.
 
-    What is round but for details, such as teeth, seems to have more than there can be.
+    A thing that is round except for details, such as teeth, may seem to have more symmetries than
+    is possible.
     """
     if whole > HIGHEST_ORDER:
         return range(HIGHEST_ORDER, 1, -1)
@@ -458,7 +464,7 @@ def _worst(
     turns: Float,
     kind: Kind,
 ) -> float | None:
-    """The largest median distance of some turns, metres; None if one of them is no symmetry."""
+    """Largest median distance of some rotations, metres; None if one of them is no symmetry."""
     worst = 0.0
     for turn in turns.tolist():
         turned = compared.turned(axis, turn, kind)
@@ -469,9 +475,9 @@ def _worst(
 
 
 def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
-    """The symmetries about different axes, of those that are sorted by what they tell."""
+    """Symmetries about different axes, from a list that is sorted by importance."""
     kept: list[Symmetry] = []
-    across = False  # whether an axis across one of any angle is there already
+    across = False  # whether an axis perpendicular to a continuous one is in the list
     for axis, order in found:
         if len(kept) == MOST_AXES:
             break
@@ -487,7 +493,7 @@ def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
 
 
 def _symmetry(axis: Float, order: int) -> Symmetry:
-    """A symmetry as cards hold it; its axis has a positive longest component."""
+    """A symmetry in the format of cards; the longest component of its axis is positive."""
     longest = axis[np.abs(axis).argmax()]
     x, y, z = np.round(axis * np.sign(longest) / np.linalg.norm(axis), 6).tolist()
     return Symmetry((x, y, z), order)

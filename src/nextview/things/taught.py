@@ -1,4 +1,4 @@
-"""A memory of taught things together with their surfaces: from observations to names and poses."""
+"""A memory of taught things with their surfaces: from observations to names and poses."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -26,31 +26,30 @@ from nextview.things.verifier import (
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
-# The radius of an object that a thing may have, of that of the thing: little may be taken in of it.
+# Smallest object radius relative to that of the thing: a view may contain little of it.
 SMALLEST_SHARE = 0.25
-# how far from their middle its pixels may lie, of the radius of the thing
+# largest extent of its pixels from their median, radii of the thing
 LARGEST_SEEN_SHARE = 2.0
 OF_ITS_PIXELS = (
-    0.9  # share of its pixels, without those that mix its depth with that behind it
+    0.9  # quantile of the extent, without pixels that mix its depth with the background
 )
-TINY = 1e-300  # belief that has a logarithm
+TINY = 1e-300  # lower bound of a belief before its logarithm
 
 
 class TaughtThings:
-    """Names taught things by their geometry, and tells their poses.
+    """Recognises taught things and estimates their poses, by their geometry.
 
     Attributes:
-        recogniser: what is remembered of their views.
-        verifier: their surfaces.
-        names: of the things, in the order of ``Verified.belief``.
-        residuals: how badly known things are explained, in the same order; None if that was not
-            fitted.
-        symmetries: of each thing, in the same order.
-        upright: whether each thing is known only as it stands, in the same order.
-        any_orientation: whether they need not rest: all orientations are equally likely.
-        rows: resting poses of the memory that are of these things, (R,) int64.
-        owners: which of the things each of these is of, (R,) int64.
-        of_classes: whether some class of the memory has several things.
+        recogniser: memory of their views.
+        verifier: verifier of their surfaces.
+        names: names of the things, in the order of ``Verified.belief``.
+        residuals: residuals of known things, in the same order; None if they were not fitted.
+        symmetries: symmetries of each thing, in the same order.
+        upright: whether each thing is known in its upright pose only, in the same order.
+        any_orientation: whether all orientations are equally likely, not only resting poses.
+        rows: resting poses in the memory that belong to these things, (R,) int64.
+        owners: thing of each of these resting poses, (R,) int64.
+        of_classes: whether a class of the memory has several things.
     """
 
     def __init__(
@@ -60,16 +59,16 @@ class TaughtThings:
         weights: EvidenceWeights = EvidenceWeights(),
         residuals: KnownResiduals | None = None,
     ) -> None:
-        """Join a memory and the surfaces of its things, or of some of them.
+        """Combine a memory and surfaces of its things, or of some of them.
 
         Args:
-            recogniser: what is remembered of the things.
-            surfaces: of the things that shall be recognised, by their names in the memory.
-            weights: how much outlines, size and geometry count.
-            residuals: how badly known things are explained, in the order of the surfaces.
+            recogniser: memory of the things.
+            surfaces: surfaces of the things to be recognised, with their names in the memory.
+            weights: weights of outlines, size and geometry.
+            residuals: residuals of known things, in the order of the surfaces.
 
         Raises:
-            ModelError: a surface of a thing that the memory does not know, or none.
+            ModelError: there is no surface, or one of a thing that is not in the memory.
         """
         about = recogniser.card.memory
         assert about is not None
@@ -106,16 +105,16 @@ class TaughtThings:
 
     @classmethod
     def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
-        """Join a memory and its own surfaces.
+        """Combine a memory and its own surfaces.
 
         Args:
-            recogniser: what is remembered of the things.
+            recogniser: memory of the things.
 
         Returns:
-            A recogniser of all things of known geometry; None if the memory holds none.
+            All things of known geometry; None if the memory contains none.
 
         Raises:
-            ModelError: what was fitted to the surfaces is not what this version fits.
+            ModelError: this version does not support the fitted weights.
         """
         about = recogniser.card.memory
         assert about is not None
@@ -133,24 +132,35 @@ class TaughtThings:
         return cls(recogniser, some, weights, residuals_of(about.verification, known))
 
     def with_prior(self, prior: RegistrationPrior) -> "TaughtThings":
-        """The same things, looked at by cameras whose errors have another prior."""
+        """The same things for cameras with another prior.
+
+        Args:
+            prior: prior of the registration.
+
+        Returns:
+            A copy that shares the surfaces.
+        """
         other = copy(self)
         other.verifier = copy(self.verifier)
         other.verifier.prior = prior
         return other
 
     def in_any_orientation(self) -> "TaughtThings":
-        """The same things, which may be held, lean or fly: they need not rest."""
+        """The same things in a gripper, leaning or in the air: they need not rest.
+
+        Returns:
+            A copy that shares the surfaces.
+        """
         tilted = copy(self)
         tilted.any_orientation = True
         return tilted
 
     def __call__(self, observations: Sequence[Observation]) -> Verified:
-        """Recognise the thing that some views show.
+        """Recognise the thing in some views.
 
         Args:
-            observations: views of one thing, all in one object frame. Views that do not show it are
-                left out.
+            observations: views of one thing in one object frame. Views that do not show it are
+                ignored.
 
         Returns:
             The belief in each thing, and the poses.
@@ -172,7 +182,14 @@ class TaughtThings:
         return self.judge(seen, self.of_things(joint.sum(1)))
 
     def of_things(self, of_hypotheses: Float) -> Float:
-        """The belief in each thing, (T,), from that in each resting pose of the memory, (H,)."""
+        """Sum the belief in resting poses over things.
+
+        Args:
+            of_hypotheses: belief in each resting pose of the memory, (H,).
+
+        Returns:
+            Belief in each thing, (T,).
+        """
         belief = np.zeros(len(self.names))
         np.add.at(belief, self.owners, of_hypotheses[self.rows])
         return belief
@@ -182,17 +199,20 @@ class TaughtThings:
         observations: Sequence[Observation],
         by_features: Float | None = None,
     ) -> Verified:
-        """Recognise the thing that some views show, of which the features have been looked at.
+        """Recognise the thing in some views, given the belief by features.
 
-        Features count where a class has several things: others of it differ from those that were
-        taught, and geometry alone cannot tell them.
+        Features count if a class has several things: other members of the class differ from the
+        taught ones, so that geometry alone does not recognise them.
 
         Args:
-            observations: views that show one thing, all in one object frame.
-            by_features: belief in each thing by features and size, (T,); None if there are none.
+            observations: views that show one thing, in one object frame.
+            by_features: belief in each thing by features and size, (T,); None without features.
 
         Returns:
             The belief in each thing, and the poses.
+
+        Raises:
+            ObservationError: no view shows enough of the thing, or its scale is not known.
         """
         prior = None
         if self.of_classes and by_features is not None:
@@ -200,12 +220,26 @@ class TaughtThings:
         return self.verifier(observations, self.any_orientation, prior)
 
     def standing(self, thing: int) -> Floats:
-        """Rotation of a thing from the axes of its file to how it stands there, (3, 3)."""
+        """Rotation from the axes of a thing's file to its upright pose.
+
+        Args:
+            thing: number of the thing.
+
+        Returns:
+            Rotation matrix, (3, 3).
+        """
         first = self.rows[self.owners == thing][0]
         return self.recogniser.memory.rotations[first]
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
-        """What features and size say of each view, (V, D): it can be summed over views."""
+        """Log-evidence of each view by features and size, which adds up over views.
+
+        Args:
+            observations: V views.
+
+        Returns:
+            Log-evidence, (V, D).
+        """
         return log_evidence_of_views(self.recogniser, observations)
 
     def log_odds_of_stranger(
@@ -213,14 +247,14 @@ class TaughtThings:
         observations: Sequence[Observation],
         found: Verified,
     ) -> float:
-        """How much likelier a stranger of its shape is than the likeliest thing.
+        """Log-odds of a stranger of the same shape against the likeliest thing.
 
         Args:
             observations: the views.
-            found: what was found of them.
+            found: their verification.
 
         Returns:
-            Log-odds, nats: positive where another thing is likelier.
+            Log-odds, nats: positive if a stranger is likelier.
         """
         seen = [observation for observation in observations if observation.seen]
         return self.verifier.log_odds_of_stranger(
@@ -234,19 +268,19 @@ class TaughtThings:
         observations: Sequence[Observation],
         found: Verified,
     ) -> float | None:
-        """Share of known things that are explained as badly by the likeliest hypothesis.
+        """p-value of the likeliest hypothesis among known things.
 
-        What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is. Few things do not stand on the
-        ground that is seen below them.
+        An object of a different order of magnitude than the likeliest thing gets the smallest
+        p-value, whatever the residual of its few pixels. A thing that does not stand on the visible
+        ground has a lower p-value, because few do not.
 
         Args:
             observations: the views.
-            found: what was found of them.
+            found: their verification.
 
         Returns:
-            Between 0 and 1, small for a thing that was not taught; None if it was not fitted how
-            badly known things are explained.
+            Between 0 and 1, small for an object that was not taught; None if the residuals of known
+            things were not fitted.
         """
         if self.residuals is None:
             return None
@@ -255,6 +289,7 @@ class TaughtThings:
         views = found.mean.shape[1]
         radius = float(self.verifier.caster.radii[likeliest])
         whole = max(observation.radius or 0.0 for observation in observations)
+
         seen = max(extent(image) for image in images_of(observations))
         if whole < SMALLEST_SHARE * radius or seen > LARGEST_SEEN_SHARE * radius:
             return self.residuals.p_value(np.inf, likeliest, views)
@@ -272,33 +307,45 @@ class TaughtThings:
 
 
 def extent(image: MetricImage) -> float:
-    """How far from their middle the pixels of a thing lie, metres."""
+    """Extent of the pixels of a thing around their median.
+
+    Args:
+        image: a view of the thing.
+
+    Returns:
+        Radius, metres.
+    """
     points = image.view(FINE_SIDE).thing_points
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return float(np.quantile(away, OF_ITS_PIXELS))
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:
-    """The weights that a card holds; those that it does not name have their defaults.
+    """The weights on a card; missing ones have their defaults.
 
     Args:
-        verification: what the card says.
-        where: path of the card, for the sentence of an error.
+        verification: fits on the card.
+        where: path of the card, for error messages.
+
+    Returns:
+        The weights.
 
     Raises:
-        ModelError: it names a weight that this version does not know, or one is out of its range.
+        ModelError: this version does not support one of the weights, or one is out of range.
     """
     strange = sorted(
         set(verification.weights) - {field.name for field in fields(EvidenceWeights)}
     )
     if strange:
         raise ModelError(
-            f"{where}: weighs {strange[0]}, which this version does not know"
+            f"{where}: has a weight {strange[0]}, which this version does not support"
         )
     for share in ("correlation", "doubt"):
         value = verification.weights.get(share, 0)
         if value > 1:
-            raise ModelError(f"{where}: its {share} is {value:g}, and it is a share")
+            raise ModelError(
+                f"{where}: its {share} is {value:g}, and a share is at most 1"
+            )
     return EvidenceWeights(**verification.weights)
 
 
@@ -306,11 +353,14 @@ def residuals_of(
     verification: Verification,
     things: Sequence[int],
 ) -> KnownResiduals | None:
-    """The residuals that a card holds, of some of its things; None if it holds none.
+    """The residuals of known things on a card, for some of its things.
 
     Args:
-        verification: of the card.
-        things: rows of the things that are meant.
+        verification: fits on the card.
+        things: indices of the things.
+
+    Returns:
+        The residuals; None if the card contains none.
     """
     if not verification.usual:
         return None

@@ -1,4 +1,4 @@
-"""Whether a thing was taught at all: by how badly the likeliest hypothesis explains the views."""
+"""Test whether an object was taught, by the residual of the likeliest hypothesis."""
 
 from dataclasses import dataclass
 
@@ -7,30 +7,30 @@ from numpy.typing import NDArray
 
 from nextview.types import Float
 
-# number of residuals that the mean of all things counts for, beside those of a thing
+# weight of the mean of all things, in residuals of one thing
 SHRINKAGE = 2.0
-LEAST_RESIDUAL = 0.02  # below which residuals do not differ
-# of pixels that are off by just the noise: half a squared standard normal
+LEAST_RESIDUAL = 0.02  # lower bound: smaller residuals are equivalent
+# mean residual by noise alone: half the square of a standard normal variable
 NOISE_RESIDUAL = 0.5
-NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
-# part of the noise in the variance of a depth, from which it is in the way
+# share of the pixels that the surface must explain before noise is an excuse
+NOISE_SHARE = 0.8
+# share of the noise in the variance of a depth, from which noise is an excuse
 MOSTLY_NOISE = 0.5
-# by what factor the noise of a real camera may be larger than it is measured
+# factor by which the noise of a real camera may exceed its estimate
 NOISE_KNOWN = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class KnownResiduals:
-    """Residuals of taught things, as their own geometry explains them through the sensor.
+    """Residuals of taught things under their own geometry, through the sensor.
 
-    Some things are always explained worse than others: thin ones, and those that moved since they
-    were scanned. So each thing has its own usual residual, and what counts is how many times it is
-    exceeded.
+    Some things always have larger residuals than others: thin things, and things whose parts moved
+    after the scan. Therefore each thing has a usual residual, and the test uses the ratio to it.
 
     Attributes:
         usual: usual residual of each thing, (T,) float64.
-        excess: logarithms of how many times known things exceed it, ascending, for each number of
-            views, (views, N) float64.
+        excess: logarithms of the ratios of known things, ascending, for each number of views,
+            (views, N) float64.
     """
 
     usual: Float
@@ -44,16 +44,16 @@ class KnownResiduals:
         views: NDArray[np.integer],
         count: int,
     ) -> "KnownResiduals":
-        """Fit to residuals of known things, each with its own thing as the likeliest hypothesis.
+        """Fit to residuals of known things whose likeliest hypothesis is correct.
 
         Args:
-            things: which thing each is of, (N,) int.
+            things: thing of each residual, (N,) int.
             residuals: ``Verified.residual`` of each, (N,).
-            views: after how many views, (N,) int, from 1 on without a gap.
+            views: number of views of each, (N,) int. A number without residuals gets those of all.
             count: number of things, T.
 
-        Raises:
-            ModelError: there is no residual for some number of views.
+        Returns:
+            The usual residuals and the distribution of the ratios.
         """
         logarithms = _logarithms(residuals)
         mean = logarithms.mean()
@@ -79,16 +79,16 @@ class KnownResiduals:
         residuals: Float,
         views: NDArray[np.integer],
     ) -> "KnownResiduals":
-        """Add things, and leave what is known of the others as it is.
+        """Add things without changing the fits of the others.
 
         Args:
-            carried: number that each thing had before, -1 for a new one, (T,) int.
-            things: which thing each further residual is of, among these, (N,) int.
-            residuals: the further ones, (N,).
-            views: after how many views, (N,) int.
+            carried: previous number of each thing, -1 for a new one, (T,) int.
+            things: thing of each additional residual, (N,) int.
+            residuals: the additional residuals, (N,).
+            views: number of views of each, (N,) int.
 
         Returns:
-            The residuals of the T things. A new one that has none of its own has the mean of the
+            The residuals of the T things. A new thing without residuals gets the mean of the
             others.
         """
         known = np.log(self.usual + LEAST_RESIDUAL)
@@ -105,15 +105,15 @@ class KnownResiduals:
         return KnownResiduals(np.exp(typical) - LEAST_RESIDUAL, tuple(excess))
 
     def p_value(self, residual: float, thing: int, views: int) -> float:
-        """Share of known things that are explained as badly.
+        """Share of known things with at least this residual, relative to the usual one.
 
         Args:
-            residual: of the likeliest hypothesis.
-            thing: which thing it is of.
-            views: how many views there are.
+            residual: residual of the likeliest hypothesis.
+            thing: number of its thing.
+            views: number of views.
 
         Returns:
-            Between 0 and 1; small for a thing that was not taught.
+            Between 0 and 1; small for an object that was not taught.
         """
         excess = self.excess[min(views, len(self.excess)) - 1]
         exceeded = (max(residual, 0) + LEAST_RESIDUAL) / (
@@ -131,24 +131,23 @@ class KnownResiduals:
         explained: float = 1.0,
         noise_share: float = 1.0,
     ) -> float:
-        """The p-value of what a real camera sees, whose noise is not known exactly.
+        """p-value for a real camera, whose noise is not known exactly.
 
-        Cameras have errors that no model of their noise holds. Known things are then explained
-        worse than in the simulation that this was fitted to. So a residual that the noise alone
-        explains, if it is larger than it was measured by ``NOISE_KNOWN``, is no reason to call a
-        thing unknown; provided that the surface explains most of the pixels at all, and that the
-        noise is larger than the errors of the scans.
+        Cameras have errors beyond any noise model, so known things have larger residuals than in
+        the simulation of the fit. A residual that noise of ``NOISE_KNOWN`` times the estimate
+        explains is therefore no reason to call an object unknown, provided that the surface
+        explains most of the pixels and that the noise exceeds the errors of the scans.
 
         Args:
-            residual: of the likeliest hypothesis.
-            thing: which thing it is of.
-            views: how many views there are.
-            explained: share of the thing's pixels that the hypothesis explains, in the mean.
-            noise_share: part that the noise of the camera has in the variance of a depth; the
-                errors of the scan have the rest.
+            residual: residual of the likeliest hypothesis.
+            thing: number of its thing.
+            views: number of views.
+            explained: mean share of the thing's pixels that the hypothesis explains.
+            noise_share: share of the camera noise in the variance of a depth; the errors of the
+                scan have the rest.
 
         Returns:
-            See ``p_value``; at least 0.5 where the noise explains the residual.
+            See ``p_value``; at least 0.5 if the noise explains the residual.
         """
         p_value = self.p_value(residual, thing, views)
         noise_explains = residual <= NOISE_RESIDUAL * NOISE_KNOWN**2 * noise_share
@@ -158,5 +157,5 @@ class KnownResiduals:
 
 
 def _logarithms(residuals: Float) -> Float:
-    """Logarithms of residuals; very small ones do not differ."""
+    """Logarithms of residuals, with a lower bound."""
     return np.log(np.maximum(residuals, 0) + LEAST_RESIDUAL)

@@ -1,10 +1,10 @@
-"""How likely a line of sight to a thing is clear where no view has looked yet.
+"""Probability of a clear line of sight to a thing through space that no view has observed.
 
-What stands around a thing hides it from many sides, and a camera sees only the near side of it.
-Space that no view has looked into may hold more of the same, standing on the same support: a place
-near the support is filled more often than one higher up. A metre of it blocks a line of sight more
-often than one of the space that is known, because views that show the thing are views from where
-little stands in the way.
+Objects around a thing occlude it from many sides, and a camera sees only their near side.
+Unobserved space may contain more of them on the same support surface, so a point near the support
+is more likely occupied than one higher up. A metre of unobserved space blocks a line of sight more
+often than a metre of observed space, because views that show the thing were taken where little is
+in the way.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ import numpy as np
 from nextview.geometry.observation import Observation
 from nextview.types import Float, Float32, Mask
 
-SIGHT_STEPS = 20  # places on each line of sight that are looked up
-UNSEEN_FILLED = 4.0  # how much oftener unknown space is filled than known space
-# metres before a measured surface, from which on space is known to be free
+SIGHT_STEPS = 20  # sample points on each line of sight
+UNSEEN_FILLED = 4.0  # occupancy of unobserved space relative to observed space
+# distance before a measured surface from which space counts as free, metres
 BEFORE = 0.01
 
 
@@ -26,7 +26,7 @@ class MeasuredDepth:
     """All depth that one view measured.
 
     Attributes:
-        depth: along the optical axis, (H, W) float32, metres; 0 where nothing was measured.
+        depth: depth along the optical axis, (H, W) float32, metres; 0 without a measurement.
         pose: camera-to-object, (4, 4) float64, metres.
         intrinsics: pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5.
     """
@@ -37,7 +37,14 @@ class MeasuredDepth:
 
     @classmethod
     def of(cls, observation: Observation) -> "MeasuredDepth | None":
-        """What the camera of a view saw, the thing and all else; None if that is not known."""
+        """Depth of the whole scene of a view.
+
+        Args:
+            observation: the view.
+
+        Returns:
+            The depth; None if the observation has no scene or no scale.
+        """
         scene = observation.scene
         if scene is None or observation.radius is None:
             return None
@@ -47,16 +54,15 @@ class MeasuredDepth:
         return cls(depth, pose, scene.intrinsics.astype(np.float64))
 
     def shows_free(self, points: Float32) -> Mask:
-        """Whether the camera looked through some places.
+        """Whether the camera observed free space at some points.
 
-        Where nothing was measured, nothing is taken to stand: most often what is behind is too far
-        away.
+        A pixel without a measurement counts as free: most often its background is too far away.
 
         Args:
-            points: (..., 3), object frame, metres.
+            points: object frame, (..., 3), metres.
 
         Returns:
-            (...) bool; not for places outside of the image.
+            Mask, (...) bool; False for points outside the image.
         """
         turn = self.pose[:3, :3].astype(np.float32)
         in_camera = (points - self.pose[:3, 3].astype(np.float32)) @ turn
@@ -85,21 +91,20 @@ def chance_of_sight(
     floor: float,
     top: float,
 ) -> Float32:
-    """How likely lines of sight are clear where it is not known what stands on them.
+    """Probability that lines of sight are clear, given that some of the space is unobserved.
 
     Args:
-        seen: the views that were taken.
-        ends: where each line meets the thing, (V, P, 3), object frame, metres; NaN for a line that
-            does not.
+        seen: the views so far.
+        ends: intersection of each line with the thing, (V, P, 3), object frame, metres; NaN for a
+            line without one.
         rays: unit vectors from the cameras along the lines, (V, P, 3).
-        hidden: lines that something is known to block, (V, P).
-        reach: metres before the thing, within which something may stand.
-        floor: height of the support, metres.
-        top: height of what is known to stand around, metres; what is not known is no higher, and
-            may be of any height up to it.
+        hidden: lines that a known obstacle blocks, (V, P).
+        reach: distance from the thing within which an obstacle may stand, metres.
+        floor: height of the support surface, metres.
+        top: height of the known obstacles, metres; unobserved obstacles have any height up to it.
 
     Returns:
-        Chances, (V, P) float32: 1 where all is known to be free.
+        Probabilities, (V, P) float32: 1 if all space on the line is known to be free.
     """
     steps = (np.arange(SIGHT_STEPS, dtype=np.float32) + 0.5) / SIGHT_STEPS
     back = (reach * steps)[:, None] * rays[:, :, None]

@@ -1,4 +1,4 @@
-"""How likely a view is, pixel by pixel, if a surface stands where it was aligned."""
+"""Likelihood of a view, pixel by pixel, given a surface in a registered pose."""
 
 from dataclasses import dataclass, fields
 
@@ -11,17 +11,17 @@ from nextview.types import Float, Index
 
 @dataclass(frozen=True)
 class PixelModel:
-    """What the pixels of a view are like if a hypothesis is true.
+    """Model of the pixels of a view if a hypothesis is true.
 
     Attributes:
-        outlier: log-likelihood of a pixel that the hypothesis does not explain, against one that it
-            explains exactly.
-        hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
-            less.
-        steep: how many pixels a steep surface may be off sideways.
-        edge: pixels of the outline within which a deviation is usual.
-        missing: weight of the share of the thing's pixels that show no surface in the misfit.
-        through: weight of the share of a hypothesis that is seen through.
+        outlier: log-likelihood of a pixel that the hypothesis does not explain, relative to an
+            exact match.
+        hole: log-likelihood of a missing measurement on the surface at normal incidence; it costs
+            less at grazing incidence.
+        steep: lateral error on a steep surface, pixels.
+        edge: distance to the outline within which deviations are usual, pixels.
+        missing: weight in the misfit of the share of thing pixels without a surface.
+        through: weight in the misfit of the share of a hypothesis that the camera sees through.
     """
 
     outlier: float = -4.0
@@ -34,21 +34,21 @@ class PixelModel:
 
 @dataclass(frozen=True, eq=False)
 class ViewLikelihood:
-    """How well H hypotheses explain one view.
+    """Likelihood of one view under H hypotheses.
 
     Attributes:
-        total: sum of the log-likelihoods of all pixels against an exact match, (H,) float64, 0 at
-            most.
-        pixels: pixels that it is a sum over: those of the thing and those where the hypothesis
-            shows, (H,) float64.
+        total: sum of the log-likelihoods of all pixels relative to an exact match, (H,) float64, at
+            most 0.
+        pixels: number of these pixels: those of the thing and those of the hypothesis, (H,)
+            float64.
         explained: share of the thing's pixels that the hypothesis explains, (H,) float64.
-        misfit: how badly the hypothesis explains the view if nothing is known of others, (H,)
-            float64, 0 for exactly: see ``likelihood``.
-        noise_share: part of the noise of the camera in the variance of a depth that is measured on
-            the hypothesis, beside the errors of its scan, (H,) float64.
-        visible: pixels where the hypothesis should show and depth was measured, (H,) float64; those
-            near the outline of the thing count less.
-        seen_behind: those of them in which something behind it was measured, (H,) float64.
+        misfit: absolute residual of the hypothesis, independent of its rivals, (H,) float64, 0 for
+            an exact match: see ``likelihood``.
+        noise_share: share of the camera noise in the variance of a depth on the hypothesis, as
+            opposed to errors of its scan, (H,) float64.
+        visible: pixels where the hypothesis should be visible and depth was measured, (H,) float64;
+            those near the outline of the thing have less weight.
+        seen_behind: those of them with a measurement behind the hypothesis, (H,) float64.
     """
 
     total: Float
@@ -60,7 +60,14 @@ class ViewLikelihood:
     seen_behind: Float
 
     def select(self, rows: Index) -> "ViewLikelihood":
-        """Some of the hypotheses, by index."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices, (N,).
+
+        Returns:
+            Likelihood under the selected hypotheses.
+        """
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
         return ViewLikelihood(**{name: part[rows] for name, part in parts.items()})
 
@@ -76,23 +83,23 @@ def likelihood(
     model: PixelModel = PixelModel(),
     below: Float | float = 0.0,
 ) -> ViewLikelihood:
-    """Judge every pixel of a view, given what it would show under each hypothesis.
+    """Evaluate every pixel of a view under each hypothesis.
 
     The depth on the thing is compared with the surface under the noise of the sensor, which grows
-    where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
-    where the surface should be visible and what is behind it was measured. Pixels as low as the
-    noise of the ground are judged by their depth, however they were segmented. What stands in front
-    of the surface is neutral, as are pixels where neither shows. What lies below the ground counts
-    like as large a share of the pixels that is seen through, whether it is visible or not.
+    with the steepness of the surface. Thing pixels without a surface are outliers, as are pixels
+    that measure the background of a surface that should be visible. Pixels within the noise of the
+    ground are evaluated by their depth, whatever their segmentation. Occluders in front of the
+    surface are neutral, as are pixels without thing and hypothesis. The share of the surface below
+    the ground counts like the same share of see-through pixels, whether it is visible or not.
 
     Args:
         view: the view.
-        rendered: the hypotheses as the view would show them.
-        model: of the pixels.
-        below: share of the surface of each hypothesis that lies below the ground, (H,).
+        rendered: rendering of the hypotheses in the view.
+        model: model of the pixels.
+        below: share of the surface of each hypothesis below the ground, (H,).
 
     Returns:
-        How well each hypothesis explains the view.
+        Likelihood of the view under each hypothesis.
     """
     shows = np.isfinite(rendered.depth)
     depth = np.where(shows, rendered.depth, 1)
@@ -106,14 +113,14 @@ def likelihood(
     sideways = model.steep * view.pitch * depth * steepness
     variance = view.noise**2 + rendered.errors[:, None] ** 2 + sideways**2
     squared = (observed - depth) ** 2 / variance
-    # A mixture of the sensor's noise and of outliers.
+    # Mixture of sensor noise and outliers.
     match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(
         np.exp(model.outlier)
     )
 
-    # Mismatches at an outline cost less, the nearer to it they are.
+    # Mismatches near the outline cost less.
     inner = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
-    deep = np.where(view.level, 0.1, inner)  # of the ground, more likely
+    deep = np.where(view.level, 0.1, inner)  # more likely ground pixels
     thing = view.kind == THING
     sunk = rendered.sunk(view)
     through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | sunk)
@@ -122,25 +129,28 @@ def likelihood(
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    # Low pixels may show the thing or the ground: their depth decides.
+    # Pixels at ground level may show the thing or the ground: their depth decides.
     low = view.level & ~sunk
     judged = np.where(through, np.where(low, match, model.outlier) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)
 
     counted = thing | through | hole
     explained = (shows & thing & (squared < 9)).sum(1) / max(1, int(thing.sum()))
-    # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
+    # The depth residual tells best whether a thing was taught. The outline depends on the
+    # segmentation.
+
     missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
     seen_through = np.where(through, judged / model.outlier, 0).sum(1)
     seen_through /= np.maximum(shows.sum(1), 1)
     impossible = np.minimum(seen_through + below, 1)
-    # Real sensors round off edges.
+    # Real sensors round off edges, so edge pixels have less weight.
     both = np.where(shows & thing, inner, 0)
     mismatch = -(both * match).sum(1) / np.maximum(both.sum(1), 1e-9)
     mismatch = np.where(both.any(1), mismatch, -model.outlier)
     misfit = mismatch - model.outlier * (
         model.missing * missing + model.through * impossible
     )
+
     pixels = counted.sum(1).astype(np.float64)
     visible = shows & ~hole & ~rendered.hidden(view)
     return ViewLikelihood(
@@ -155,6 +165,6 @@ def likelihood(
 
 
 def _noise_share(view: DepthView, rendered: Rendered) -> Float:
-    """Part of the noise in the variance of a typical depth of the thing, (H,)."""
+    """Share of the noise in the variance of a typical depth of the thing, (H,)."""
     noise = float(np.median(view.noise[view.kind == THING])) ** 2
     return np.asarray(noise / (noise + rendered.errors.astype(np.float64) ** 2))

@@ -1,4 +1,4 @@
-"""Recognise taught things by their geometry: propose, align, judge every pixel, believe."""
+"""Recognition of things by their geometry: proposals, registration, pixel likelihoods, belief."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,26 +35,25 @@ from nextview.things.view_templates import ViewTemplates, rank_within
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Index, Mask
 
-# share of things that do not stand on the ground: others carry them, or they hang
+# share of things that do not stand on the ground: others support them, or they hang
 UNUSUAL = 0.1
-THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
-LIKELY_THINGS = 4  # the same of the likeliest by outline
-RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
-RIVAL_THINGS = 2  # likeliest things that are turned
+THINGS_ALIGNED = 8  # likeliest things whose proposed orientations are all registered
+LIKELY_THINGS = 4  # the same by outline
+RIVAL_STEPS = 24  # rotations that are tried for a continuous near symmetry
+RIVAL_THINGS = 2  # likeliest things whose near symmetries are tried
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Hypotheses are aligned with few pixels first, and those that survive with more.
+    """One stage of a coarse-to-fine registration: few pixels first, more for the survivors.
 
     Attributes:
         side: rows and columns of pixels.
-        levels: steps of the alignment.
-        most: how many hypotheses survive at most, half of them of one thing.
-        hopeless: a hypothesis that is by so much less likely than the best one, as a logarithm, is
-            given up.
+        levels: steps of the registration.
+        most: largest number of survivors, at most half of them of one thing.
+        hopeless: log-likelihood below the best hypothesis at which a hypothesis is rejected.
         rivals: whether the likeliest hypotheses of RIVAL_THINGS things are also tried in the poses
-            that a near symmetry leads to.
+            of their near symmetries.
     """
 
     side: int
@@ -64,7 +63,7 @@ class Stage:
     rivals: bool = False
 
 
-FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
+FINE_SIDE = 40  # rows and columns of pixels in the last stage
 STAGES = (
     Stage(16, FIRST, 32, 100.0, rivals=True),
     Stage(24, COARSE_LEVELS, 12, 25.0),
@@ -74,30 +73,31 @@ STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class Verified:
-    """What the geometry of some views says.
+    """Result of the verification of some views.
 
     Attributes:
-        belief: in each thing, (T,) float64, sums to 1.
-        things: thing of each hypothesis that was judged, the likeliest hypothesis first, (M,)
-            int64.
-        probabilities: of these hypotheses, (M,) float64, their sum is 1.
-        poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
-        cameras: by how much each view sees them displaced, (M, V, 3) float64, metres, object frame.
+        belief: belief in each thing, (T,) float64, sums to 1.
+        things: thing of each hypothesis, the likeliest hypothesis first, (M,) int64.
+        probabilities: probability of each hypothesis, (M,) float64, sums to 1.
+        poses: poses of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
+        cameras: displacement of each hypothesis in each view, (M, V, 3) float64, metres, object
+            frame.
         mean: mean log-likelihood of the pixels of each view, (M, V) float64.
-        camera_costs: half the squared deviations of each camera's place, (M, V) float64.
+        camera_costs: half the squared normalised errors of each camera's position, (M, V) float64.
         log_belief: log-belief in the thing of each hypothesis by outline and size, (M,) float64.
         by_outline: belief in each thing by outline and size alone, (T,) float64.
         explained: share of the thing's pixels in each view that each hypothesis explains, (M, V)
             float64.
-        misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
+        misfit: residual of each hypothesis in each view, (M, V) float64; 0 for an exact match.
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
-        seen_behind: share of what should be visible of each hypothesis that the cameras see past,
-            of all views together, (M,) float64.
-        below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
-            noise, tilt and errors of the scan explain it.
-        stands: whether each hypothesis touches the ground, and would not fall over, (M,) bool;
-            True where no view shows the ground.
-        carried: whether others carry each hypothesis that does not stand on the ground, (M,) bool.
+        seen_behind: share of the visible pixels of each hypothesis with a measurement behind it,
+            over all views, (M,) float64.
+        below: depth of each hypothesis below the ground, (M,) float64, metres; 0 if noise, tilt and
+            errors of the scan explain it.
+        stands: whether each hypothesis touches the ground and does not topple, (M,) bool; True if
+            no view shows the ground.
+        carried: whether others support each hypothesis that does not stand on the ground, (M,)
+            bool.
     """
 
     belief: Float
@@ -118,7 +118,14 @@ class Verified:
     carried: Mask
 
     def select(self, rows: NDArray) -> "Verified":
-        """Some of the hypotheses, by index or mask."""
+        """Select hypotheses.
+
+        Args:
+            rows: indices or mask.
+
+        Returns:
+            The selected hypotheses, with probabilities that sum to 1.
+        """
         kept = (*OF_HYPOTHESES, "probabilities", "log_belief")
         some = replace(self, **{name: getattr(self, name)[rows] for name in kept})
         return replace(
@@ -126,7 +133,14 @@ class Verified:
         )
 
     def judged(self, truth: int) -> JudgedEpisode:
-        """The same as an example of the thing of this number, to fit weights to."""
+        """Convert the result to an example for the fit of the weights.
+
+        Args:
+            truth: number of the true thing.
+
+        Returns:
+            The example.
+        """
         return JudgedEpisode(
             truth,
             self.things,
@@ -137,11 +151,14 @@ class Verified:
         )
 
     def alignment(self, rows: Index, verifier: "Verifier") -> Alignment:
-        """Some of the hypotheses, as they were aligned.
+        """The alignment of some hypotheses.
 
         Args:
-            rows: which, (N,).
-            verifier: that found them.
+            rows: indices of the hypotheses, (N,).
+            verifier: the verifier that found them.
+
+        Returns:
+            Their alignment in the object frame.
         """
         things = self.things[rows]
         rotations = self.poses[rows, :3, :3]
@@ -156,7 +173,7 @@ class Verified:
 
     @property
     def residual(self) -> float:
-        """How badly the likeliest hypothesis explains the views, in the mean; 0 for exactly."""
+        """Mean residual of the likeliest hypothesis over the views; 0 for an exact match."""
         return float(self.misfit[0].mean())
 
 
@@ -174,19 +191,19 @@ OF_HYPOTHESES = (
     "stands",
     "carried",
 )
-"""What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
+"""Fields of ``Verified`` for each hypothesis, besides its probability and prior belief."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Proposed:
-    """What is aligned, M hypotheses.
+    """M hypotheses before the registration.
 
     Attributes:
         things: number of the surface of each, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
-        centres: of the surfaces in the object frame, (M, 3) float64, metres.
-        log_belief: before the geometry is looked at, (M,) float64.
-        by_outline: belief in each thing before that, (T,) float64, sums to 1.
+        centres: centres of the surfaces in the object frame, (M, 3) float64, metres.
+        log_belief: log-belief before the verification, (M,) float64.
+        by_outline: belief in each thing before the verification, (T,) float64, sums to 1.
     """
 
     things: Index
@@ -196,7 +213,7 @@ class _Proposed:
     by_outline: Float
 
     def select(self, rows: NDArray) -> "_Proposed":
-        """Some of the hypotheses, by index or mask."""
+        """Select hypotheses by index or mask."""
         return replace(
             self,
             things=self.things[rows],
@@ -206,7 +223,7 @@ class _Proposed:
         )
 
     def followed_by(self, others: "_Proposed") -> "_Proposed":
-        """These hypotheses, and others after them."""
+        """Append other hypotheses."""
         return replace(
             self,
             things=np.concatenate([self.things, others.things]),
@@ -218,14 +235,14 @@ class _Proposed:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """How likely M hypotheses are.
+    """Likelihood of M hypotheses.
 
     Attributes:
-        scores: their logarithms, up to a constant, (M,) float64.
-        costs: of the cameras' errors, (M, V) float64.
-        views: how well they explain the pixels of each of V views.
-        ground: how they stand on the ground.
-        carried: whether others carry them, (M,) bool.
+        scores: log-likelihoods, up to a constant, (M,) float64.
+        costs: costs of the camera errors, (M, V) float64.
+        views: likelihoods of each of V views.
+        ground: stability on the ground.
+        carried: whether others support them, (M,) bool.
     """
 
     scores: Float
@@ -235,7 +252,7 @@ class _Judged:
     carried: Mask
 
     def select(self, rows: Index) -> "_Judged":
-        """Some of the hypotheses, by index."""
+        """Select hypotheses by index."""
         return _Judged(
             self.scores[rows],
             self.costs[rows],
@@ -246,13 +263,15 @@ class _Judged:
 
 
 class Verifier:
-    """Recognises things of known geometry, and tells their poses.
+    """Recognises things of known geometry and estimates their poses.
 
     Attributes:
-        caster: the surfaces of the things.
-        weights: how much each kind of evidence counts.
-        rivals: of each thing the turns about its centroid after which it hardly looks different,
-            (N, 3, 3) float64; () where none are known.
+        caster: surfaces of the things.
+        weights: weights of the evidence.
+        pixels: model of the pixels.
+        prior: prior of the cameras and the vertical.
+        rivals: rotations of each thing about its centroid that hardly change its appearance, (N, 3,
+            3) float64; () if unknown.
     """
 
     def __init__(
@@ -262,13 +281,13 @@ class Verifier:
         pixels: PixelModel = PixelModel(),
         prior: RegistrationPrior = RegistrationPrior(),
     ) -> None:
-        """Make the surfaces ready for casting.
+        """Prepare the surfaces for ray casting.
 
         Args:
-            surfaces: of the things.
-            weights: how much each kind of evidence counts.
-            pixels: what pixels are like if a hypothesis is true.
-            prior: how far off cameras and the vertical may be.
+            surfaces: surfaces of the things.
+            weights: weights of the evidence.
+            pixels: model of the pixels.
+            prior: prior of the cameras and the vertical.
         """
         self.caster = SurfaceCaster(surfaces)
         self.weights = weights
@@ -282,13 +301,13 @@ class Verifier:
         any_orientation: bool = False,
         prior: Float | None = None,
     ) -> Verified:
-        """Search all things in all orientations, align what is likely with all views, judge it.
+        """Search all things in all orientations, register the likely ones, and verify them.
 
         Args:
-            observations: views of one thing, all in one object frame.
-            any_orientation: whether all orientations are equally likely, and the ground does not
-                count: the thing is held, or flies.
-            prior: log-belief in each thing beforehand, (T,); None for none.
+            observations: views of one thing in one object frame.
+            any_orientation: whether all orientations are equally likely and the ground is ignored,
+                because the thing is in a gripper or in the air.
+            prior: prior log-belief in each thing, (T,); None for a uniform one.
 
         Returns:
             The belief by outline, size and geometry, and the poses.
@@ -304,7 +323,7 @@ class Verifier:
         found = self.templates.propose(images)
         if not len(found.things):
             raise ObservationError(
-                "no view shows enough of the thing to be compared with others"
+                "no view shows enough of the thing to compare it with the scans"
             )
         by_outline = found.log_belief + (0 if prior is None else prior)
         by_outline -= by_outline.max()
@@ -326,12 +345,12 @@ class Verifier:
         found: Verified,
         resting: bool,
     ) -> float:
-        """How much likelier a stranger of its shape is than the likeliest hypothesis.
+        """Log-odds of a stranger of the same shape against the likeliest hypothesis.
 
         Args:
-            observations: the views that it was found in.
-            found: what was found of them.
-            resting: whether the ground counts, if it is seen.
+            observations: the views.
+            found: their verification.
+            resting: whether the ground counts if it is visible.
 
         Returns:
             Log-odds, nats: see ``stranger.log_odds_of_stranger``.
@@ -350,14 +369,14 @@ class Verifier:
 
     @cached_property
     def templates(self) -> ViewTemplates:
-        """Pictures of the things from all around, which propose orientations."""
+        """Templates of the things from all directions, which propose orientations."""
         return ViewTemplates(self.caster)
 
     def prepare(self, threads: int = 0) -> None:
-        """Render the pictures now, so that the first frame takes as long as all others.
+        """Render the templates now, so that they do not delay the first frame.
 
         Args:
-            threads: that work side by side; 0 for one on each core.
+            threads: number of threads; 0 for one on each core.
         """
         if "templates" not in vars(self):
             self.templates = ViewTemplates(self.caster, threads)
@@ -369,19 +388,19 @@ class Verifier:
         hidden: bool,
         images: Sequence[MetricImage],
     ) -> tuple[_Proposed, Alignment]:
-        """Align the first orientation of each thing, and add all others of the likeliest things.
+        """Register the first orientation of each thing, and add the others of the likeliest things.
 
-        The likeliest are those that fit best after alignment, and those of the likeliest outlines;
-        all of them where a part of the outline is hidden: its first orientation may be any.
+        The likeliest things are those with the best scores after registration, and those with the
+        likeliest outlines. If a part of the outline is hidden, the others of all things are added.
 
         Args:
             proposed: orientations of things.
-            ranks: how many orientations of the same thing come before each, (M,).
+            ranks: number of earlier orientations of the same thing, (M,).
             hidden: whether every view shows only a part of the outline.
             images: the views.
 
         Returns:
-            Hypotheses to be aligned, and their poses so far.
+            Hypotheses to be registered, and their initial poses.
         """
         stage = STAGES[0]
         views = [image.view(stage.side) for image in images]
@@ -405,9 +424,7 @@ class Verifier:
         images: Sequence[MetricImage],
         level: Float,
     ) -> Verified:
-        """The proposals aligned and judged, coarse to fine, in a frame that was turned to be
-        level.
-        """
+        """Register and verify the proposals, coarse to fine, in a level frame."""
         for stage in STAGES:
             views = [image.view(stage.side) for image in images]
             alignment = align(self.caster, alignment, views, stage.levels, self.prior)
@@ -417,11 +434,12 @@ class Verifier:
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
             rows = order[different_poses(self.caster, alignment.select(order))]
-            # no thing crowds out all others, as a round one would
+            # a thing with many similar poses, such as a round one, does not displace all others
             rows = rows[rank_within(alignment.things[rows]) < stage.most // 2]
             rows = rows[: stage.most]
             alignment = alignment.select(rows)
             proposed = proposed.select(rows)
+
             if stage.rivals and self.rivals:
                 turned, source = self._rivals(alignment)
                 alignment = joined(alignment, turned)
@@ -436,9 +454,9 @@ class Verifier:
         views: Sequence[DepthView],
         others_carry: bool = False,
     ) -> _Judged:
-        """Score hypotheses by the pixels of all views and by how they stand.
+        """Score hypotheses by the pixels of all views and by their stability.
 
-        ``others_carry`` says whether it is looked up what else than the ground carries them.
+        ``others_carry`` enables the search for supports other than the ground.
         """
         ground = standing(self.caster, alignment, views, self.prior.tilt)
         rendered = [
@@ -461,10 +479,10 @@ class Verifier:
         return _Judged(scores, costs, judged, ground, by_others)
 
     def _rivals(self, alignment: Alignment) -> tuple[Alignment, Index]:
-        """The likeliest hypotheses in the poses in which their things hardly look different.
+        """The likeliest hypotheses in the poses of their near symmetries.
 
         Returns:
-            These, and the row of the hypothesis from which each was turned, (N,).
+            The alignment, and the index of the original hypothesis of each, (N,).
         """
         first = np.sort(np.unique(alignment.things, return_index=True)[1])
         some = [
@@ -486,9 +504,9 @@ class Verifier:
         judged: _Judged,
         level: Float,
     ) -> Verified:
-        """The answer of the proposals that survived, sorted by their scores.
+        """Assemble the result from the surviving proposals, sorted by their scores.
 
-        ``alignment`` is in the frame that was turned to be level.
+        ``alignment`` is in the level frame.
         """
         visible = np.sum([view.visible for view in judged.views], axis=0)
         behind = np.sum([view.seen_behind for view in judged.views], axis=0)
@@ -517,7 +535,14 @@ class Verifier:
 
 
 def rival_turns(symmetries: Sequence[Symmetry]) -> Float:
-    """Turns that near symmetries lead to, without that by nothing, (N, 3, 3)."""
+    """Rotations that near symmetries generate, without the identity.
+
+    Args:
+        symmetries: near symmetries of a thing.
+
+    Returns:
+        Rotation matrices, (N, 3, 3).
+    """
     vectors = [
         2 * np.pi * step / steps * np.array(one.axis)
         for one in symmetries
@@ -530,7 +555,7 @@ def rival_turns(symmetries: Sequence[Symmetry]) -> Float:
 def _levelled(
     observations: Sequence[Observation],
 ) -> tuple[list[MetricImage], Float]:
-    """The observations that show the thing, turned so that the ground is level, and that turn."""
+    """Images that show the thing, rotated so that the ground is level, and that rotation."""
     images = images_of(observations)
     grounds = [image.ground for image in images if image.ground is not None]
     level = levelling(grounds)
@@ -538,19 +563,22 @@ def _levelled(
 
 
 def _held(observations: Sequence[Observation]) -> tuple[list[MetricImage], Float]:
-    """The observations that show the thing, without a ground to stand on, and no turn."""
+    """Images that show the thing, without a ground, and the identity rotation."""
     images = [replace(image, ground=None) for image in images_of(observations)]
     return images, np.eye(3)
 
 
 def images_of(observations: Sequence[Observation]) -> list[MetricImage]:
-    """Take over the observations that show the thing.
+    """Convert the observations that show the thing to metres.
 
     Args:
-        observations: of one thing.
+        observations: views of one thing.
+
+    Returns:
+        Images of the views that show it.
 
     Raises:
-        ObservationError: none of them shows it, or its scale is not known.
+        ObservationError: no view shows the thing, or its scale is not known.
     """
     found = (MetricImage.of(observation) for observation in observations)
     images = [image for image in found if image is not None]

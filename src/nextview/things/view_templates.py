@@ -1,13 +1,13 @@
-"""Proposals for things in any orientation: what is seen, compared with pictures from all around.
+"""Proposals of things in any orientation, by matching of depth templates.
 
-Each thing is rendered from directions all around it, as template matching does (Hinterstoisser et
+Each thing is rendered from directions all around it, as in template matching (Hinterstoisser et
 al., "Model based training, detection and pose estimation of texture-less 3D objects in heavily
-cluttered scenes", 2012). A picture is a small grid over the outline, in metres, so that a picture
-of another size does not fit. What is seen is turned in the image plane instead of the templates.
-Outlines are compared by their intersection over union where it is known what is there: not where
-something stands before the thing, where nothing was measured, or beyond the border of the image.
-What is partly hidden is also compared displaced to what hides it. Depths are compared by the mean
-squared difference where both show. All of it is a few matrix products.
+cluttered scenes", 2012). A template is a small metric grid over the outline, so that a template of
+another size does not fit. The view is rotated in the image plane instead of the templates. The
+score of outlines is their intersection over union where the view is conclusive: not at occluders,
+at pixels without a measurement, or beyond the border of the image. A partly occluded outline is
+also shifted towards the occluder. The score of depths is their mean squared difference in the
+intersection. All scores are a few matrix products.
 """
 
 import os
@@ -25,42 +25,43 @@ from nextview.things.depth_view import NOT_MEASURED, THING, MetricImage
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
-TEMPLATE_DIRECTIONS = 162  # from which each thing is rendered: some 15 degrees apart
-TURNS = 24  # in the image plane, in which what is seen is compared: 15 degrees apart
-TEMPLATE_SIDE = 16  # rows and columns of a picture
-TEMPLATE_REACH = 2.2  # from its centre to its borders, root mean squares of the outline
-RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
-TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
-MOST_ORIENTATIONS = 16  # of one thing that are proposed
-THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
-HIDDEN_PROPOSED = 100  # the same where every view shows a part of the outline only
-FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
-NO_FIT = 12.0  # cost of a template of another size than what is seen
-# of the middle of an outline, root mean squares of it, beyond which depths do not differ
+TEMPLATE_DIRECTIONS = 162  # viewing directions of the templates, some 15 degrees apart
+TURNS = 24  # rotations of the view in the image plane, 15 degrees apart
+TEMPLATE_SIDE = 16  # rows and columns of a template
+TEMPLATE_REACH = 2.2  # half width of a template, root mean squares of the outline
+RENDERING_PIXELS = 28  # rows and columns of a rendering
+TEMPLATE_DISTANCE = 5.0  # distance of the camera from the centre, radii
+MOST_ORIENTATIONS = 16  # most proposed orientations of one thing
+THINGS_PROPOSED = 40  # proposed things, the likeliest by their outlines
+HIDDEN_PROPOSED = 100  # the same where every view shows only a part of the outline
+FEWEST_OUTLINE_PIXELS = 12  # fewest pixels of an outline that can be matched
+NO_FIT = 12.0  # cost of a template of another size
+# largest depth difference to the median of an outline, root mean squares of the outline
 FARTHEST_BEHIND = 3.0
-SPECK = 0.05  # of the largest part of an outline, below which a part is noise
+# size relative to the largest part of an outline, below which a part is noise
+SPECK = 0.05
 
 OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
-"""How much a unit of the mismatch of outlines and depths costs."""
-SIZE_STEP = 0.06  # between the logarithms of the sizes at which a view is compared
-# range of the template's size relative to that of the seen outline, logarithms
+"""Cost of a unit mismatch of outlines and of depths."""
+SIZE_STEP = 0.06  # step between the tested log-sizes of a view
+# range of the template's log-size relative to the visible outline
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
-SHIFTS = (0.5, 1.5)  # step and reach of the middle of an occluded outline, sizes
+SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
 HIDDEN_SHARE = (
-    0.05  # share of occluders around an outline from which it counts as occluded
+    0.05  # share of occluders around an outline, from which it counts as occluded
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Small pictures of outlines and depths, N of them, C cells each.
+    """N templates of outlines and depths, with C cells each.
 
     Attributes:
-        outline: which cells show the thing, 0 or 1, (N, C) float32.
-        depth: behind the middle of the outline, root mean squares of the outline; 0 where nothing
-            shows, (N, C) float32.
+        outline: cells that show the thing, 0 or 1, (N, C) float32.
+        depth: depth relative to the median of the outline, in root mean squares of the outline; 0
+            for empty cells, (N, C) float32.
     """
 
     outline: Float32
@@ -69,13 +70,13 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class SeenPictures:
-    """What a view shows on the grid of templates of one size, turned and moved, A pictures.
+    """A rotations of a view, sampled on the grid of templates of one size.
 
     Attributes:
-        outline: which cells show the thing, 0 or 1, (A, C) float32.
-        known: of which cells it is known whether they show it, 0 or 1, (A, C) float32.
-        depth: as that of ``Pictures``.
-        area: of the whole outline, cells.
+        outline: cells that show the thing, 0 or 1, (A, C) float32.
+        known: cells with a conclusive measurement, 0 or 1, (A, C) float32.
+        depth: see ``Pictures``.
+        area: area of the whole outline, cells.
     """
 
     outline: Float32
@@ -86,14 +87,14 @@ class SeenPictures:
 
 @dataclass(frozen=True, eq=False)
 class OrientedProposals:
-    """Hypotheses of things in any orientation.
+    """M hypotheses of things in any orientation.
 
     Attributes:
         things: thing of each, (M,) int64.
-        ranks: how many orientations of its thing suit its view better, (M,) int64.
+        ranks: number of better orientations of the same thing in the same view, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
-        centres: of the surfaces in the object frame, (M, 3) float64, metres.
-        log_belief: in each thing by outline and the shape of the depth, up to a constant, (T,)
+        centres: centres of the surfaces in the object frame, (M, 3) float64, metres.
+        log_belief: log-belief in each thing by outline and relative depth, up to a constant, (T,)
             float64.
         hidden: whether every view shows only a part of the outline, which then says little.
     """
@@ -107,24 +108,24 @@ class OrientedProposals:
 
 
 class ViewTemplates:
-    """Pictures of things from all around.
+    """Templates of things from all directions.
 
     Attributes:
         things: thing of each template, (N,) int64.
-        rotations: from the axes of the scan file to those of a camera that looks at the middle of
+        rotations: from the axes of the scan file to those of a camera that looks at the centre of
             the outline, (N, 3, 3) float64.
-        offsets: from the middle of the outline, at its median depth, to the centre of the surface,
-            in these axes, (N, 3) float64, metres.
+        offsets: from the centre of the outline, at its median depth, to the centre of the surface,
+            in the camera axes, (N, 3) float64, metres.
         sizes: root mean square of the outline, metres, (N,) float64.
-        pictures: what the camera sees.
+        pictures: the templates.
     """
 
     def __init__(self, caster: SurfaceCaster, threads: int = 1) -> None:
-        """Render all surfaces of a caster from all around.
+        """Render all surfaces from all directions.
 
         Args:
-            caster: of the things.
-            threads: that work side by side; 0 for one on each core.
+            caster: surfaces of the things.
+            threads: number of threads; 0 for one on each core.
         """
         looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
         with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
@@ -140,16 +141,16 @@ class ViewTemplates:
         )
 
     def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
-        """Orientations of the likeliest things, given what some views show.
+        """Propose orientations of the likeliest things, given some views.
 
-        Each view proposes orientations, of things that suit all of the views.
+        Each view proposes orientations of the things that match all views.
 
         Args:
-            images: the views, of one thing.
+            images: views of one thing.
 
         Returns:
-            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none where too little is
-            seen.
+            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none if too little is
+            visible.
         """
         known = int(self.things.max()) + 1
         views = [one for one in map(SeenOutline.of, images) if one is not None]
@@ -192,7 +193,7 @@ class ViewTemplates:
         )
 
     def _fit(self, view: "SeenOutline") -> "TemplateFit":
-        """How well each template fits a view, where it fits best."""
+        """Best match of each template in a view."""
         count = len(self.things)
         fit = TemplateFit(
             np.full(count, NO_FIT, np.float32),
@@ -200,12 +201,14 @@ class ViewTemplates:
             np.zeros((count, 2)),
             np.zeros(count),
         )
+
         bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
 
         sizes = SIZES_HIDDEN if view.hidden else SIZES
         first, last = (round(one / SIZE_STEP) for one in sizes)
         if not ((bins >= first) & (bins <= last)).any():
-            bins = bins.clip(first, last)  # those of the next size are the likeliest
+            # the templates of the next size are the likeliest
+            bins = bins.clip(first, last)
 
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
         grid = turned_grid(turns)
@@ -234,7 +237,7 @@ class ViewTemplates:
     def _poses(
         self, fit: "TemplateFit", view: "SeenOutline", rows: Index
     ) -> tuple[Float, Float]:
-        """Rotations, (M, 3, 3), and centres, (M, 3), of some templates where they fit best."""
+        """Rotations, (M, 3, 3), and centres, (M, 3), of some templates at their best match."""
         x, y = view.camera.slopes(*(view.centre + fit.shift[rows])[:, ::-1].T)
         ahead = np.stack([x, y, np.ones(len(rows))], -1)
         lengths = np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -248,13 +251,13 @@ class ViewTemplates:
 
 @dataclass(frozen=True, eq=False)
 class TemplateFit:
-    """How well N templates fit a view, and where.
+    """Best matches of N templates in a view.
 
     Attributes:
-        cost: (N,) float32; NO_FIT where they cannot.
-        turn: in the image plane, radians, (N,) float64.
-        shift: of the middle of the outline, x and y, pixels, (N, 2) float64.
-        behind: by how much the middle of the outline lies behind that of what is seen, metres, (N,)
+        cost: cost of each match, (N,) float32; NO_FIT if the size differs.
+        turn: rotation in the image plane, radians, (N,) float64.
+        shift: shift of the centre of the outline, x and y, pixels, (N, 2) float64.
+        behind: depth of the template's outline relative to the visible outline, metres, (N,)
             float64.
     """
 
@@ -265,10 +268,13 @@ class TemplateFit:
 
 
 def rank_within(things: Index) -> Index:
-    """How many earlier elements are the same, for each element, (N,).
+    """Number of earlier equal elements for each element.
 
     Args:
         things: numbers, (N,).
+
+    Returns:
+        Ranks, (N,) int64.
     """
     order = np.argsort(things, kind="stable")
     first = np.searchsorted(things[order], things[order])
@@ -278,7 +284,14 @@ def rank_within(things: Index) -> Index:
 
 
 def spread_directions(count: int) -> Float:
-    """Unit vectors that are spread evenly over the sphere, on a spiral, (count, 3)."""
+    """Directions that are spread evenly over the sphere, on a spiral.
+
+    Args:
+        count: number of directions.
+
+    Returns:
+        Unit vectors, (count, 3).
+    """
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     azimuth = np.pi * (1 + np.sqrt(5)) * k
@@ -287,9 +300,13 @@ def spread_directions(count: int) -> Float:
 
 
 def looking_from(directions: Float) -> Float:
-    """Rotations to the axes of cameras that look at the origin, (N, 3, 3), of directions, (N, 3).
+    """Rotations from the world to cameras that look at the origin.
 
-    Their rows are the camera's axes: x right, y down, z forward.
+    Args:
+        directions: unit vectors from the origin to the cameras, (N, 3).
+
+    Returns:
+        Rotation matrices, (N, 3, 3), whose rows are the camera axes: x right, y down, z forward.
     """
     forward = -directions
     aside = np.where(np.abs(forward[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
@@ -309,9 +326,9 @@ class _Rendered:
 
 
 def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
-    """Render one thing by cameras with these axes, (N, 3, 3), all at once.
+    """Render one thing from all cameras with these axes, (N, 3, 3).
 
-    What ``SeenOutline`` computes of a view is computed for all of them in the same way.
+    The statistics of the outlines are those of ``SeenOutline``, computed for all at once.
     """
     radius = float(caster.radii[thing])
     focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
@@ -332,7 +349,7 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     depth = depth[kept]
     shown = shown[kept]
 
-    # middle and spread of each outline, and its median depth
+    # centre and spread of each outline, and its median depth
     count = shown.sum(1)
     pixels = np.stack([column, row], -1).astype(np.float64)
     centre = shown @ pixels / count[:, None]
@@ -351,7 +368,7 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     )
     offsets = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle[:, None] * ahead
 
-    # what the cells of the grid show
+    # contents of the cells
     cells = turned_grid(np.zeros(1))[0] * spread[:, None, None] + centre[:, None]
     at = np.rint(cells).astype(np.int64)
     inside = ((at >= 0) & (at < RENDERING_PIXELS)).all(2)
@@ -372,19 +389,19 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
 
 @dataclass(frozen=True, eq=False)
 class SeenOutline:
-    """What a view shows of a thing.
+    """The visible outline of a thing in one view.
 
     Attributes:
-        depth: of all pixels, (H, W) float32, metres.
-        shown: pixels that show the thing, (H, W) bool.
-        known: pixels of which it is known whether they show it, (H, W) bool.
-        camera: of the image.
+        depth: depth of all pixels, (H, W) float32, metres.
+        shown: pixels of the thing, (H, W) bool.
+        known: pixels with a conclusive measurement, (H, W) bool.
+        camera: camera of the image.
         pose: camera-to-object, (4, 4).
-        centre: of the outline, x and y, pixels, (2,).
+        centre: centre of the outline, x and y, pixels, (2,).
         middle: median depth of the thing, metres.
         size: root mean square of the outline, metres.
-        shifts: by which the middle of the thing may be off that of what is seen, x and y, sizes,
-            (S, 2); the first is none.
+        shifts: possible offsets between the centre of the thing and that of its visible part, x and
+            y, sizes, (S, 2); the first is zero.
     """
 
     depth: Float32
@@ -399,7 +416,14 @@ class SeenOutline:
 
     @classmethod
     def of(cls, image: MetricImage) -> "SeenOutline | None":
-        """That of an image; None where too little is seen."""
+        """Outline of a thing in an image.
+
+        Args:
+            image: a view of the thing.
+
+        Returns:
+            The outline; None if too little is visible.
+        """
         shown = without_specks(image.kind == THING)
         if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
             return None
@@ -412,6 +436,7 @@ class SeenOutline:
         hiding = around & image.hiding
         if np.count_nonzero(hiding) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
+
         rows, columns = np.nonzero(hiding)
         towards = np.array([columns.mean(), rows.mean()]) - found.centre
         step, reach = SHIFTS
@@ -429,14 +454,17 @@ class SeenOutline:
         camera: PinholeCamera,
         pose: Float,
     ) -> "SeenOutline":
-        """Return the outline of some pixels.
+        """Outline of given pixels.
 
         Args:
-            depth: of all pixels, (H, W) float32, metres.
-            shown: pixels that show the thing, FEWEST_OUTLINE_PIXELS at least, (H, W) bool.
-            known: pixels of which it is known whether they show it, (H, W) bool.
-            camera: of the image.
+            depth: depth of all pixels, (H, W) float32, metres.
+            shown: pixels of the thing, at least FEWEST_OUTLINE_PIXELS, (H, W) bool.
+            known: pixels with a conclusive measurement, (H, W) bool.
+            camera: camera of the image.
             pose: camera-to-object, (4, 4).
+
+        Returns:
+            The outline.
         """
         rows, columns = np.nonzero(shown)
         centre = np.array([columns.mean(), rows.mean()])
@@ -459,22 +487,25 @@ class SeenOutline:
 
     @property
     def ahead(self) -> Float:
-        """Towards the middle of the outline, camera axes, one metre of depth long, (3,)."""
+        """Vector to the centre of the outline, camera axes, one metre of depth long, (3,)."""
         x, y = self.camera.slopes(*self.centre[::-1])
         return np.array([x, y, 1.0])
 
     @property
     def axes(self) -> Float:
-        """Axes of a camera that looks at the middle of the outline, columns, (3, 3)."""
+        """Axes of a camera that looks at the centre of the outline, as columns, (3, 3)."""
         return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
 
     def pictures(self, size: float, shift: Float, grid: Float32) -> SeenPictures:
-        """Outline and depth on the grid of templates of a size.
+        """Sample outline and depth on the grid of templates of one size.
 
         Args:
             size: root mean square of their outlines, metres.
-            shift: of the grid's middle from that of the outline, pixels, (2,).
-            grid: cells of the grid, turned in the image plane, see ``turned_grid``, (A, C, 2).
+            shift: shift of the grid from the centre of the outline, pixels, (2,).
+            grid: rotated cells of the grid, see ``turned_grid``, (A, C, 2).
+
+        Returns:
+            A pictures.
         """
         pixels = size * self.focal / self.middle
         turned = grid * np.float32(pixels) + (self.centre + shift).astype(np.float32)
@@ -497,10 +528,10 @@ class SeenOutline:
 
 
 def turned_grid(turns: Float) -> Float32:
-    """Cells of a template's grid, turned in the image plane by some angles.
+    """Cells of a template's grid, rotated in the image plane.
 
     Args:
-        turns: radians, (A,).
+        turns: angles, radians, (A,).
 
     Returns:
         x and y of each cell, sizes, (A, C, 2) float32.
@@ -512,7 +543,7 @@ def turned_grid(turns: Float) -> Float32:
 
 
 def without_specks(shown: Mask) -> Mask:
-    """Leave out parts of an outline that are far smaller than its largest: noise of the surface.
+    """Remove parts of an outline that are far smaller than its largest one: they are noise.
 
     Args:
         shown: pixels of a thing, (H, W).
@@ -529,28 +560,28 @@ def without_specks(shown: Mask) -> Mask:
 
 
 def _from_z_to(direction: Float) -> Float:
-    """The smallest rotation that takes z to a unit vector, (3, 3)."""
+    """The smallest rotation that maps z to a unit vector, (3, 3)."""
     axis = np.array([-direction[1], direction[0], 0.0])  # z x direction
     skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + skew + skew @ skew / (1 + direction[2])
 
 
 def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
-    """Return how badly pictures fit templates of their size.
+    """Costs of the matches between views and templates of one size.
 
     Args:
-        seen: A pictures.
+        seen: A pictures of a view.
         known: N templates.
 
     Returns:
-        Costs, (A, N) float32, 0 for a perfect fit; and how far behind the template what is seen
-        lies in the mean, sizes, (A, N) float32.
+        Costs, (A, N) float32, 0 for a perfect match; and mean depth of the view behind the
+        template, sizes, (A, N) float32.
     """
     both = seen.outline @ known.outline.T
     one = max(seen.area, 1.0) + seen.known @ known.outline.T - both
     overlap = both / np.maximum(one, both + 1e-6)
 
-    # The mean squared difference where both show, without its mean.
+    # Variance of the depth difference in the intersection.
     count = np.maximum(both, 1)
     mean = (seen.depth @ known.outline.T - seen.outline @ known.depth.T) / count
     squares = (seen.depth**2) @ known.outline.T + seen.outline @ (known.depth**2).T

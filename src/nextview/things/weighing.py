@@ -1,4 +1,4 @@
-"""How much outlines, size and geometry count beside each other, and the belief that follows."""
+"""Weights of outline, size and geometry, and the belief that follows from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,8 +9,8 @@ import numpy as np
 from nextview.errors import ModelError
 from nextview.types import Float, Index
 
-NEVER = -1e9  # log-likelihood of a thing that was not aligned
-# belief in the truth below which it is not told how wrong it was
+NEVER = -1e9  # log-likelihood of a thing without a registered hypothesis
+# lower bound of the belief in the truth before its logarithm
 LEAST_TRUE_BELIEF = 1e-9
 
 GEOMETRY_WEIGHTS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
@@ -18,24 +18,23 @@ OUTLINE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)
 CAMERA_WEIGHTS = (0.1, 0.5)
 VIEW_CORRELATIONS = (0.0, 0.2, 0.5, 1.0)
 DOUBTS = (0.001, 0.003, 0.01, 0.03)
-"""What ``fit_weights`` tries."""
+"""Candidate values of ``fit_weights``."""
 
 
 @dataclass(frozen=True)
 class EvidenceWeights:
-    """How much each kind of evidence counts.
+    """Weights of the kinds of evidence.
 
-    The pixels of a view are correlated, and so are the views of a thing: they are not as many
-    independent pieces of evidence. What the sums are multiplied by is fitted to views of which the
-    truth is known.
+    The pixels of a view are correlated, and so are the views of a thing, so they are not
+    independent pieces of evidence. The factors of their sums are fitted to views of known things.
 
     Attributes:
         geometry: of the mean log-likelihood of a view's pixels.
         outlines: of the log-belief by outline and size.
-        cameras: of the log-likelihood of the errors of the cameras' places.
+        cameras: of the log-likelihood of the camera position errors.
         correlation: of two views, 0 to 1: the sum over k views is divided by ``1 + correlation * (k
             - 1)``.
-        doubt: share of the belief that is left to outline and size alone.
+        doubt: share of the belief that depends on outline and size alone.
     """
 
     geometry: float = 40.0
@@ -49,26 +48,26 @@ class EvidenceWeights:
 
         Args:
             mean: mean log-likelihood of the pixels of each view, (M, V).
-            camera_costs: half the squared deviations of each camera's place, (M, V).
+            camera_costs: half the squared normalised errors of each camera's position, (M, V).
             log_belief: log-belief in the thing of each hypothesis by outline and size, (M,).
 
         Returns:
-            (M,) float64.
+            Scores, (M,) float64.
         """
         of_views = self.geometry * mean - self.cameras * camera_costs
         together = 1 + self.correlation * (mean.shape[1] - 1)
         return of_views.sum(1) / together + self.outlines * log_belief
 
     def belief(self, scores: Float, things: Index, by_outline: Float) -> Float:
-        """Belief in each thing, by its likeliest hypothesis.
+        """Belief in each thing, from its likeliest hypothesis.
 
         Args:
-            scores: of M hypotheses, (M,).
+            scores: scores of M hypotheses, (M,).
             things: thing of each, (M,) int.
             by_outline: belief in each thing by outline and size alone, (T,), sums to 1.
 
         Returns:
-            (T,) float64, sums to 1.
+            Belief, (T,) float64, sums to 1.
         """
         best = np.full(len(by_outline), NEVER)
         np.maximum.at(best, things, scores)
@@ -79,13 +78,13 @@ class EvidenceWeights:
 
 @dataclass(frozen=True, eq=False)
 class JudgedEpisode:
-    """What was found of the hypotheses of one thing after some views, and which thing it was.
+    """Evidence about the hypotheses of one object after some views, and the true thing.
 
     Attributes:
-        truth: number of the thing.
+        truth: number of the true thing.
         things: thing of each hypothesis, (M,) int64.
         mean: mean log-likelihood of the pixels of each view, (M, V) float64.
-        camera_costs: half the squared deviations of each camera's place, (M, V) float64.
+        camera_costs: half the squared normalised errors of each camera's position, (M, V) float64.
         log_belief: log-belief in the thing of each hypothesis by outline and size, (M,) float64.
         by_outline: belief in each thing by outline and size alone, (T,) float64.
     """
@@ -98,18 +97,25 @@ class JudgedEpisode:
     by_outline: Float
 
     def belief(self, weights: EvidenceWeights) -> Float:
-        """Belief in each thing with some weights, (T,) float64."""
+        """Belief in each thing.
+
+        Args:
+            weights: weights of the evidence.
+
+        Returns:
+            Belief, (T,) float64, sums to 1.
+        """
         scores = weights.scores(self.mean, self.camera_costs, self.log_belief)
         return weights.belief(scores, self.things, self.by_outline)
 
 
 def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
-    """Choose the weights with the least mean negative log-belief in the truth.
+    """Choose the weights with the smallest mean negative log-belief in the truth.
 
-    All combinations of some values are tried; the doubt is fitted after the others.
+    The search covers a grid of values; the doubt is fitted after the other weights.
 
     Args:
-        episodes: of things whose names are known, after one and more views.
+        episodes: episodes of known things, after one or more views.
 
     Returns:
         The best weights.
