@@ -21,6 +21,7 @@ import numpy as np
 
 from nextview import __version__
 from nextview.benchmark.frozen import FrozenView, Matrix, as_matrix, read_view
+from nextview.benchmark.published_policies import PredictedEntropy, SampledInformation
 from nextview.benchmark.thing_policies import BLIND_RULES, RingSteps
 from nextview.checks import did_you_mean, one_line
 from nextview.errors import ObservationError, ResultsError, UsageError
@@ -141,7 +142,8 @@ class NextviewMethod:
         """Open the memory.
 
         Args:
-            policy: geometry, random, spread, furthest, fixed or ring, or a name of ``load``.
+            policy: geometry, sampled, predicted, random, spread, furthest, fixed or ring, or a
+                name of ``load``.
             models: name or folder of the memory.
             things: names that may be right.
             seed: of random policies.
@@ -225,6 +227,8 @@ class NextviewMethod:
             "fixed": lambda: RingSteps(grid),
             "ring": lambda: RingSteps(grid, 1),
             "geometry": lambda: DiscriminateGeometry(sphere),
+            "sampled": lambda: SampledInformation(sphere),
+            "predicted": lambda: PredictedEntropy(sphere),
         }
         if self._policy in known:
             return known[self._policy]()

@@ -38,8 +38,8 @@ class SubmitOptions:
     """Which method runs, and how many views it gets.
 
     Attributes:
-        policy: how nextview chooses views: geometry, random, spread, furthest, fixed, ring, or a
-            policy of your own, MODULE:CLASS.
+        policy: how nextview chooses views: geometry, sampled, predicted, random, spread, furthest,
+            fixed, ring, or a policy of your own, MODULE:CLASS.
         models: memory of nextview; it has to be taught with the scans of the archive.
         command: run another process instead of nextview, such as "python my_method.py". It reads a
             line of JSON for each view and writes one as its answer (docs/submit.md).
