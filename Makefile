@@ -1,7 +1,7 @@
 # Two commands do everything on a machine with Python 3.11+, pip and make: `make demo` and `make test`.
 PYTHON ?= python3
 
-.PHONY: demo test test-ros lint docs reproduce reproduce-small clean
+.PHONY: demo test test-ros lint docs reproduce reproduce-small reproduce-things clean
 
 demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
 	.venv/bin/nextview demo
@@ -34,6 +34,35 @@ reproduce: .venv-test/installed  ## all models, tables and figures from DATA; re
 
 reproduce-small: .venv-test/installed  ## the same on three meshes a class, or on box furniture where DATA is not there
 	$(SNAKEMAKE) --directory $(OUT)-small --configfile workflow/small.yaml --config data=$(abspath $(wildcard $(DATA))) $(CONFIG)
+
+YCB ?= data/YCB
+PSB ?= data/PSB
+THINGS ?= reproduction-things
+NEXTVIEW = OMP_NUM_THREADS=1 .venv-test/bin/nextview
+PYTHON_TEST = OMP_NUM_THREADS=1 .venv-test/bin/python
+CHOICES = --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
+
+reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
+	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes $(THINGS)/pairs --models $(THINGS)/alike --families --draws 2 $(CHOICES)
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy --draws 2 $(CHOICES)
+	$(NEXTVIEW) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
+	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
+	$(PYTHON_TEST) -m benchmarks.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
+	mkdir -p $(THINGS)/small
+	for policy in geometry sampled predicted random fixed; do \
+		$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/$$policy.json --policy $$policy || exit 1; \
+	done
+	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
+		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
+	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board
+
+$(THINGS)/look_alikes/pairs.csv: .venv-test/installed
+	rm -rf $(THINGS)/look_alikes
+	mkdir -p $(THINGS)
+	$(PYTHON_TEST) benchmarks/look_alikes.py $(YCB) $(THINGS)/look_alikes --models $(DATA) --pairs 50 --seed 60
+
+$(THINGS)/alike/memory.json: $(THINGS)/look_alikes/pairs.csv
+	$(NEXTVIEW) learn $(THINGS)/look_alikes $(THINGS)/alike --unit m
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
