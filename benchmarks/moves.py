@@ -177,7 +177,9 @@ def alarms(look: Look) -> list[int]:
 
 
 def _centre(vertices: Float, pose: Float) -> Float:
-    return pose[:3, :3] @ vertices.mean(0) + pose[:3, 3]
+    """Middle of a placed scan, which a symmetric thing keeps when it is turned, (3,)."""
+    placed = vertices @ pose[:3, :3].T + pose[:3, 3]
+    return (placed.min(0) + placed.max(0)) / 2
 
 
 def watch_a_move(

@@ -255,7 +255,7 @@ def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
     """
     against = sum(one.contradicts for one in found)
     confirmed = sum(one.confirms for one in found)
-    return (against >= 2 and against > confirmed) or (confirmed >= 2 and camera.far)
+    return (against >= 2 and against >= confirmed) or (confirmed >= 2 and camera.far)
 
 
 def _object_at(
