@@ -1,23 +1,28 @@
-"""What a scene notices of things that are moved or taken away, and its false alarms.
+"""Moves and removals that a scene notices, and its false alarms, on simulated tables.
 
-    python benchmarks/moves.py OUT.jsonl SCANS [--tables 44] [--still 15] [--seed 0]
+    python benchmarks/moves.py SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
         [--masks true network]
 
-SCANS holds the scans of the things that the memory knows, in metres, by their names. On each
-simulated table stand six of them, 0 to 8 cm apart, and a camera 0.55 to 0.7 m away looks at them
-through the stereo sensor. After the first frame one thing, in turn a flat, a small and a large one,
-is moved by 3 to 150 mm along the table, in turn, or taken away; two more frames follow. On further
-tables nothing moves, and four more frames follow. On every other table the camera stands still, and
-on half of the tables with moves and all others its pose has an arm's errors: 3 mm and 0.3 degrees
-a frame along each axis, and 0.3 degrees of the vertical.
+SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Six of
+them stand on each table, 0 to 8 cm apart; a camera 0.55 to 0.7 m away sees them through the model
+of a stereo sensor. After the first frame one of them, in turn a flat, a small and a large one, is
+moved along the table by 3 to 150 mm, in turn, or is removed; two frames follow. On the still tables
+nothing moves, and four frames follow. The camera stands on every other table, and elsewhere goes on
+by 25 to 70 degrees. The poses of half of the tables with moves, and of all still ones, have an
+arm's errors: 3 mm and 0.3 degrees a frame along and about each axis, and 0.3 degrees of the
+vertical.
 
-``--masks network`` tells the things with the bundled network; by default it is known which thing
-each pixel shows.
+With ``--masks true`` it is known which thing each pixel shows; with ``--masks network`` the bundled
+network finds the objects.
 
-OUT gets a line a table, and the tables that it holds already are not looked at again: a run that
-was stopped goes on. Printed is how many moves were noticed in the first frame after them, where 350
-pixels show the thing before and would show its old place after; the false alarms among the other
-objects; how far the pose after a move is off; and confident names of what no longer is there.
+A move counts if the thing was found in the first frame, and 350 of its pixels show it there and
+would show its old place in the next frame. It is noticed if the next frame reports the object in
+``moved`` or ``gone``. A false alarm is a frame that reports an object that stands. The position
+error is the distance of the middle of the scan from the truth after the last frame, and a ghost is
+a confident name more than 20 mm from where the thing is.
+
+OUT.jsonl gets a line for each table. Tables that it contains are not run again, so a run that was
+stopped goes on.
 """
 
 from __future__ import annotations
@@ -34,6 +39,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 import nextview
+from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.scene.objects import SceneObject
@@ -325,24 +331,32 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
 
 
 def main(
-    out: tyro.conf.Positional[Path],
     scans: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
     tables: int = 44,
     still: int = 15,
     seed: int = 0,
     masks: Masks = "true",
     models: str = "ycb",
 ) -> None:
-    """Look at tables, and print what was noticed.
+    """Count the moves and removals that a scene notices, and its false alarms.
+
+    Six things stand on each simulated table. After the first frame one of them is moved by 3 to
+    150 mm, or removed; on the still tables nothing changes, but the poses have an arm's errors.
+    Printed are the moves noticed in the next frame, by distance; false alarms; confident names of
+    what is no longer there; and position errors.
 
     Args:
-        out: file of results, a line a table; it is added to.
-        scans: folder of the scans.
-        tables: how many with a move.
-        still: how many without one.
-        seed: of all draws.
-        masks: what tells the things: the truth or the bundled network.
+        scans: folder with scans of the things that the memory knows, in metres, by their names.
+        out: file of results, a line for each table; tables that it contains are not run again.
+        tables: number of tables with a move.
+        still: number of tables without a move.
+        seed: of the tables and cameras.
+        masks: whether the objects in a frame are given ("true"), or found by the bundled network.
         models: memory of the things.
+
+    Raises:
+        UsageError: there are no scans, or no table with room for a move is found.
     """
     lines = (
         [json.loads(line) for line in out.read_text().splitlines()]
@@ -371,4 +385,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with orderly_end("the tables that were done are kept"):
+        tyro.cli(main)

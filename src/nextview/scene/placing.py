@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +15,7 @@ from nextview.sensing.frame import Frame, Part
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.things.registration import RegistrationPrior, scan_errors
+from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
 from nextview.types import Float
 
@@ -199,13 +201,17 @@ class PlacedSurface:
         found = _log_density(off, np.hypot(self.sigma, sideways), otherwise)
         return self.weight * np.where(shows, found - self.without, 0.0)
 
+    @cached_property
+    def _caster(self) -> SurfaceCaster:
+        return caster_of(self.posed)
+
     def _rendered(self, motions: Float) -> tuple[Float, Float]:
         """Return depth, (M, P), infinity beside the surface, and the tangent of its slope."""
         to_camera = np.linalg.inv(self.frame.camera_to_world)
         poses = to_camera @ np.stack([self.pose(motion) for motion in motions])
         turns = poses[:, :3, :3].astype(np.float32)
         origins = -np.einsum("mji,mj->mi", poses[:, :3, :3], poses[:, :3, 3])
-        depth, normals = caster_of(self.posed).cast(
+        depth, normals = self._caster.cast(
             np.zeros(len(motions), np.int64),
             origins.astype(np.float32),
             self.rays.astype(np.float32) @ turns,
