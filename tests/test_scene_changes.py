@@ -84,15 +84,15 @@ def test_what_stands_still_is_not_said_to_move_because_of_an_arms_errors(ycb, me
 def test_two_things_that_were_swapped_have_both_moved(ycb, meshes):
     camera, scene, numbers = watched(ycb, meshes)
     places = {thing.name: thing.placed.mean(0)[:2] for thing in camera.table.things}
-    way = places["foam_brick"] - places["tuna_fish_can"]
+    way = places["mustard_bottle"] - places["tuna_fish_can"]
     table = shifted(camera.table, "tuna_fish_can", way)
-    camera.change(shifted(table, "foam_brick", -way))
+    camera.change(shifted(table, "mustard_bottle", -way))
     look = scene.update(camera.frame(view(40)))
     assert {move.number for move in look.moved} == {
-        numbers["foam_brick"],
+        numbers["mustard_bottle"],
         numbers["tuna_fish_can"],
     }
     for thing in scene.objects:
-        if thing.name in ("foam_brick", "tuna_fish_can"):
+        if thing.name in ("mustard_bottle", "tuna_fish_can"):
             true = camera.table.things[NAMES.index(thing.name)].placed.mean(0)[:2]
             assert np.linalg.norm(thing.place[:2] - true) < 0.02

@@ -29,9 +29,9 @@ from nextview.sensing.tabletop import TableTop
 from nextview.things.registration import scan_errors
 from nextview.types import Float, Mask
 
-MOVED_SHARE = 0.001  # expected share of objects that are elsewhere in the next frame
-GONE_SHARE = 0.001  # expected share of objects that are gone in the next frame
-SURPRISE = -float(np.log(MOVED_SHARE))  # nats that make a change as likely as none
+MOVE_PRIOR = 0.001  # expected share of objects that are elsewhere in the next frame
+REMOVAL_PRIOR = 0.001  # expected share of objects that are gone in the next frame
+SURPRISE = -float(np.log(MOVE_PRIOR))  # nats that make a change as likely as none
 WRONG_NAMES = 0.01  # expected share of wrong names or poses among confident ones
 WRONG_DOUBTFUL = 0.5  # the same among those that are not confident
 # metres, standard deviations of a move along the ground, equally likely: from a nudge to a table
@@ -94,9 +94,9 @@ class Change:
     @property
     def contradicts(self) -> bool:
         """Return True if the object is likely to be no longer at its known place."""
-        stands = self.stands + np.log(1 - MOVED_SHARE - GONE_SHARE)
-        moved = self.elsewhere + np.log(MOVED_SHARE)
-        return bool(np.logaddexp(moved, np.log(GONE_SHARE)) > stands)
+        stands = self.stands + np.log(1 - MOVE_PRIOR - REMOVAL_PRIOR)
+        moved = self.elsewhere + np.log(MOVE_PRIOR)
+        return bool(np.logaddexp(moved, np.log(REMOVAL_PRIOR)) > stands)
 
     @property
     def confirms(self) -> bool:

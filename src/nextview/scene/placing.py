@@ -23,13 +23,12 @@ DEPTH_RANGE = 1.0  # metres over which depth is spread that nothing known explai
 COMPARED_SIDE = 36  # rows and columns of pixels in which an object is compared
 MOTION_STEPS = (0.012, 0.006, 0.003, 0.0015, 0.001)  # metres, steps of a fit
 STEP_ROUNDS = 3  # largest number of rounds with each step
-LEAST_GAIN = 0.5  # nats that a round has to gain for another one
+ROUND_GAIN = 0.5  # nats that a round has to gain for another one
 INDEPENDENT_PIXELS = (
     RegistrationPrior().pixels
 )  # largest number, as neighbours err alike
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))  # share of pixels
-GRAZING_COSINE = 0.15  # least cosine between a ray and a surface of known depth
-OUTLINE_MARGIN = 12.0  # pixels around an object in which it may appear
+LEAST_COSINE = 0.15  # least cosine between a ray and a surface of known depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +113,7 @@ class PlacedSurface:
             corners = np.concatenate([placed, placed + shift])
         to_camera = np.linalg.inv(frame.camera_to_world)
         in_camera = corners @ to_camera[:3, :3].T + to_camera[:3, 3]
-        part = window_around(in_camera, frame, OUTLINE_MARGIN)
+        part = window_around(in_camera, frame)
         if part is None:
             return None
         rays, depth = _pixels_of(frame, part)
@@ -218,7 +217,7 @@ class PlacedSurface:
         )
         directions = self.rays / np.linalg.norm(self.rays, axis=1, keepdims=True)
         inwards = np.einsum("mpi,mij,pj->mp", normals, turns.swapaxes(1, 2), directions)
-        cosine = np.clip(np.abs(inwards), GRAZING_COSINE, 1)
+        cosine = np.clip(np.abs(inwards), LEAST_COSINE, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
         return np.asarray(depth, np.float64), np.asarray(slope, np.float64)
 
@@ -273,7 +272,7 @@ def likeliest(
                 value = value + part * change
                 here = there
                 break
-        if here < before + LEAST_GAIN:
+        if here < before + ROUND_GAIN:
             settled = step
     return value
 
@@ -320,7 +319,7 @@ def seen_surface(sighting: Sighting) -> PoseCandidate | None:
     ).reshape(-1, 4)
     of_corners = depth.ravel()[corners]
     inside = (sighting.mask[row, column] & (depth > 0)).ravel()[corners].all(1)
-    steepest = step / frame.intrinsics[0, 0] * of_corners.max(1) / GRAZING_COSINE
+    steepest = step / frame.intrinsics[0, 0] * of_corners.max(1) / LEAST_COSINE
     corners = corners[inside & (np.ptp(of_corners, axis=1) < steepest)]
     if not len(corners):
         return None

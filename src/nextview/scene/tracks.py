@@ -250,7 +250,6 @@ def render_track(
     part = window_around(
         posed.vertices @ in_camera[:3, :3].T + in_camera[:3, 3],
         frame,
-        WINDOW_EDGE,
     )
     if part is None:
         return None
@@ -269,20 +268,19 @@ def render_track(
     return RenderedObject(part, depth, agrees, hidden, through, near)
 
 
-def window_around(corners: Float, frame: Frame, margin: float) -> Part | None:
+def window_around(corners: Float, frame: Frame) -> Part | None:
     """Return rows and columns that contain points; None if they are out of view.
 
     Args:
         corners: the points, (N, 3), camera frame, metres.
         frame: the frame.
-        margin: around the points, pixels.
     """
     ahead = corners[corners[:, 2] > 0.01]
     if not len(ahead):
         return None
     at = frame.camera.project(ahead)
-    low = at.min(0)[::-1] - margin
-    high = at.max(0)[::-1] + margin
+    low = at.min(0)[::-1] - WINDOW_EDGE
+    high = at.max(0)[::-1] + WINDOW_EDGE
     part = spans(low, high, frame.shape)
     if part[0].start >= part[0].stop or part[1].start >= part[1].stop:
         return None
