@@ -137,7 +137,7 @@ def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(ycb, ycb_meshes):
     pose = frame.pose.copy()
     pose[:2, 3] += 0.2
     look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
-    assert look.moved == (1,)
+    assert [move.number for move in look.moved] == [1]
     assert [warning.name for warning in look.warnings] == ["pose"]
 
 

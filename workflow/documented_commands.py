@@ -65,7 +65,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
     r"benchmarks/(real_frames|segmentation)\.py": "needs real frames, which are not part of this",
-    r"^nextview benchmark tables": "needs scans of all things that the bundled memory knows",
+    r"^nextview benchmark tables|benchmarks/moves\.py": (
+        "needs scans of all things that the bundled memory knows"
+    ),
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
     r"^nextview download": (

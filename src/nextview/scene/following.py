@@ -27,10 +27,6 @@ SEGMENT_POINTS = 400  # sampled points of a segment
 FEWEST_TESTED = 30  # least number of tested pixels before an object may be called gone
 GONE = 0.6  # least share of tested pixels that show the background of a gone object
 STEP_BEHIND = 0.02  # metres, least distance of that background behind the object
-THERE = (
-    0.6  # least share of tested pixels that agree with an object that is still there
-)
-FEWEST_AGAINST = 2  # least number of contradicted objects in a frame with a wrong pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,70 +193,6 @@ def _divided(
     return {int(row): label == row + 1 for row in rows if (label == row + 1).any()}
 
 
-@dataclass(frozen=True)
-class SegmentAgreement:
-    """Agreement of a frame with an object at its known place.
-
-    Attributes:
-        tested: number of pixels with depth in which the object would be visible if it stood alone.
-        seen: share of these pixels whose depth agrees with the object.
-        through: share of these pixels whose depth is behind the object.
-    """
-
-    tested: int
-    seen: float
-    through: float
-
-    @property
-    def contradicts(self) -> bool:
-        """Return True if the object is no longer at its known place."""
-        return self.tested >= FEWEST_TESTED and self.through >= GONE
-
-    @property
-    def confirms(self) -> bool:
-        """Return True if the object is still at its known place."""
-        return self.tested >= FEWEST_TESTED and self.seen >= THERE
-
-
-def agreement(track: Track, top: TableTop) -> SegmentAgreement:
-    """Compare an object with a new frame.
-
-    Args:
-        track: the object.
-        top: support surfaces of the new frame.
-    """
-    rendered = render_track(track, top, -1, track.posed)
-    if rendered is None:
-        return _agreement_of_points(track, top.frame)
-    tested = rendered.agrees | rendered.hidden | rendered.through
-    inner = tested & ndimage.binary_erosion(np.isfinite(rendered.depth), iterations=2)
-    count = int(np.count_nonzero(inner))
-    if not count:
-        return SegmentAgreement(0, 0.0, 0.0)
-    return SegmentAgreement(
-        count,
-        float((rendered.agrees & inner).sum() / count),
-        float((rendered.through & inner).sum() / count),
-    )
-
-
-def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
-    """Compare an object of unknown shape with a frame, using the points of its last sighting."""
-    last = track.thing.sightings[-1]
-    few = slice(None, None, max(1, len(last.facets.planes) // SEGMENT_POINTS))
-    pose = last.frame.camera_to_world
-    points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
-    _, off = _points_in(points, frame)
-    if not len(off):
-        return SegmentAgreement(0, 0.0, 0.0)
-
-    return SegmentAgreement(
-        len(off),
-        float((np.abs(off) < STEP_BEHIND).mean()),
-        float((off > STEP_BEHIND).mean()),
-    )
-
-
 def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
     """Project points into a frame.
 
@@ -299,9 +231,3 @@ def seen_through(points: Float, frame: Frame) -> float:
     if len(off) < FEWEST_TESTED:
         return 0.0
     return float((off > STEP_BEHIND).mean())
-
-
-def contradicted(found: Sequence[SegmentAgreement]) -> bool:
-    """Return True if a frame contradicts so many objects that its pose must be wrong."""
-    against = sum(one.contradicts for one in found)
-    return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)

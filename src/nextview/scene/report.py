@@ -108,7 +108,10 @@ def scene_as_json(
             "name": name,
             "taken": one.taken,
             "appeared": one.appeared,
-            "moved": one.moved,
+            "moved": [
+                {"number": move.number, "before": move.before, "after": move.after}
+                for move in one.moved
+            ],
             "gone": one.gone,
             "joined": one.joined,
             "warnings": [warning.message for warning in one.warnings],

@@ -15,12 +15,8 @@ from numpy.typing import ArrayLike
 from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
 from nextview.geometry.axes import upright_axes
-from nextview.scene.following import (
-    SegmentAgreement,
-    agreement,
-    assign,
-    contradicted,
-)
+from nextview.scene.changes import Change, changes, wrong_pose
+from nextview.scene.following import SAME_OBJECT_SHARE, assign
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import candidates
 from nextview.scene.objects import SceneObject
@@ -64,6 +60,22 @@ MOVED_OR_POSE = ViewWarning(
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Move:
+    """An object that stands elsewhere than before.
+
+    Attributes:
+        number: of the object.
+        before: pose of its scan before the move, scan-to-world, (4, 4) float64, metres; None for an
+            unknown object.
+        after: the same after the move.
+    """
+
+    number: int
+    before: Float | None
+    after: Float | None
+
+
 @dataclass(frozen=True)
 class Look:
     """Changes that one frame made to a scene.
@@ -71,7 +83,7 @@ class Look:
     Attributes:
         taken: whether the frame was used.
         appeared: numbers of new objects.
-        moved: numbers of objects that have moved.
+        moved: objects that have moved, each with its poses before and after.
         gone: numbers of objects that have disappeared.
         joined: pairs of numbers: an object that turned out to be a part of another one, and that
             other object. The first number is not used again.
@@ -80,7 +92,7 @@ class Look:
 
     taken: bool
     appeared: tuple[int, ...] = ()
-    moved: tuple[int, ...] = ()
+    moved: tuple[Move, ...] = ()
     gone: tuple[int, ...] = ()
     joined: tuple[tuple[int, int], ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
@@ -307,14 +319,21 @@ class Scene:
         Raises:
             ObservationError: neither the ground nor any known object is visible.
         """
-        found = [agreement(track, top) for track in before.tracks]
-        if contradicted(found):
+        found, camera = changes(
+            before.tracks,
+            top,
+            top.segments(),
+            before.tops,
+            before.cameras,
+        )
+        if wrong_pose(found, camera):
             return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
         seen_again = any(one.confirms for one in found)
         if before.tops and not (top.shows_ground or seen_again):
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
+        state = replace(state, cameras=(*before.cameras, camera))
         if look.moved and not seen_again:
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
@@ -323,14 +342,14 @@ class Scene:
         self,
         before: SceneState,
         top: TableTop,
-        found: Sequence[SegmentAgreement],
+        found: Sequence[Change],
     ) -> tuple[SceneState, Look]:
         """Return the scene after a frame that fits."""
         number = len(before.tops)
         bench = Bench(top, number, self._judged)
         pairs = list(zip(before.tracks, found, strict=True))
         there = [track for track, one in pairs if not one.contradicts]
-        lost = [track for track, one in pairs if one.contradicts]
+        lost = [(track, one) for track, one in pairs if one.contradicts]
 
         own, new = assign(top.segments(), there, top)
         hidden = [track for row, track in enumerate(there) if row not in own]
@@ -413,29 +432,27 @@ def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
 def _numbered(
     state: SceneState,
     tracks: Sequence[Track],
-    lost: Sequence[Track],
+    lost: Sequence[tuple[Track, Change]],
 ) -> tuple[SceneState, Look]:
     """Number new objects; a lost object that reappears elsewhere keeps its number.
 
     Args:
         state: with the last frame, and the objects before it.
         tracks: the objects.
-        lost: objects that are no longer at their known place.
+        lost: objects that are no longer at their known place, and what the frame says of them.
     """
-    away = {track.result.answer: track for track in lost if track.result is not None}
+    found_again = _found_again(tracks, lost, state.tops[-1])
     number = state.next_number
     appeared = []
     moved = []
     kept = []
     joined = []
-    for track in tracks:
+    for row, track in enumerate(tracks):
         if track.number < 0:
-            assert track.result is not None
-            answer = track.result.answer
-            old = away.pop(answer, None) if answer else None
+            old = found_again.get(row)
             if old is not None:
                 track = replace(track, number=old.number)
-                moved.append(old.number)
+                moved.append(Move(old.number, _pose_of(old), _pose_of(track)))
             else:
                 track = replace(track, number=number)
                 appeared.append(number)
@@ -443,8 +460,9 @@ def _numbered(
         joined += [(ended, track.number) for ended in track.absorbed]
         kept.append(replace(track, absorbed=()))
 
-    gone = tuple(track.number for track in lost if track.number not in moved)
-    changed = {*gone, *moved, *(ended for ended, _ in joined)}
+    left = {track.number for track, _ in lost}
+    gone = tuple(sorted(left - {move.number for move in moved}))
+    changed = {*left, *(ended for ended, _ in joined)}
     touching = {pair for pair in state.touching if not set(pair) & changed}
     touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
     after = replace(
@@ -456,6 +474,43 @@ def _numbered(
     look = Look(True, tuple(appeared), tuple(moved), gone, tuple(joined))
     warnings = (*state.tops[-1].warnings, *after.remarks)
     return after, replace(look, warnings=warnings)
+
+
+def _found_again(
+    tracks: Sequence[Track],
+    lost: Sequence[tuple[Track, Change]],
+    top: TableTop,
+) -> dict[int, Track]:
+    """Find lost objects among the new ones, by row: by place, and otherwise by name."""
+    new = {row: track for row, track in enumerate(tracks) if track.number < 0}
+    found: dict[int, Track] = {}
+    for old, change in lost:
+        if not change.found or change.pose is None or old.posed is None:
+            continue
+        there = replace(old.posed, pose=change.pose)
+        rendered = render_track(old, top, -1, there)
+        for row in new.keys() - found.keys():
+            mask = new[row].thing.sightings[-1].mask
+            explained = 0 if rendered is None else rendered.fit(mask)[0]
+            if explained >= SAME_OBJECT_SHARE * np.count_nonzero(mask):
+                found[row] = old
+                break
+
+    for old, _ in lost:
+        name = None if old.result is None else old.result.answer
+        if name is None or old in found.values():
+            continue
+        for row in new.keys() - found.keys():
+            result = new[row].result
+            if result is not None and result.answer == name:
+                found[row] = old
+                break
+    return found
+
+
+def _pose_of(track: Track) -> Float | None:
+    """Return the pose of an object, (4, 4); None for an unknown object."""
+    return None if track.result is None else track.result.pose
 
 
 def _touching(

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from nextview.checks import number_of
+from nextview.scene.changes import CameraError
 from nextview.scene.next_view import FEWEST_HIDDEN, TableGround
 from nextview.scene.objects import SceneObject
 from nextview.scene.tracks import Track
@@ -34,6 +35,7 @@ class SceneState:
         region: search region; None for everywhere.
         tops: support surfaces of each frame.
         tracks: the objects.
+        cameras: error of the pose of each frame.
         touching: numbers of all pairs of objects that touch, the smaller number first.
         next_number: number of the next new object.
         left_unknown: number of small objects in the last frame that were not verified.
@@ -42,6 +44,7 @@ class SceneState:
     region: Box | None = None
     tops: tuple[TableTop, ...] = ()
     tracks: tuple[Track, ...] = ()
+    cameras: tuple[CameraError, ...] = ()
     touching: frozenset[tuple[int, int]] = frozenset()
     next_number: int = 1
     left_unknown: int = 0

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.poses import PoseCandidate
-from nextview.sensing.frame import Part, spans
+from nextview.sensing.frame import Frame, Part, spans
 from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
@@ -248,10 +247,9 @@ def render_track(
 
     frame = top.frame
     in_camera = np.linalg.inv(frame.camera_to_world) @ pose
-    part = _window(
+    part = window_around(
         posed.vertices @ in_camera[:3, :3].T + in_camera[:3, 3],
-        frame.intrinsics,
-        frame.shape,
+        frame,
     )
     if part is None:
         return None
@@ -270,15 +268,20 @@ def render_track(
     return RenderedObject(part, depth, agrees, hidden, through, near)
 
 
-def _window(corners: Float, intrinsics: Float, shape: tuple[int, int]) -> Part | None:
-    """Return rows and columns that contain points, (N, 3), camera frame; None if out of view."""
+def window_around(corners: Float, frame: Frame) -> Part | None:
+    """Return rows and columns that contain points; None if they are out of view.
+
+    Args:
+        corners: the points, (N, 3), camera frame, metres.
+        frame: the frame.
+    """
     ahead = corners[corners[:, 2] > 0.01]
     if not len(ahead):
         return None
-    at = PinholeCamera.of(intrinsics, shape).project(ahead)
+    at = frame.camera.project(ahead)
     low = at.min(0)[::-1] - WINDOW_EDGE
     high = at.max(0)[::-1] + WINDOW_EDGE
-    part = spans(low, high, shape)
+    part = spans(low, high, frame.shape)
     if part[0].start >= part[0].stop or part[1].start >= part[1].stop:
         return None
     return part
@@ -291,15 +294,13 @@ def _cast(
     part: Part,
 ) -> Float32:
     """Return the depth of a scan in a part of a frame, (h, w) float32, metres; infinity outside."""
-    assert posed.vertices is not None
-    assert posed.faces is not None
     x = rays[0][part[1]]
     y = rays[1][part[0]]
     step = max(1, -(-max(len(x), len(y)) // RENDERED_ROWS))
     columns, rows = np.meshgrid(x[step // 2 :: step], y[step // 2 :: step])
     directions = np.stack([columns, rows, np.ones_like(columns)], -1).reshape(-1, 3)
 
-    caster = _caster(posed.thing, _Triangles(posed.vertices, posed.faces))
+    caster = caster_of(posed)
     turn = in_camera[:3, :3].astype(np.float32)
     origin = (-in_camera[:3, 3] @ in_camera[:3, :3]).astype(np.float32)
     depth, _ = caster.cast(
@@ -332,6 +333,17 @@ class _Triangles:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Triangles) and self.content == other.content
+
+
+def caster_of(posed: PoseCandidate) -> SurfaceCaster:
+    """Prepare the surface of a thing, which must have one, for ray casting.
+
+    Args:
+        posed: the thing.
+    """
+    assert posed.vertices is not None
+    assert posed.faces is not None
+    return _caster(posed.thing, _Triangles(posed.vertices, posed.faces))
 
 
 @lru_cache(maxsize=256)

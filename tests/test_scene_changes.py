@@ -1,0 +1,98 @@
+"""What moves, goes or stands still between the frames of a scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_tables import camera_over, meshes_of, view, without
+
+import nextview
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import SimulatedTable
+
+NAMES = ("cracker_box", "mustard_bottle", "tuna_fish_can", "scissors", "foam_brick")
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    return meshes_of(NAMES)
+
+
+def watched(ycb, meshes, **errors):
+    """A camera over the things, and a scene with true masks after one frame."""
+    camera = camera_over(list(meshes.values()), seed=8)
+    camera.sensor = replace(SENSORS["stereo"], **errors)
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    scene.update(camera.frame(view(20)))
+    numbers = {thing.name: thing.number for thing in scene.objects}
+    assert set(numbers) == set(NAMES)
+    return camera, scene, numbers
+
+
+def shifted(table, name, shift):
+    """The same table after a thing was moved by a shift along it, (2,), metres."""
+    motion = np.eye(4)
+    motion[:2, 3] = shift
+    return SimulatedTable(
+        tuple(
+            replace(thing, pose=motion @ thing.pose) if thing.name == name else thing
+            for thing in table.things
+        )
+    )
+
+
+def outwards(table, name):
+    """Direction from the middle of the table to a thing, (2,)."""
+    middle = next(one for one in table.things if one.name == name).placed.mean(0)[:2]
+    return middle / np.linalg.norm(middle)
+
+
+@pytest.mark.parametrize("metres", [0.008, 0.02, 0.1])
+def test_a_moved_thing_has_both_poses_and_none_between(ycb, meshes, metres):
+    camera, scene, numbers = watched(ycb, meshes)
+    before = {thing.name: thing for thing in scene.objects}["tuna_fish_can"]
+    shift = metres * outwards(camera.table, "tuna_fish_can")
+    camera.change(shifted(camera.table, "tuna_fish_can", shift))
+    look = scene.update(camera.frame(view(60)))
+    assert [move.number for move in look.moved] == [numbers["tuna_fish_can"]]
+    assert look.gone == look.appeared == ()
+    (move,) = look.moved
+    after = {thing.name: thing for thing in scene.objects}["tuna_fish_can"]
+    assert np.array_equal(move.before, before.pose)
+    assert np.array_equal(move.after, after.pose)
+    assert np.allclose((after.place - before.place)[:2], shift, atol=0.005)
+    assert set(after.pixels) == {1}
+    assert len(scene.objects) == len(NAMES)
+
+
+def test_a_flat_thing_that_was_taken_away_is_gone(ycb, meshes):
+    camera, scene, numbers = watched(ycb, meshes)
+    camera.change(without(camera.table, "scissors"))
+    look = scene.update(camera.frame(view(20)))
+    assert look.gone == (numbers["scissors"],)
+    assert look.moved == ()
+
+
+def test_what_stands_still_is_not_said_to_move_because_of_an_arms_errors(ycb, meshes):
+    camera, scene, _ = watched(ycb, meshes, moved=0.003, turned=0.3)
+    for degrees in (20, 50, 80):
+        look = scene.update(camera.frame(view(degrees)))
+        assert look.taken
+        assert look.moved == look.gone == look.appeared == ()
+
+
+def test_two_things_that_were_swapped_have_both_moved(ycb, meshes):
+    camera, scene, numbers = watched(ycb, meshes)
+    places = {thing.name: thing.placed.mean(0)[:2] for thing in camera.table.things}
+    way = places["mustard_bottle"] - places["tuna_fish_can"]
+    table = shifted(camera.table, "tuna_fish_can", way)
+    camera.change(shifted(table, "mustard_bottle", -way))
+    look = scene.update(camera.frame(view(40)))
+    assert {move.number for move in look.moved} == {
+        numbers["mustard_bottle"],
+        numbers["tuna_fish_can"],
+    }
+    for thing in scene.objects:
+        if thing.name in ("mustard_bottle", "tuna_fish_can"):
+            true = camera.table.things[NAMES.index(thing.name)].placed.mean(0)[:2]
+            assert np.linalg.norm(thing.place[:2] - true) < 0.02
