@@ -434,7 +434,8 @@ def _told_before(track: Track, pose: Float, tops: Sequence[TableTop]) -> float:
     assert posed is not None
     told = 0.0
     for place, number in enumerate(track.frames):
-        old, new = posed.pose.copy(), pose.copy()
+        old = posed.pose.copy()
+        new = pose.copy()
         if len(posed.displacements) == len(track.frames):
             old[:3, 3] += posed.displacements[place]
             new[:3, 3] += posed.displacements[place]

@@ -128,7 +128,8 @@ def carried(
     for row in rows:
         one = alignment.select(np.array([row]))
         low = _underside(caster, one)
-        of_others, of_ground = [], []
+        of_others = []
+        of_ground = []
         for number, view in enumerate(views):
             displaced = one.cameras[0, number]
             beside = ~np.isfinite(rendered[number].depth[row])
@@ -184,7 +185,8 @@ def _touched(
     reach = np.asarray(np.hypot(apart, errors), np.float64)
 
     own = (points - one.centres[0]) @ one.rotations[0] + surface.centre
-    low, high = surface.vertices.min(0), surface.vertices.max(0)
+    low = surface.vertices.min(0)
+    high = surface.vertices.max(0)
     near = ((own > low - reach[:, None]) & (own < high + reach[:, None])).all(1)
     off, _ = surface.nearby.query(own[near])
     touching = np.flatnonzero(near)[off < reach[near] + surface.spacing]
