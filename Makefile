@@ -47,16 +47,19 @@ reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next view
 	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy --draws 2 $(CHOICES)
 	$(NEXTVIEW) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
 	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
+	test -f $(THINGS)/nextview-bench-small/manifest.json || \
 	$(PYTHON_TEST) -m benchmarks.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
 	mkdir -p $(THINGS)/small
 	for policy in geometry sampled predicted random fixed; do \
+		test -f $(THINGS)/small/$$policy.json || \
 		$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/$$policy.json --policy $$policy || exit 1; \
 	done
+	test -f $(THINGS)/small/icp.json || \
 	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
 		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
-	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board
+	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --overwrite
 
-$(THINGS)/look_alikes/pairs.csv: .venv-test/installed
+$(THINGS)/look_alikes/pairs.csv: | .venv-test/installed
 	rm -rf $(THINGS)/look_alikes
 	mkdir -p $(THINGS)
 	$(PYTHON_TEST) benchmarks/look_alikes.py $(YCB) $(THINGS)/look_alikes --models $(DATA) --pairs 50 --seed 60
