@@ -50,7 +50,7 @@ reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next view
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
 	$(PYTHON_TEST) -m benchmarks.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
 	mkdir -p $(THINGS)/small
-	for policy in geometry sampled predicted random fixed; do \
+	for policy in geometry sampled predicted fixed furthest random spread; do \
 		test -f $(THINGS)/small/$$policy.json || \
 		$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/$$policy.json --policy $$policy || exit 1; \
 	done
