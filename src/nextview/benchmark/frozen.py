@@ -145,6 +145,7 @@ class FrozenArchive:
             raise DatasetError(
                 f"{self.folder}: is no frozen archive, which has a {MANIFEST} (docs/submit.md)"
             )
+
         self.sha256 = sha256_of(path)
         where = f"{path}: not the manifest of an archive"
         self.manifest = decode_record(
@@ -154,6 +155,7 @@ class FrozenArchive:
             raise DatasetError(
                 f"{path}: has format {self.manifest.format}, this version reads {FROZEN_FORMAT}"
             )
+
         if not self.numbers:
             raise DatasetError(f"{self.folder}: holds no episode")
 

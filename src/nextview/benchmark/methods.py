@@ -230,6 +230,7 @@ class NextviewMethod:
             "sampled": lambda: SampledInformation(sphere),
             "predicted": lambda: PredictedEntropy(sphere),
         }
+
         if self._policy in known:
             return known[self._policy]()
         return make_policy_anywhere(
@@ -271,7 +272,8 @@ def aimed_at(poses: Float) -> Float:
     Returns:
         The point, (3,), metres; half a metre ahead of cameras that look in one direction.
     """
-    places, ahead = poses[:, :3, 3], poses[:, :3, 2]
+    places = poses[:, :3, 3]
+    ahead = poses[:, :3, 2]
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     total = across.sum(0)
     if np.linalg.cond(total) > 1e6:
@@ -321,6 +323,7 @@ class CommandMethod:
         self.blind = blind
         self._wait = wait
         self._command = one_line(command)
+
         try:
             self._process = subprocess.Popen(
                 shlex.split(command),
@@ -332,6 +335,7 @@ class CommandMethod:
             )
         except (OSError, ValueError, IndexError) as error:
             raise UsageError(f"{self._command}: cannot be started ({error})") from None
+
         self._lines: queue.Queue[str] = queue.Queue()
         assert self._process.stdout is not None
         self._listener = threading.Thread(
@@ -360,6 +364,7 @@ class CommandMethod:
             raise ResultsError(
                 f"{where}: no answer in {self._wait:g} s (--wait)"
             ) from None
+
         if not line:
             raise ResultsError(f"{where}: the process has ended; see what it said")
         wanted = "not an answer, a line of JSON with name, confidence and confident"
@@ -440,6 +445,7 @@ def check_said(
         raise ResultsError(
             f"{where}: the archive has no thing called {one_line(repr(name))}{near}"
         )
+
     if not 0 <= confidence <= 1:
         raise ResultsError(
             f"{where}: a confidence is between 0 and 1, not {confidence}"

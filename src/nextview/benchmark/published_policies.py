@@ -1,13 +1,14 @@
 """Published policies for known objects, as opponents in the benchmark of things.
 
 Both predict what a camera would see of each leading hypothesis, and choose the view after which the
-entropy of the belief is expected to be lowest. They are written from the papers, with depth images
-in place of the features there: every pixel is independent, with the noise of the sensor and a share
-of outliers, and the weights of pixels against the prior are those of the verifier. As in the
-papers, poses are not refined with the new view, and space that no view has shown is free.
+entropy of the belief is expected to be lowest. They follow the method of the papers, not the code
+of their authors, with depth images in place of the features there: every pixel is independent, with
+the noise of the sensor and a share of outliers, and the weights of pixels against the prior are
+those of the verifier. Poses are not refined with the new view, and space that no view has shown is
+free.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,8 @@ STEP_SCALE = np.radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
-class SampledInformation:
-    """Chooses the view with the most mutual information, estimated by sampling.
-
-    Denzler and Brown, "Information theoretic sensor data selection for active object recognition
-    and state estimation", IEEE TPAMI 24(2), 2002: a hypothesis is drawn from the belief,
-    an image from the hypothesis, and the entropy of the updated belief is averaged over the draws.
+class LowestEntropy(ABC):
+    """Chooses the view after which the entropy of the belief is expected to be lowest.
 
     Attributes:
         viewpoints: the candidates.
@@ -42,93 +39,108 @@ class SampledInformation:
     needs: tuple[str, ...] = ("outlook",)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Return the free view with the lowest mean entropy over sampled images.
+        """Return the free view with the highest value.
 
         Args:
             state: of the episodes.
-            rng: of the samples, and for ties.
+            rng: of samples, and for ties.
 
         Raises:
             PolicyError: the state has no outlook.
         """
-
-        def reduction(outlook: Outlook, images: HypothesisImages) -> Float:
-            belief = outlook.hypotheses.belief
-            truths = rng.choice(len(belief), SAMPLES, p=belief)
-            seen = _simulated(outlook, images, truths, rng)
-            return -_entropies(outlook, images, seen).mean(1)
-
-        return _best(self.viewpoints, state, rng, reduction)
-
-
-@dataclass(frozen=True, eq=False)
-class PredictedEntropy:
-    """Chooses the view with the largest expected reduction of entropy, from predicted views.
-
-    Borotschnig, Paletta, Prantl and Pinz, "Appearance-based active object recognition", Image and
-    Vision Computing 18, 2000: each hypothesis predicts its own view without noise, the
-    reductions of entropy are weighted by the belief, and small motions are discouraged.
-
-    Attributes:
-        viewpoints: the candidates.
-        needs: required inputs, see ``Policy.needs``.
-    """
-
-    viewpoints: Viewpoints
-    needs: tuple[str, ...] = ("outlook",)
-
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Return the free view with the largest expected reduction of entropy.
-
-        Args:
-            state: of the episodes.
-            rng: for ties.
-
-        Raises:
-            PolicyError: the state has no outlook.
-        """
-
-        def reduction(outlook: Outlook, images: HypothesisImages) -> Float:
-            belief = outlook.hypotheses.belief
-            truths = np.arange(len(belief))
-            seen = _simulated(outlook, images, truths, None)
-            before = _entropy(belief[None], outlook.hypotheses.things)[0]
-            gained = before - _entropies(outlook, images, seen) @ belief
-            towards = images.origins / np.linalg.norm(
-                images.origins, axis=1, keepdims=True
+        if state.outlook is None:
+            raise PolicyError(
+                "this policy needs things of known geometry: a memory that was taught from scans"
             )
-            arc = np.arccos(np.clip(towards @ outlook.towards, -1, 1))
-            return gained * (1 - np.exp(-((arc / STEP_SCALE) ** 2)))
 
-        return _best(self.viewpoints, state, rng, reduction)
-
-
-def _best(
-    viewpoints: Viewpoints,
-    state: EpisodeState,
-    rng: np.random.Generator,
-    value: Callable[[Outlook, HypothesisImages], Float],
-) -> Index:
-    """The free view of the highest value in each episode, (B,); ties are broken at random."""
-    if state.outlook is None:
-        raise PolicyError(
-            "this policy needs things of known geometry: a memory that was taught from scans"
-        )
-    values = np.full(state.free.shape, -np.inf)
-    for row, (outlook, free) in enumerate(zip(state.outlook, state.free, strict=True)):
-        some = np.flatnonzero(free)
-        values[row, some] = 1e-9 * rng.random(len(some))
-        if outlook is not None and len(some):
-            cameras = outlook.cameras(viewpoints.directions[some])
+        values = np.full(state.free.shape, -np.inf)
+        for row, outlook in enumerate(state.outlook):
+            some = np.flatnonzero(state.free[row])
+            values[row, some] = 1e-9 * rng.random(len(some))
+            if outlook is None or not len(some):
+                continue
             images = rendered_images(
                 outlook.caster,
                 outlook.hypotheses,
-                cameras,
+                outlook.cameras(self.viewpoints.directions[some]),
                 outlook.surroundings,
                 RENDERED_SIDE,
             )
-            values[row, some] += value(outlook, images)
-    return best_view(viewpoints, state, values)
+            values[row, some] += self.values(outlook, images, rng)
+        return best_view(self.viewpoints, state, values)
+
+    @abstractmethod
+    def values(
+        self,
+        outlook: Outlook,
+        images: HypothesisImages,
+        rng: np.random.Generator,
+    ) -> Float:
+        """Return the value of each view of one episode, (V,), nats.
+
+        Args:
+            outlook: with the belief so far.
+            images: the hypotheses as each view would show them.
+            rng: of samples.
+        """
+
+
+class SampledInformation(LowestEntropy):
+    """Chooses the view with the most mutual information, estimated by sampling.
+
+    Denzler and Brown, "Information theoretic sensor data selection for active object recognition
+    and state estimation", IEEE TPAMI 24(2), 2002: a hypothesis is drawn from the belief, an image
+    from the hypothesis, and the entropy of the updated belief is averaged over the draws.
+    """
+
+    def values(
+        self,
+        outlook: Outlook,
+        images: HypothesisImages,
+        rng: np.random.Generator,
+    ) -> Float:
+        """Return the negative mean entropy over sampled images; see ``LowestEntropy.values``.
+
+        Args:
+            outlook: with the belief so far.
+            images: the hypotheses as each view would show them.
+            rng: of samples.
+        """
+        belief = outlook.hypotheses.belief
+        truths = rng.choice(len(belief), SAMPLES, p=belief)
+        seen = _simulated(outlook, images, truths, rng)
+        return -_entropies(outlook, images, seen).mean(1)
+
+
+class PredictedEntropy(LowestEntropy):
+    """Chooses the view with the largest expected reduction of entropy, from predicted views.
+
+    Borotschnig, Paletta, Prantl and Pinz, "Appearance-based active object recognition", Image and
+    Vision Computing 18, 2000: each hypothesis predicts its own view without noise, the reductions
+    of entropy are weighted by the belief, and small motions are discouraged.
+    """
+
+    def values(
+        self,
+        outlook: Outlook,
+        images: HypothesisImages,
+        rng: np.random.Generator,
+    ) -> Float:
+        """Return the expected reduction, less near the current view; see ``LowestEntropy.values``.
+
+        Args:
+            outlook: with the belief so far.
+            images: the hypotheses as each view would show them.
+            rng: not used.
+        """
+        belief = outlook.hypotheses.belief
+        seen = _simulated(outlook, images, np.arange(len(belief)), None)
+        before = _entropy(belief[None], outlook.hypotheses.things)[0]
+        gained = before - _entropies(outlook, images, seen) @ belief
+
+        lengths = np.linalg.norm(images.origins, axis=1, keepdims=True)
+        arc = np.arccos(np.clip(images.origins / lengths @ outlook.towards, -1, 1))
+        return gained * (1 - np.exp(-((arc / STEP_SCALE) ** 2)))
 
 
 def _simulated(
@@ -161,6 +173,7 @@ def _entropies(outlook: Outlook, images: HypothesisImages, seen: Float32) -> Flo
     weight = weights.geometry / (1 + weights.correlation * outlook.taken)
     variance = depth_variance(images, outlook.sensor, outlook.pixels)
     log_belief = np.log(outlook.hypotheses.belief)
+
     scores = np.empty((*seen.shape[:2], len(log_belief)))
     for row in range(len(log_belief)):
         mean = _mean_log_likelihood(
@@ -171,6 +184,7 @@ def _entropies(outlook: Outlook, images: HypothesisImages, seen: Float32) -> Flo
             outlook.pixels.outlier,
         )
         scores[..., row] = log_belief[row] + weight * mean
+
     belief = np.exp(scores - scores.max(2, keepdims=True))
     return _entropy(belief / belief.sum(2, keepdims=True), outlook.hypotheses.things)
 

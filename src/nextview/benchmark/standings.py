@@ -243,12 +243,14 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
     files = sorted(folder.glob("*.json"))
     if not files:
         raise ResultsError(f"{folder}: holds no file of results, .json")
+
     read: dict[str, Submission] = {}
     for file in files:
         one = read_record(file, Submission, "a file of results", ResultsError)
         _check_submission(one, frozen, str(file))
         if one.method in read:
             raise ResultsError(f"{file}: another file has the method {one.method}, too")
+
         first = next(iter(read.values()), one)
         if one.views != first.views:
             raise ResultsError(
@@ -271,6 +273,7 @@ def _check_submission(one: Submission, frozen: FrozenArchive, file: str) -> None
             f" {one.archive_sha256[:12]}), not of {frozen.manifest.name},"
             f" {frozen.sha256[:12]}"
         )
+
     numbers = [each.episode for each in one.episodes]
     for number in dict.fromkeys((*frozen.numbers, *numbers)):
         count = numbers.count(number)
@@ -279,6 +282,7 @@ def _check_submission(one: Submission, frozen: FrozenArchive, file: str) -> None
                 f"{file}: answers episode {one_line(number)} {number_of(count, 'time')};"
                 f" each of the {len(frozen.numbers)} is answered once"
             )
+
     for each in one.episodes:
         _check_episode(each, one.views, frozen, f"{file}, episode {each.episode}")
 
@@ -302,6 +306,7 @@ def _check_episode(
         raise ResultsError(
             f"{where}: its views {taken} do not begin with {told.first}, or repeat one"
         )
+
     for said in one.said:
         check_said(said.name, said.confidence, said.pose, tuple(frozen.things), where)
 
@@ -329,7 +334,9 @@ def _scored(
     by_number = {each.episode: each.said for each in one.episodes}
     said = tuple(by_number[number] for number in truths)
     right = np.zeros((len(said), one.views), bool)
-    posed, distances, turns = [], [], []
+    posed = []
+    distances = []
+    turns = []
 
     for row, (answers, truth) in enumerate(zip(said, truths.values(), strict=True)):
         names = [each.name == truth.thing for each in answers]
@@ -340,7 +347,9 @@ def _scored(
             continue
         if truth.thing not in shapes:
             shapes[truth.thing] = KnownShape(frozen.scan(truth.thing), truth.thing)
-        shape, found, true = shapes[truth.thing], np.array(pose), np.array(truth.pose)
+        shape = shapes[truth.thing]
+        found = np.array(pose)
+        true = np.array(truth.pose)
         posed.append(row)
         distances.append(shape.distance(found, true))
         turns.append(shape.turn(found, true))
@@ -432,6 +441,7 @@ def _main_table(
         ("confident and wrong", CONFIDENT_WRONG, views),
         ("unknown", UNKNOWN_SAID, views),
     ]
+
     rows = []
     for one in scored:
         name = one.submission.method
@@ -439,6 +449,7 @@ def _main_table(
             _with_interval(*numbers[Key(name, None, at, measure)], things)
             for _, measure, at in columns
         ]
+
         times = [said.cpu_seconds for each in one.said for said in each]
         known = [seconds for seconds in times if seconds is not None]
         rows.append(
@@ -450,6 +461,7 @@ def _main_table(
                 f"{np.mean(known):.2f}" if known else NONE,
             )
         )
+
     return WrittenTable(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
@@ -473,7 +485,8 @@ def _with_interval(value: float, low: float, high: float, things: int) -> str:
     """
     if value in (0, 1):
         agreed = binomtest(int(value) * things, things).proportion_ci(method="wilson")
-        low, high = agreed.low, agreed.high
+        low = agreed.low
+        high = agreed.high
     return f"{value:.3f} ({low:.3f} to {high:.3f})"
 
 

@@ -330,6 +330,7 @@ def _whatever_it_is(
     posed = seen_surface(track.thing.sightings[-1])
     if posed is None:
         return Change()
+
     known = [cameras[track.frames[-1]]]
     radius = track.thing.object_frame.radius
     error = float(scan_errors(radius))
@@ -337,6 +338,7 @@ def _whatever_it_is(
     one = _object_at(posed, own, known, top)
     if one is None:
         return Change()
+
     stands = one.standing(camera)
     if not named:
         return Change(stands)
@@ -457,6 +459,7 @@ def _shift_to_segment(
     surface = PlacedSurface.of(posed, top) if segments else None
     if surface is None:
         return none
+
     depth = surface.shown()
     shows = np.isfinite(depth)
     points = surface.rays[shows] * depth[shows, None]
@@ -464,6 +467,7 @@ def _shift_to_segment(
     over = [np.count_nonzero(mask[row, column]) for mask in segments]
     if not max(over):
         return none
+
     mask = segments[int(np.argmax(over))] & (top.frame.depth > 0)
     measured = np.median(top.frame.positions(*np.nonzero(mask)), axis=0)
     pose = top.frame.camera_to_world

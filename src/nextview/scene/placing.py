@@ -14,6 +14,7 @@ from nextview.scene.tracks import caster_of, window_around
 from nextview.sensing.frame import Frame, Part
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
+from nextview.things.expected_images import LOWEST_COSINE
 from nextview.things.registration import RegistrationPrior, scan_errors
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
@@ -24,11 +25,9 @@ COMPARED_SIDE = 36  # rows and columns of pixels in which an object is compared
 MOTION_STEPS = (0.012, 0.006, 0.003, 0.0015, 0.001)  # metres, steps of a fit
 STEP_ROUNDS = 3  # largest number of rounds with each step
 ROUND_GAIN = 0.5  # nats that a round has to gain for another one
-INDEPENDENT_PIXELS = (
-    RegistrationPrior().pixels
-)  # largest number, as neighbours err alike
+# largest number, as neighbours err alike
+INDEPENDENT_PIXELS = RegistrationPrior().pixels
 SEEN_THROUGH = float(np.exp(PixelModel().outlier))  # share of pixels
-LEAST_COSINE = 0.15  # least cosine between a ray and a surface of known depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +216,7 @@ class PlacedSurface:
         )
         directions = self.rays / np.linalg.norm(self.rays, axis=1, keepdims=True)
         inwards = np.einsum("mpi,mij,pj->mp", normals, turns.swapaxes(1, 2), directions)
-        cosine = np.clip(np.abs(inwards), LEAST_COSINE, 1)
+        cosine = np.clip(np.abs(inwards), LOWEST_COSINE, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
         return np.asarray(depth, np.float64), np.asarray(slope, np.float64)
 
@@ -319,7 +318,7 @@ def seen_surface(sighting: Sighting) -> PoseCandidate | None:
     ).reshape(-1, 4)
     of_corners = depth.ravel()[corners]
     inside = (sighting.mask[row, column] & (depth > 0)).ravel()[corners].all(1)
-    steepest = step / frame.intrinsics[0, 0] * of_corners.max(1) / LEAST_COSINE
+    steepest = step / frame.intrinsics[0, 0] * of_corners.max(1) / LOWEST_COSINE
     corners = corners[inside & (np.ptp(of_corners, axis=1) < steepest)]
     if not len(corners):
         return None
@@ -359,7 +358,8 @@ def _pixels_of(frame: Frame, part: Part) -> tuple[Float, Float]:
     )
     row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
     seen = frame.depth[row, column] > 0
-    row, column = row[seen], column[seen]
+    row = row[seen]
+    column = column[seen]
     rays = np.column_stack(
         (frame.rays[0][column], frame.rays[1][row], np.ones(len(row)))
     )

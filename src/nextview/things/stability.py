@@ -13,13 +13,14 @@ import numpy as np
 from nextview.things.depth_view import ELSEWHERE, HIDING, HIDING_NOISE, DepthView
 from nextview.things.registration import SUNK, Alignment, Rendered, scan_errors
 from nextview.things.surface import SurfaceCaster
+from nextview.things.verification import PixelModel
 from nextview.types import Float, Index, Mask
 
 # largest gap between contact directions beyond a half turn, radians: the centroid of a standing
 # thing may lie on an edge of the contact area, and is not known exactly
 LARGEST_OVERHANG = 0.2
 # pixels around an outline in which cameras mix the depths of both sides
-MIXED = 3.0
+MIXED = PixelModel().edge
 # offset of a ray from a hull corner towards the centre, relative to their distance
 WITHIN = 0.05
 FEWEST_TOUCHED = 2  # fewest pixels that show a support
