@@ -70,6 +70,7 @@ __all__ = [
     "SimulatedCamera",
     "Stopping",
     "System",
+    "Tracker",
     "UsageError",
     "View",
     "ViewSphere",
@@ -82,11 +83,15 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """``Scene``, the simulated camera and ``learn``, imported when they are used."""
+    """``Scene``, ``Tracker``, the simulated camera and ``learn``, imported when they are used."""
     if name == "Scene":
         from nextview.scene.scene import Scene
 
         return Scene
+    if name == "Tracker":
+        from nextview.scene.tracker import Tracker
+
+        return Tracker
     if name == "SimulatedCamera":
         from nextview.simulation.simulated import SimulatedCamera
 

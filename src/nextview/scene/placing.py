@@ -143,7 +143,7 @@ class PlacedSurface:
         return replace(
             self,
             others=np.reshape(shown, (-1, len(self.depth))),
-            without=_log_density(off, self.sigma, 0.5),
+            without=log_density(off, self.sigma, 0.5),
         )
 
     def pose(self, motion: Float) -> Float:
@@ -196,7 +196,7 @@ class PlacedSurface:
             off = np.where(one < depth, nearer, off)
         # something unknown may hide the surface, but the camera rarely sees through it
         otherwise = np.where(self.depth < depth, 0.5, SEEN_THROUGH)
-        found = _log_density(off, np.hypot(self.sigma, sideways), otherwise)
+        found = log_density(off, np.hypot(self.sigma, sideways), otherwise)
         return self.weight * np.where(shows, found - self.without, 0.0)
 
     @cached_property
@@ -334,7 +334,7 @@ def seen_surface(sighting: Sighting) -> PoseCandidate | None:
     )
 
 
-def _log_density(off: Float, sigma: Float, otherwise: Float | float) -> Float:
+def log_density(off: Float, sigma: Float, otherwise: Float | float) -> Float:
     """Log-density of depths that are off a surface, or are otherwise anywhere.
 
     Args:

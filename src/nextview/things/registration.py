@@ -568,7 +568,7 @@ def _equations(
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
-        square, towards = _normal_equations(
+        square, towards = normal_equations(
             pulls_of(view, rendered, centres, reach),
             prior,
         )
@@ -648,8 +648,8 @@ def pose_covariances(
         reach = level.reach(rendered.radii, displaced[number])
         drawn = pulls_of(view, rendered, centres, reach)
         held = pulls_of_outline(view, rendered, centres)
-        information += _normal_equations(drawn, prior)[0]
-        information += _normal_equations(held, prior)[0]
+        information += normal_equations(drawn, prior)[0]
+        information += normal_equations(held, prior)[0]
 
     return inverses(information)
 
@@ -722,11 +722,19 @@ def pulls_of_outline(view: DepthView, rendered: Rendered, centres: Float) -> Pul
     )
 
 
-def _normal_equations(
+def normal_equations(
     pulls: Pulls,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Normal equations of one view: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
+    """Compute the normal equations of one view.
+
+    Args:
+        pulls: residuals of H hypotheses.
+        prior: gives the effective number of independent pixels.
+
+    Returns:
+        Matrices, (H, 6, 6), and right-hand sides, (H, 6), of rotation and translation.
+    """
     turning = np.cross(pulls.arms, pulls.directions)
     jacobian = np.concatenate(
         [turning, pulls.directions, pulls.distances[:, None]],

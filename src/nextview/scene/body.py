@@ -1,0 +1,241 @@
+"""A thing that a tracker follows: its surface, and the filters of its pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import expit, logit
+
+from nextview.recognition.poses import PoseCandidate, PoseUncertainty
+from nextview.scene.motion import BodyState, MotionModel, Rest
+from nextview.scene.objects import SceneObject
+from nextview.scene.tracks import caster_of
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.types import Float, Float32
+
+LOSSES = 0.1  # expected number of losses a second
+MOST_ODDS = 30.0  # log-odds that a pose is right
+FARTHEST_DEVIATIONS = 4.0  # at which a point may be on a surface
+LEAST_DEGREES = (
+    0.5  # standard deviation of the orientation with which a thing is taken over
+)
+LEAST_MILLIMETRES = 1.0  # the same of its place
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A thing in the last frame of a tracker.
+
+    Attributes:
+        number: of the object in the scene.
+        name: of the thing.
+        pose: from the frame of its scan to the world, (4, 4) float64, metres; predicted if it is
+            hidden.
+        velocity: angular, radians a second, and of the middle of the scan, metres a second, in the
+            world, (6,); zero if it rests.
+        uncertainty: of the pose, standard deviations.
+        visible: share of the pixels on it that nothing in front hides, 0 to 1.
+        probability: that the pose is right, and the thing is not lost.
+    """
+
+    number: int
+    name: str
+    pose: Float
+    velocity: Float
+    uncertainty: PoseUncertainty
+    visible: float
+    probability: float
+
+    @property
+    def lost(self) -> bool:
+        """Return True if the thing is probably not where it is expected."""
+        return self.probability < 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A followed thing.
+
+    Attributes:
+        number: of the object in the scene.
+        name: of the thing.
+        surface: in the frame of its scan.
+        caster: of rays at it.
+        seen: state of its motion in the last frame that shows it.
+        unseen: time since that frame, seconds.
+        rest: its pose in case that it rests.
+        state: expected in the next frame, or found in the last one.
+        visible: share of the pixels on it that nothing in front hides.
+        probability: that the pose is right.
+    """
+
+    number: int
+    name: str
+    surface: Surface
+    caster: SurfaceCaster
+    seen: BodyState
+    unseen: float
+    rest: Rest
+    state: BodyState
+    visible: float = 1.0
+    probability: float = 1.0
+
+    @classmethod
+    def of(cls, one: SceneObject, model: MotionModel) -> Body | None:
+        """Start with an object of a scene; None if it has no confident name and pose.
+
+        Args:
+            one: the object.
+            model: of its motion.
+        """
+        if not one.confident or one.pose is None:
+            return None
+        label = one.result.classes.index(one.name)
+        posed = next(each for each in one.candidates if each.label == label)
+        return cls._placed(one.number, posed, model)
+
+    @classmethod
+    def _placed(cls, number: int, posed: PoseCandidate, model: MotionModel) -> Body:
+        """Start with a thing in a pose."""
+        caster = caster_of(posed)
+        surface = caster.surfaces[0]
+        rotation = posed.pose[:3, :3]
+        deviations = [
+            np.radians(max(posed.degrees, LEAST_DEGREES)),
+            max(posed.millimetres, LEAST_MILLIMETRES) / 1000,
+        ]
+        spins = [each.axis for each in posed.symmetry or () if each.order == 0]
+        state = BodyState.at_rest(
+            rotation,
+            rotation @ surface.centre + posed.pose[:3, 3],
+            np.repeat(deviations, 3),
+            model,
+            np.reshape(np.array(spins, np.float64), (-1, 3)),
+        )
+        return cls(
+            number, posed.thing, surface, caster, state, 0.0, Rest.at(state), state
+        )
+
+    @property
+    def rests(self) -> bool:
+        """True if it probably rests."""
+        return self.rest.probability >= 0.5
+
+    @property
+    def lost(self) -> bool:
+        """True if it is probably not where it is expected."""
+        return self.probability < 0.5
+
+    @property
+    def pose(self) -> Float:
+        """Pose of the scan in the world, (4, 4) float64, metres."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.state.rotation
+        pose[:3, 3] = self.state.centre - self.state.rotation @ self.surface.centre
+        return pose
+
+    @property
+    def displaced(self) -> float:
+        """Standard deviation of the displacement of its surface, metres."""
+        turn, shift = _deviations(self.state)
+        return float(np.hypot(turn * self.surface.radius, shift) / np.sqrt(3))
+
+    @property
+    def tracked(self) -> Tracked:
+        """What users see of it."""
+        turn, shift = _deviations(self.state)
+        return Tracked(
+            self.number,
+            self.name,
+            self.pose,
+            self.state.velocity,
+            PoseUncertainty(float(np.degrees(turn)), float(1000 * shift)),
+            self.visible,
+            self.probability,
+        )
+
+    def after(self, seconds: float, model: MotionModel) -> Body:
+        """Predict it for the next frame.
+
+        Args:
+            seconds: since the last frame.
+            model: of its motion.
+        """
+        unseen = self.unseen + seconds
+        body = replace(
+            self,
+            rest=self.rest.after(seconds, model),
+            state=self.seen.after(unseen, model),
+            unseen=unseen,
+            probability=self.probability * float(np.exp(-LOSSES * seconds)),
+        )
+        if not body.rests or body.lost:
+            return body
+        # it may begin to move now, whenever it was seen last
+        begins = self.seen.after(seconds, model)
+        return replace(body, state=body.rest.state_of(begins, begins.pose_covariance))
+
+    def judged(self, evidence: float, visible: float) -> Body:
+        """Update the probability that the pose is right.
+
+        Args:
+            evidence: log-likelihood of a frame with the thing, against that without it.
+            visible: share of the pixels on it that nothing in front hides.
+        """
+        odds = np.clip(logit(self.probability) + evidence, -MOST_ODDS, MOST_ODDS)
+        return replace(self, visible=visible, probability=float(expit(odds)))
+
+    def measured(self, state: BodyState, errors: Float) -> Body:
+        """Take in a measured pose.
+
+        Args:
+            state: filtered in case that it moves.
+            errors: covariance of the measured pose without the prediction, (6, 6).
+        """
+        rest = self.rest.measured(self.state, state, errors)
+        body = replace(self, rest=rest, state=state)
+        if not body.lost:
+            body = replace(body, seen=state, unseen=0.0)
+        if body.rests:
+            body = replace(body, state=rest.state_of(state, rest.covariance))
+        return body
+
+    def log_density(self, points: Float32, noise: Float32) -> Float:
+        """Log-density of measured points on the surface in its expected pose.
+
+        Args:
+            points: (N, 3), world, metres.
+            noise: standard deviation of each, (N,), metres.
+
+        Returns:
+            Log-densities along the distance from the surface, (N,), 1/metres, of which one half
+            may be elsewhere.
+        """
+        state = self.state
+        density = np.full(len(points), -np.inf)
+        local = (points - state.centre) @ state.rotation + self.surface.centre
+        farthest = FARTHEST_DEVIATIONS * np.hypot(2 * self.displaced, noise.max())
+        tree = self.surface.nearby
+        apart, nearest = tree.query(
+            local, distance_upper_bound=float(farthest) + self.surface.spacing
+        )
+        near = np.flatnonzero(np.isfinite(apart))
+        if not len(near):
+            return density
+
+        apart = np.asarray(apart)[near]
+        away = (local[near] - tree.data[np.asarray(nearest)[near]]) @ state.rotation.T
+        away /= np.maximum(apart, 1e-9)[:, None]
+        arms = points[near] - state.centre
+        rows = np.concatenate([np.cross(arms, away), away], axis=1)
+        variance = np.einsum("ni,ij,nj->n", rows, state.pose_covariance, rows)
+        variance += noise[near] ** 2 + (self.surface.spacing / 2) ** 2
+        density[near] = -0.5 * (apart**2 / variance + np.log(8 * np.pi * variance))
+        return density
+
+
+def _deviations(state: BodyState) -> tuple[float, float]:
+    """Standard deviations of rotation, radians, and place, metres, all axes together."""
+    variances = np.diag(state.pose_covariance)
+    return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))

@@ -1,0 +1,143 @@
+"""Follow the poses of recognised things at the rate of the camera, from depth alone.
+
+In each frame a thing is registered from its expected pose, with the expectation as the prior (an
+iterated extended Kalman filter). Whether it is still there follows from the likelihood of the
+pixels on it, against that without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from nextview.checks import number
+from nextview.errors import SessionError
+from nextview.scene.body import Body, Tracked
+from nextview.scene.body_pixels import BodyPixels, registered
+from nextview.scene.motion import MotionModel
+from nextview.scene.scene import Scene
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import Frame
+from nextview.sensing.planes import Plane
+
+FRAME_SECONDS = 1 / 30  # between frames without a time
+SEARCH_STARTS = 8  # poses from which a thing is registered if its pose is uncertain
+# error of the expected pose, radii, up to which the registration converges from there
+ONE_START = 0.25
+
+
+class Tracker:
+    """Follows the things that a scene has named, frame by frame.
+
+    >>> tracker = nextview.Tracker(scene)                                       # doctest: +SKIP
+    >>> for frame in frames:                                                    # doctest: +SKIP
+    ...     for thing in tracker.update(frame):
+    ...         print(thing.name, thing.lost, thing.pose)
+
+    A thing that moves behind something is expected where its velocity would bring it, and searched
+    around that place. One that stands is expected to stay. If a thing stays lost, update the scene
+    with a frame and ``follow`` it again.
+
+    Args:
+        scene: with at least one frame; its things with confident names are followed.
+        model: how things move.
+        rng: for the poses in which a thing is searched; seed 0 by default.
+
+    Raises:
+        SessionError: the scene has no frame yet.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: MotionModel = MotionModel(),
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self.model = model
+        self._rng = rng or np.random.default_rng(0)
+        self._bodies: Mapping[int, Body] = {}
+        self._time: float | None = None
+        self._noise: Noise
+        self._ground: Plane | None = None
+        self.follow(scene)
+
+    def follow(self, scene: Scene) -> None:
+        """Take over what a scene has found: new things, and those that are lost here.
+
+        A thing that is followed and not lost keeps its pose. One that the scene no longer has is
+        no longer followed.
+
+        Args:
+            scene: with at least one frame.
+
+        Raises:
+            SessionError: the scene has no frame yet.
+        """
+        if not scene.tops:
+            raise SessionError(
+                "there is nothing to follow before the first frame of the scene"
+            )
+        top = scene.tops[-1]
+        self._noise = top.noise
+        self._ground = top.plane if top.shows_ground else None
+        bodies = {}
+        for one in scene.objects:
+            body = self._bodies.get(one.number)
+            if body is None or body.lost:
+                body = Body.of(one, self.model)
+            if body is not None:
+                bodies[one.number] = body
+        self._bodies = bodies
+
+    @property
+    def things(self) -> tuple[Tracked, ...]:
+        """The things that are followed, by their numbers."""
+        return tuple(body.tracked for _, body in sorted(self._bodies.items()))
+
+    def update(self, frame: Frame, time: float | None = None) -> tuple[Tracked, ...]:
+        """Follow all things into the next frame.
+
+        Args:
+            frame: of the same camera or another one, with a pose.
+            time: of the frame, seconds on any clock; 1/30 s after the last frame by default.
+
+        Returns:
+            The things that are followed, by their numbers.
+
+        Raises:
+            UsageError: the time is before that of the last frame.
+        """
+        before = self._time
+        if time is None:
+            time = 0.0 if before is None else before + FRAME_SECONDS
+        time = number(time, "the time", least=-np.inf if before is None else before)
+        seconds = FRAME_SECONDS if before is None else time - before
+        self._time = time
+
+        bodies = {
+            key: body.after(seconds, self.model) for key, body in self._bodies.items()
+        }
+        for key, body in bodies.items():
+            others = [other for name, other in bodies.items() if name != key]
+            bodies[key] = self._followed(body, others, frame)
+        self._bodies = bodies
+        return self.things
+
+    def _followed(self, body: Body, others: Sequence[Body], frame: Frame) -> Body:
+        """Register a thing in a frame."""
+        pixels = BodyPixels.around(body, others, frame, self._noise, self._ground)
+        if pixels is None:
+            return body.judged(0.0, 0.0)
+        starts = [body.state]
+        if body.displaced > ONE_START * body.surface.radius:
+            spread = np.linalg.cholesky(body.state.pose_covariance)
+            motions = self._rng.normal(size=(SEARCH_STARTS, 6)) @ spread.T
+            starts += [body.seen, *(body.state.displaced(each) for each in motions)]
+
+        tried = [registered(body, start, pixels) for start in starts]
+        best = max(tried, key=lambda each: each.evidence)
+        body = body.judged(best.evidence, best.visible)
+        if best.errors is None or best.evidence <= 0:
+            return body
+        return body.measured(best.state, best.errors)

@@ -1,0 +1,149 @@
+"""Things are followed from frame to frame: moved, hidden, taken away and found again."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_tables import camera_over, meshes_of, view, without
+from test_scene_changes import shifted
+
+import nextview
+from nextview.errors import SessionError, UsageError
+from nextview.scene.motion import BodyState, MotionModel
+from nextview.sensing.frame import Frame
+
+NAMES = ("mustard_bottle", "tuna_fish_can", "banana")
+STEP = np.array([0.004, -0.003])  # metres a frame, 0.15 m/s at 30 Hz
+
+
+@pytest.fixture
+def watched(ycb):
+    camera = camera_over(list(meshes_of(NAMES).values()), seed=8)
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    scene.update(camera.frame(view(20)))
+    assert {thing.name for thing in scene.objects if thing.confident} == set(NAMES)
+    return camera, scene
+
+
+def off(camera, tracked):
+    """Distance of each thing's pose from the truth, metres, at the middle of its scan."""
+    apart = {}
+    for one in tracked:
+        true = next(thing for thing in camera.table.things if thing.name == one.name)
+        middle = (true.vertices.min(0) + true.vertices.max(0)) / 2
+        difference = one.pose - true.pose
+        apart[one.name] = np.linalg.norm(
+            difference[:3, :3] @ middle + difference[:3, 3]
+        )
+    return apart
+
+
+def hidden(camera, frame, name):
+    """A frame in which something close to the camera hides a thing."""
+    row = [thing.name for thing in camera.table.things].index(name)
+    rows, columns = np.nonzero(camera.owner == row)
+    depth = frame.depth.copy()
+    part = np.s_[
+        max(0, rows.min() - 8) : rows.max() + 8,
+        max(0, columns.min() - 8) : columns.max() + 8,
+    ]
+    depth[part] = 0.3
+    return Frame(depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
+
+
+def test_a_thing_that_moves_is_followed_and_the_others_stand(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    for _ in range(10):
+        camera.change(shifted(camera.table, "banana", STEP))
+        tracked = tracker.update(camera.frame(view(20)))
+        assert not any(one.lost for one in tracked)
+        assert max(off(camera, tracked).values()) < 0.004
+    banana = next(one for one in tracked if one.name == "banana")
+    assert np.allclose(banana.velocity[3:5], 30 * STEP, atol=0.06)
+    assert banana.visible > 0.7
+
+
+def test_a_thing_that_was_hidden_is_found_where_it_was_moved(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    for _ in range(8):
+        camera.change(shifted(camera.table, "banana", STEP))
+        frame = camera.frame(view(20))
+        tracked = tracker.update(hidden(camera, frame, "banana"))
+    banana = next(one for one in tracked if one.name == "banana")
+    assert banana.visible < 0.05
+    assert banana.uncertainty.millimetres > 10
+    for _ in range(5):
+        tracked = tracker.update(camera.frame(view(20)))
+    assert not any(one.lost for one in tracked)
+    assert off(camera, tracked)["banana"] < 0.004
+
+
+def test_a_thing_that_was_taken_away_is_lost_and_followed_again_after_the_scene(
+    watched,
+):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    full = camera.table
+    camera.change(without(full, "banana"))
+    for _ in range(3):
+        tracked = tracker.update(camera.frame(view(20)))
+    assert {one.name for one in tracked if one.lost} == {"banana"}
+    scene.update(camera.frame(view(20)))
+    tracker.follow(scene)
+    assert {one.name for one in tracker.things} == set(NAMES) - {"banana"}
+
+    camera.change(full)
+    frame = camera.frame(view(20))
+    scene.update(frame)
+    tracker.follow(scene)
+    assert off(camera, tracker.update(frame))["banana"] < 0.004
+
+
+def test_what_is_out_of_view_keeps_its_place(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    frame = camera.frame(view(20))
+    aside = frame.camera_to_world.copy()
+    aside[:3, :3] = (
+        aside[:3, :3] @ Rotation.from_euler("y", 120, degrees=True).as_matrix()
+    )
+    tracked = tracker.update(
+        Frame(frame.depth, frame.intrinsics, aside, pixel_centre=0.5)
+    )
+    assert max(off(camera, tracked).values()) < 0.004
+    assert all(one.visible == 0 and not one.lost for one in tracked)
+
+
+def test_wrong_use_is_refused(ycb, watched):
+    camera, scene = watched
+    with pytest.raises(SessionError, match="before the first frame"):
+        nextview.Tracker(nextview.Scene(ycb))
+    tracker = nextview.Tracker(scene)
+    frame = camera.frame(view(20))
+    tracker.update(frame, 2.0)
+    with pytest.raises(UsageError, match="the time"):
+        tracker.update(frame, 1.0)
+
+
+def test_predicted_motion_agrees_with_simulated_motions():
+    model = MotionModel(speed=0.3, turning=1e-6, memory=0.4)
+    body = BodyState.at_rest(
+        np.eye(3), np.zeros(3), np.full(6, 1e-9), model, np.zeros((0, 3))
+    )
+    rng = np.random.default_rng(1)
+    steps, seconds = 200, 0.5
+    kept = np.exp(-seconds / steps / model.memory)
+    velocity = rng.normal(0, model.speed, 20_000)
+    path = np.zeros_like(velocity)
+    for _ in range(steps):
+        path += velocity * seconds / steps
+        fresh = rng.normal(0, model.speed, len(path))
+        velocity = kept * velocity + np.sqrt(1 - kept**2) * fresh
+    predicted = body
+    for _ in range(5):
+        predicted = predicted.after(seconds / 5, model)
+    assert np.sqrt(predicted.covariance[3, 3]) == pytest.approx(path.std(), rel=0.03)
+    assert predicted.covariance[3, 9] == pytest.approx(
+        np.cov(path, velocity)[0, 1], rel=0.06
+    )
