@@ -7,6 +7,7 @@ import pytest
 from small_tables import camera_over, meshes_of, view, without
 
 import nextview
+from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable
 
@@ -96,3 +97,28 @@ def test_two_things_that_were_swapped_have_both_moved(ycb, meshes):
         if thing.name in ("mustard_bottle", "tuna_fish_can"):
             true = camera.table.things[NAMES.index(thing.name)].placed.mean(0)[:2]
             assert np.linalg.norm(thing.place[:2] - true) < 0.02
+
+
+@pytest.mark.parametrize("metres", [0.01, 0.05])
+def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes, metres):
+    camera = camera_over(list(meshes.values()), seed=8)
+    camera.sensor = SENSORS["stereo"]
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    belt = np.eye(4)
+    start = camera.table
+    for number in range(4):
+        belt[0, 3] = number * metres
+        things = [replace(one, pose=belt @ one.pose) for one in start.things]
+        camera.change(SimulatedTable(tuple(things)))
+        frame = camera.frame(view(20 + 30 * number))
+        on_belt = np.linalg.inv(belt) @ frame.pose
+        look = scene.update(
+            Frame(frame.depth, frame.intrinsics, on_belt, pixel_centre=0.5)
+        )
+        assert look.taken
+        assert look.moved == look.gone == ()
+    for one in scene.objects:
+        true = next(thing for thing in camera.table.things if thing.name == one.name)
+        middle = np.append(true.vertices.mean(0), 1)
+        assert np.linalg.norm((belt @ one.pose - true.pose) @ middle) < 0.003
+    assert {one.name for one in scene.objects} == set(NAMES)

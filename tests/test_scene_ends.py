@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from small_tables import camera_over, view
+from small_tables import camera_over, meshes_of, view
 
 import nextview
 from nextview.cli.look import print_scene
@@ -57,7 +57,30 @@ def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
     assert "unexplained" in names(look)
     assert "empty" not in names(look)
     assert not scene.done
+    assert scene.open
+    assert any("neither ground nor an object" in one.why for one in scene.open)
     assert scene.target is not None
+
+
+def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
+    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=5)
+    camera.sensor = SENSORS["stereo"]
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    assert scene.open == ()
+    scene.update(camera.frame(view(20, elevation=25)))
+    hidden = [one for one in scene.open if "hidden" in one.why]
+    assert len(hidden) == 1
+    box = next(thing for thing in camera.table.things if thing.name == "cracker_box")
+    assert abs(hidden[0].place[2]) < 0.01
+    # behind the box, as seen from the camera
+    sight = box.placed.mean(0)[:2] - view(20, elevation=25)[:2, 3]
+    assert (hidden[0].place[:2] - box.placed.mean(0)[:2]) @ sight > 0
+    assert not scene.done
+
+    for degrees in (140, 260):
+        scene.update(camera.frame(view(degrees, elevation=60)))
+    assert scene.open == ()
+    assert scene.done
 
 
 def test_small_steps_side_by_side_are_not_empty(ycb):

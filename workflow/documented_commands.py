@@ -160,20 +160,7 @@ FEWER = {  # what a page says of the published runs, and how many it is here
     r"--views-per-object \d+": "--views-per-object 2",
     r"--batch \d+": "--batch 8",
 }
-BEFORE = {  # what Python blocks of a page take for granted
-    "docs/your_camera.md": (
-        """
-import nextview
-from nextview.sensing import Frame
-from stand_ins import arm, intrinsics
-
-system = nextview.load()
-session = system.session(distance=0.6)
-depth, pose = arm.look()
-"""
-    ),
-    "docs/your_table.md": (
-        """
+TABLE_OF_THINGS = """
 import numpy as np
 
 from nextview.geometry.mesh import make_mesh
@@ -190,22 +177,56 @@ def mesh_of(name):
     return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
 
 
+rng = np.random.default_rng(4)
+meshes = [mesh_of(name) for name in ("cracker_box", "mug", "banana")]
+table = TableCamera(SimulatedTable.draw(meshes, rng), SENSORS["stereo"], rng)
+"""
+BEFORE = {  # what Python blocks of a page take for granted
+    "docs/your_camera.md": (
+        """
+import nextview
+from nextview.sensing import Frame
+from stand_ins import arm, intrinsics
+
+system = nextview.load()
+session = system.session(distance=0.6)
+depth, pose = arm.look()
+"""
+    ),
+    "docs/your_table.md": (
+        TABLE_OF_THINGS
+        + """
 class Arm:
     def __init__(self):
-        rng = np.random.default_rng(4)
-        meshes = [mesh_of(name) for name in ("cracker_box", "mug", "banana")]
-        self.camera = TableCamera(SimulatedTable.draw(meshes, rng), SENSORS["stereo"], rng)
         self.pose = poses_around(np.radians([30]), np.radians(45), 0.6, np.zeros(3))[0]
 
     def look(self):
-        return self.camera.frame(self.pose).depth, self.pose
+        return table.frame(self.pose).depth, self.pose
 
     def go_to(self, pose):
         self.pose = pose
 
 
 arm = Arm()
-intrinsics = arm.camera.sensor.intrinsics
+intrinsics = table.sensor.intrinsics
+"""
+    ),
+    "docs/tracking.md": (
+        TABLE_OF_THINGS
+        + """
+class Camera:
+    def read(self):
+        pose = poses_around(np.radians([30]), np.radians(45), 0.6, np.zeros(3))[0]
+        return table.frame(pose).depth, pose, 0.0
+
+    def __iter__(self):
+        for number in range(5):
+            depth, pose, _ = self.read()
+            yield depth, pose, (number + 1) / 30
+
+
+camera = Camera()
+intrinsics = table.sensor.intrinsics
 """
     ),
     "docs/see_it.md": "import nextview",

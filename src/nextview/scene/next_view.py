@@ -23,7 +23,7 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System
-from nextview.types import Float, Mask
+from nextview.types import Float, Index, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table
 OBJECT_MARGIN = 0.08  # metres of table around the objects that count
@@ -107,10 +107,13 @@ class TableGround:
         return cls(points, top, in_view & ~shown & (top == 0), shape, low, axes, floor)
 
     @property
-    def largest_hidden(self) -> int:
-        """Number of cells in the largest connected hidden area of the table."""
+    def largest_hidden(self) -> Index:
+        """Cells of the largest connected hidden area of the table, (N,) int64."""
         label, count = ndimage.label(self.hidden.reshape(self.shape))
-        return int(np.bincount(label.ravel())[1:].max()) if count else 0
+        if not count:
+            return np.zeros(0, np.int64)
+        largest = np.bincount(label.ravel())[1:].argmax() + 1
+        return np.flatnonzero(label.ravel() == largest)
 
     def visible(self, camera: Float) -> Mask:
         """Return which cells would be visible from a camera position, (C,) bool.
@@ -300,7 +303,7 @@ def ground_value(
         views: the candidates; the value of a view that is not free is 0.
     """
     value = np.zeros(len(views.poses))
-    if ground.largest_hidden < FEWEST_HIDDEN:
+    if len(ground.largest_hidden) < FEWEST_HIDDEN:
         return value
     each = objects * np.log(max(things, 2)) / max(len(ground.hidden), 1)
     for row in np.flatnonzero(views.free):

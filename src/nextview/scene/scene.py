@@ -20,6 +20,7 @@ from nextview.scene.following import SAME_OBJECT_SHARE, assign
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import candidates
 from nextview.scene.objects import SceneObject
+from nextview.scene.open_points import OpenPoint
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
@@ -196,7 +197,15 @@ class Scene:
         state = self._state
         if len(state.tops) >= self.system.stopping.max_views:
             return True
-        return bool(state.tops) and state.settled
+        return bool(state.tops) and not state.open
+
+    @property
+    def open(self) -> tuple[OpenPoint, ...]:
+        """What is not settled yet, and why: objects first, then parts of the table.
+
+        Empty before the first frame, and when further views would add little.
+        """
+        return self._state.open
 
     @property
     def target(self) -> Float | None:

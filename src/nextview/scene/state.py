@@ -9,8 +9,9 @@ import numpy as np
 
 from nextview.checks import number_of
 from nextview.scene.changes import CameraError
-from nextview.scene.next_view import FEWEST_HIDDEN, TableGround
+from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject
+from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box
@@ -71,13 +72,13 @@ class SceneState:
         return ground_seen(self.tops, self.region)
 
     @cached_property
-    def settled(self) -> bool:
-        """True if there is at least one frame and further views would add little."""
-        if self.unexplained or not all(track.settled for track in self.tracks):
-            return False
-        if self.ground is None:
-            return self.ground_seen
-        return self.ground.largest_hidden < FEWEST_HIDDEN
+    def open(self) -> tuple[OpenPoint, ...]:
+        """What is not settled; empty before the first frame."""
+        if not self.tops:
+            return ()
+        return open_points(
+            self.tracks, self.unexplained, self.ground, self.ground_seen
+        )
 
     @property
     def around(self) -> Float:
