@@ -6,8 +6,9 @@ SCANS is a folder with scans of the things that the memory knows, in metres, by 
 them stand on a table, and a scene names them from three views. One whose pose it finds is then
 followed: the camera stands still, 0.6 to 0.8 m away, and takes 640 x 480 pixels at 30 Hz through
 the model of a stereo sensor for four seconds, while a gripper lifts the thing and moves it with up
-to 0.2 m/s and 60 degrees/s. The tracker does not know the gripper. For half a second a forearm
-hides the thing.
+to 0.2 m/s and 60 degrees/s. The gripper has the size of a Panda's, and leaves half of the thing
+visible in the first frame; the tracker does not know it. For half a second a forearm hides the
+thing.
 
 Errors are those of the pose in the camera's frame: the distance of the middle of the scan from the
 truth, and the angle of the rotation, or between the axes of a thing that is symmetric about one. A
@@ -60,9 +61,14 @@ SPEED = 0.2  # metres a second, at most
 TURN_SPEED = 60.0  # degrees a second, at most
 LIFT = 0.12  # metres
 THINGS = 4
-MOST_TABLES = 20  # drawn until the pose of a thing is found
+MOST_TABLES = 30  # drawn until the pose of a thing is found
+MOST_TRAJECTORIES = 8  # drawn for a thing
+VISIBLE_AT_FIRST = 0.5  # share of the pixels of the thing
 GAP = 0.10  # metres between neighbours, at most
 NAMED_FROM = 3  # views
+FINGER = (0.015, 0.02, 0.054)  # metres, along the opening, across and along the finger
+HAND = (0.204, 0.063, 0.066)  # metres
+DEEPEST_TIPS = 0.04  # metres below the top of a thing
 HIDDEN_SECONDS = 0.5
 HAND_FROM = 0.65  # share of the way from the camera to the thing
 LOST_MILLIMETRES = 20.0
@@ -141,43 +147,43 @@ class Trajectory:
             hand_places,
         )
 
-    def frames(self, rng: np.random.Generator) -> Iterator[tuple[Frame, float]]:
-        """Measure the frames, each with the share of the thing's pixels that is visible."""
-        sensor = SENSOR
-        rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(-1, 3)
+    def cast(self, number: int) -> tuple[NDArray[np.float32], float]:
+        """Depth of a frame without noise, and the share of the thing's pixels that is visible."""
+        rays = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
         rays = rays @ self.camera[:3, :3].T
         origin = self.camera[:3, 3]
         thing = self.table.things[self.row]
-        others = [one for k, one in enumerate(self.table.things) if k != self.row]
-        top = upright_boxes(
-            np.array([[1.5, 1.1, 0.03]]), np.zeros(1), np.zeros((1, 2)), -0.03
-        )
-        floor = upright_boxes(
-            np.array([[8.0, 8.0, 0.01]]), np.zeros(1), np.zeros((1, 2)), -0.75
-        )
-        world: list[Triangles] = [
-            *((one.placed, one.faces) for one in others),
-            (top.vertices, top.faces),
-            (floor.vertices, floor.faces),
+        pose = self.poses[number]
+        since = pose @ np.linalg.inv(thing.pose)
+        own = (thing.vertices @ pose[:3, :3].T + pose[:3, 3], thing.faces)
+        moved = [
+            (one @ since[:3, :3].T + since[:3, 3], faces) for one, faces in self.gripper
         ]
-        for pose, place in zip(self.poses, self.hand_places, strict=True):
-            since = pose @ np.linalg.inv(thing.pose)
-            moved = [
-                (one @ since[:3, :3].T + since[:3, 3], faces)
-                for one, faces in self.gripper
-            ]
-            vertices = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
-            own = (vertices, thing.faces)
-            hand = (self.hand[0] + place, self.hand[1])
-            alone, _ = RayCaster([own]).cast(origin, rays)
-            depth, owner = RayCaster([own, *moved, hand, *world]).cast(origin, rays)
-            clean = np.where(np.isfinite(depth), depth, 0).reshape(sensor.shape)
-            measured, _ = sensor.measure(clean.astype(np.float32), rng.spawn(1)[0])
-            visible = np.count_nonzero(owner == 0) / max(1, np.isfinite(alone).sum())
-            yield (
-                Frame(measured, sensor.intrinsics, self.camera, pixel_centre=0.5),
-                visible,
-            )
+        hand = (self.hand[0] + self.hand_places[number], self.hand[1])
+        others = [one for row, one in enumerate(self.table.things) if row != self.row]
+        world = [*((one.placed, one.faces) for one in others), *_table_and_floor()]
+
+        alone, _ = RayCaster([own]).cast(origin, rays)
+        depth, owner = RayCaster([own, *moved, hand, *world]).cast(origin, rays)
+        clean = np.where(np.isfinite(depth), depth, 0).reshape(SENSOR.shape)
+        share = np.count_nonzero(owner == 0) / max(1, np.isfinite(alone).sum())
+        return clean.astype(np.float32), float(share)
+
+    def frames(self, rng: np.random.Generator) -> Iterator[tuple[Frame, float]]:
+        """Measure the frames, each with the share of the thing's pixels that is visible."""
+        for number in range(len(self.poses)):
+            clean, share = self.cast(number)
+            measured, _ = SENSOR.measure(clean, rng.spawn(1)[0])
+            frame = Frame(measured, SENSOR.intrinsics, self.camera, pixel_centre=0.5)
+            yield frame, share
+
+
+def _table_and_floor() -> list[Triangles]:
+    """A table whose top is z = 0, and the floor."""
+    one = np.zeros(1)
+    top = upright_boxes(np.array([[1.5, 1.1, 0.03]]), one, np.zeros((1, 2)), -0.03)
+    floor = upright_boxes(np.array([[8.0, 8.0, 0.01]]), one, np.zeros((1, 2)), -0.75)
+    return [(top.vertices, top.faces), (floor.vertices, floor.faces)]
 
 
 def _slowed(path: Float, speed: float, rate: int) -> Float:
@@ -187,18 +193,24 @@ def _slowed(path: Float, speed: float, rate: int) -> Float:
 
 
 def _gripper(placed: Float) -> tuple[Triangles, ...]:
-    """Two fingers at the sides of a thing, and a palm above, in the world."""
+    """Fingers and hand of the size of a Panda's, with the fingertips at a thing, in the world."""
     low, high = placed.min(0), placed.max(0)
     middle = (low + high) / 2
     side = int(np.argmin((high - low)[:2]))
+    tips = max(middle[2], high[2] - DEEPEST_TIPS)
     parts = []
     for end, sign in ((low, -1), (high, 1)):
         place = middle.copy()
-        place[side] = end[side] + sign * 0.007
-        place[2] = high[2]
-        parts.append(((0.012, 0.012, 0.05), place))
-    parts.append(((0.05, 0.05, 0.03), np.array([*middle[:2], high[2] + 0.05])))
-    boxes = [trimesh.creation.box(size, _shift(place)) for size, place in parts]
+        place[side] = end[side] + sign * FINGER[0] / 2
+        place[2] = tips + FINGER[2] / 2
+        parts.append((FINGER, place))
+    above = np.array([*middle[:2], tips + FINGER[2] + HAND[2] / 2])
+    parts.append((HAND, above))
+    boxes = []
+    for size, place in parts:
+        # sizes are given along the opening first
+        turned = size if side == 0 else (size[1], size[0], size[2])
+        boxes.append(trimesh.creation.box(turned, _shift(place)))
     return tuple((np.asarray(box.vertices), np.asarray(box.faces)) for box in boxes)
 
 
@@ -264,15 +276,26 @@ def _rightly_named(scene: Scene, thing: PlacedThing) -> SceneObject | None:
     return None
 
 
+def _visible_trajectory(
+    table: SimulatedTable, row: int, rng: np.random.Generator
+) -> Trajectory | None:
+    """Draw a trajectory in whose first frame half of the thing is visible; None if none is."""
+    for _ in range(MOST_TRAJECTORIES):
+        trajectory = Trajectory.draw(table, row, rng)
+        if trajectory.cast(0)[1] >= VISIBLE_AT_FIRST:
+            return trajectory
+    return None
+
+
 def _named_table(
     system: nextview.System,
     meshes: Sequence[Mesh],
     rng: np.random.Generator,
-) -> tuple[SimulatedTable, int, Scene, SceneObject]:
-    """Draw a table, the row of a thing on it, the scene, and the object that is that thing.
+) -> tuple[Trajectory, Scene, SceneObject]:
+    """Draw the trajectory of a thing on a table, the scene, and the object that is the thing.
 
     Raises:
-        UsageError: the pose of the drawn thing is found on none of MOST_TABLES tables.
+        UsageError: none of MOST_TABLES tables has a visible thing whose pose is found.
     """
     for _ in range(MOST_TABLES):
         try:
@@ -283,9 +306,14 @@ def _named_table(
         scene = named(system, table, rng)
         row = int(rng.integers(THINGS))
         one = _rightly_named(scene, table.things[row])
-        if one is not None:
-            return table, row, scene, one
-    raise UsageError("the pose of the drawn thing is found on none of the tables")
+        if one is None:
+            continue
+        trajectory = _visible_trajectory(table, row, rng)
+        if trajectory is not None:
+            return trajectory, scene, one
+    raise UsageError(
+        "on none of the tables a thing is visible in the gripper, and its pose found"
+    )
 
 
 def follow(
@@ -295,10 +323,10 @@ def follow(
 ) -> dict[str, Any]:
     """Track one thing along a trajectory."""
     rng = np.random.default_rng(seed)
-    table, row, scene, one = _named_table(system, meshes, rng)
-    thing = table.things[row]
+    trajectory, scene, one = _named_table(system, meshes, rng)
+    table = trajectory.table
+    thing = table.things[trajectory.row]
     axis = axis_of(one)
-    trajectory = Trajectory.draw(table, row, rng)
     tracker = Tracker(scene)
     line: dict[str, Any] = {"thing": thing.name, "symmetric": axis is not None}
     steps = []

@@ -15,6 +15,7 @@ from nextview.things.surface import Surface, SurfaceCaster
 from nextview.types import Float, Float32
 
 LOSSES = 0.1  # expected number of losses a second
+RETURNS = 1.0  # expected number of times a second that a lost thing is in view again
 MOST_ODDS = 30.0  # log-odds that a pose is right
 FARTHEST_DEVIATIONS = 4.0  # at which a point may be on a surface
 LEAST_DEGREES = (
@@ -168,7 +169,8 @@ class Body:
             rest=self.rest.after(seconds, model),
             state=self.seen.after(unseen, model),
             unseen=unseen,
-            probability=self.probability * float(np.exp(-LOSSES * seconds)),
+            probability=self.probability * float(np.exp(-LOSSES * seconds))
+            + (1 - self.probability) * float(1 - np.exp(-RETURNS * seconds)),
         )
         if not body.rests or body.lost:
             return body

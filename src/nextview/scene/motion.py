@@ -136,8 +136,21 @@ class BodyState:
         )
 
     def motion_to(self, other: BodyState) -> Float:
-        """Return rotation about the centre and shift, (6,), to the pose of another state."""
-        turn = Rotation.from_matrix(other.rotation @ self.rotation.T).as_rotvec()
+        """Return rotation about the centre and shift, (6,), to the pose of another state.
+
+        The rotation is the smallest after which the body looks as in the other state: turns about
+        ``spins`` are left out.
+        """
+        if not len(self.spins):
+            turn = Rotation.from_matrix(other.rotation @ self.rotation.T).as_rotvec()
+        elif len(self.spins) > 1:  # a ball
+            turn = np.zeros(3)
+        else:
+            axis = self.rotation @ self.spins[0]
+            there = other.rotation @ self.spins[0]
+            across = np.cross(axis, there)
+            sine = np.linalg.norm(across)
+            turn = across / max(sine, 1e-12) * np.arctan2(sine, axis @ there)
         return np.concatenate([turn, other.centre - self.centre])
 
     def displaced(self, motion: Float) -> BodyState:

@@ -76,9 +76,7 @@ class SceneState:
         """What is not settled; empty before the first frame."""
         if not self.tops:
             return ()
-        return open_points(
-            self.tracks, self.unexplained, self.ground, self.ground_seen
-        )
+        return open_points(self.tracks, self.unexplained, self.ground, self.ground_seen)
 
     @property
     def around(self) -> Float:

@@ -8,13 +8,14 @@ pixels on it, against that without it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from nextview.checks import number
 from nextview.errors import SessionError
 from nextview.scene.body import Body, Tracked
-from nextview.scene.body_pixels import BodyPixels, registered
+from nextview.scene.body_pixels import NEAR_SHIFT, BodyPixels, registered
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
 from nextview.sensing.facets import Noise
@@ -22,9 +23,9 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
-SEARCH_STARTS = 8  # poses from which a thing is registered if its pose is uncertain
-# error of the expected pose, radii, up to which the registration converges from there
-ONE_START = 0.25
+SEARCH_STARTS = (
+    4  # further poses near which an uncertain thing is registered in a frame
+)
 
 
 class Tracker:
@@ -126,18 +127,26 @@ class Tracker:
 
     def _followed(self, body: Body, others: Sequence[Body], frame: Frame) -> Body:
         """Register a thing in a frame."""
-        pixels = BodyPixels.around(body, others, frame, self._noise, self._ground)
+        pixels = self._pixels(body, others, frame)
         if pixels is None:
             return body.judged(0.0, 0.0)
-        starts = [body.state]
-        if body.displaced > ONE_START * body.surface.radius:
-            spread = np.linalg.cholesky(body.state.pose_covariance)
-            motions = self._rng.normal(size=(SEARCH_STARTS, 6)) @ spread.T
-            starts += [body.seen, *(body.state.displaced(each) for each in motions)]
+        tried = [registered(body, pixels)]
+        if body.displaced > NEAR_SHIFT * body.surface.radius:
+            places = pixels.places(body, SEARCH_STARTS, self._rng)
+            for state in places:
+                start = replace(body, state=state)
+                near = self._pixels(start, others, frame)
+                if near is not None:
+                    tried.append(registered(body, near, start))
 
-        tried = [registered(body, start, pixels) for start in starts]
         best = max(tried, key=lambda each: each.evidence)
         body = body.judged(best.evidence, best.visible)
         if best.errors is None or best.evidence <= 0:
             return body
         return body.measured(best.state, best.errors)
+
+    def _pixels(
+        self, body: Body, others: Sequence[Body], frame: Frame
+    ) -> BodyPixels | None:
+        """Cut out the pixels around a thing; None if it is out of view."""
+        return BodyPixels.around(body, others, frame, self._noise, self._ground)
