@@ -41,6 +41,11 @@ CHOSEN_AGAIN = 2  # step before which the pixels of the thing are chosen again
 # deviations from a pose from which a registration converges to the true one
 NEAR_TURN = 0.3  # radians
 NEAR_SHIFT = 0.25  # radii
+# share of the outline of a thing at which another surface continues its own
+TOUCHING_SHARE = 0.2
+SMOOTH_SHARE = 0.9  # share of neighbouring pixels that show one surface
+GOES_ON_DEVIATIONS = 3.0  # of the depth, within which a surface goes on
+STEEPEST = 3.0  # tangent of the slope of surfaces across the line of sight
 LONGEST_STEP = 0.5  # radians, or radii
 MOST_INDEPENDENT = RegistrationPrior().pixels
 
@@ -343,7 +348,45 @@ def _gain(
     gains = np.where(front, np.logaddexp(on, without), on) - without
     visible = ~front | (gains > np.log(2))
     independent = min(1.0, pixels.prior(count).pixels / count)
-    return float(independent * gains.sum()), float(np.count_nonzero(visible) / count)
+    explained = np.zeros(len(shows), bool)
+    explained[measured] = gains > np.log(2)
+    gain = gains.sum() + _gain_of_edges(view, explained, pixels)
+    return float(independent * gain), float(np.count_nonzero(visible) / count)
+
+
+def _gain_of_edges(view: DepthView, explained: Mask, pixels: BodyPixels) -> float:
+    """Log-likelihood of the edges of what a thing explains against that without the thing.
+
+    Where the surface goes on beyond the pixels that a thing explains, it is likely to be that of
+    something else. Neighbours that something known explains, or that are in front, tell nothing.
+
+    Args:
+        view: the pixels.
+        explained: those that the thing explains, (P,) bool.
+        pixels: with the explanations without the thing.
+    """
+    unknown = pixels.without < np.log(1 / DEPTH_RANGE)
+    told = (~explained & unknown & (view.kind != NOT_MEASURED)).reshape(view.shape)
+    inside = explained.reshape(view.shape)
+    depth = view.depth.reshape(view.shape)
+    noise = view.noise.reshape(view.shape)
+    goes_on = 0
+    ends = 0
+    for axis in (0, 1):
+        first, last = (
+            (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        )
+        for one, other in ((first, last), (last, first)):
+            pairs = inside[one] & told[other]
+            behind = (depth[other] - depth[one])[pairs]
+            near = GOES_ON_DEVIATIONS * np.hypot(noise[one], noise[other])[pairs]
+            near += STEEPEST * view.step[axis] * view.pitch * depth[one][pairs]
+            goes_on += np.count_nonzero(np.abs(behind) < near)
+            ends += np.count_nonzero(behind >= near)
+    return float(
+        goes_on * np.log(TOUCHING_SHARE / SMOOTH_SHARE)
+        + ends * np.log((1 - TOUCHING_SHARE) / (1 - SMOOTH_SHARE))
+    )
 
 
 def _outline(mask: Mask, step: Float) -> tuple[Float32, Float32]:
