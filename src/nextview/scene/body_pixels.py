@@ -381,8 +381,8 @@ def _gain_of_edges(view: DepthView, explained: Mask, pixels: BodyPixels) -> floa
             behind = (depth[other] - depth[one])[pairs]
             near = GOES_ON_DEVIATIONS * np.hypot(noise[one], noise[other])[pairs]
             near += STEEPEST * view.step[axis] * view.pitch * depth[one][pairs]
-            goes_on += np.count_nonzero(np.abs(behind) < near)
-            ends += np.count_nonzero(behind >= near)
+            goes_on += int((np.abs(behind) < near).sum())
+            ends += int((behind >= near).sum())
     return float(
         goes_on * np.log(TOUCHING_SHARE / SMOOTH_SHARE)
         + ends * np.log((1 - TOUCHING_SHARE) / (1 - SMOOTH_SHARE))
