@@ -38,6 +38,8 @@ class Tracked:
         uncertainty: of the pose, standard deviations.
         visible: share of the pixels on it that nothing in front hides, 0 to 1.
         probability: that the pose is right, and the thing is not lost.
+        found_again: whether it was found by a search, after it was hidden or lost, and no scene has
+            confirmed it since: something of a similar surface may be taken for it.
     """
 
     number: int
@@ -47,6 +49,7 @@ class Tracked:
     uncertainty: PoseUncertainty
     visible: float
     probability: float
+    found_again: bool = False
 
     @property
     def lost(self) -> bool:
@@ -69,6 +72,7 @@ class Body:
         state: expected in the next frame, or found in the last one.
         visible: share of the pixels on it that nothing in front hides.
         probability: that the pose is right.
+        found_again: whether it was found by a search since a scene has named it.
     """
 
     number: int
@@ -81,6 +85,7 @@ class Body:
     state: BodyState
     visible: float = 1.0
     probability: float = 1.0
+    found_again: bool = False
 
     @classmethod
     def of(cls, one: SceneObject, model: MotionModel) -> Body | None:
@@ -154,6 +159,7 @@ class Body:
             PoseUncertainty(float(np.degrees(turn)), float(1000 * shift)),
             self.visible,
             self.probability,
+            self.found_again,
         )
 
     def after(self, seconds: float, model: MotionModel) -> Body:

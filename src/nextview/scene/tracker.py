@@ -66,8 +66,8 @@ class Tracker:
     def follow(self, scene: Scene) -> None:
         """Take over what a scene has found: new things, and those that are lost here.
 
-        A thing that is followed and not lost keeps its pose. One that the scene no longer has is
-        no longer followed.
+        A thing that is followed keeps its pose, unless it was lost or found by a search. One that
+        the scene no longer has is no longer followed.
 
         Args:
             scene: with at least one frame.
@@ -85,7 +85,7 @@ class Tracker:
         bodies = {}
         for one in scene.objects:
             body = self._bodies.get(one.number)
-            if body is None or body.lost:
+            if body is None or body.lost or body.found_again:
                 body = Body.of(one, self.model)
             if body is not None:
                 bodies[one.number] = body
@@ -143,6 +143,8 @@ class Tracker:
         body = body.judged(best.evidence, best.visible)
         if best.errors is None or best.evidence <= 0:
             return body
+        searched = best is not tried[0]
+        body = replace(body, found_again=body.found_again or searched)
         return body.measured(best.state, best.errors)
 
     def _pixels(
