@@ -13,6 +13,7 @@ import pytest
 from pipeline import refused, run_python
 
 from nextview.benchmark.submit import SubmitOptions, submit
+from nextview.captured.bundled_table import BUNDLED_TABLE
 from nextview.captured.writing import write_capture
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
@@ -126,7 +127,12 @@ def made(
         archive, folder / "submitted/fixed.json", SubmitOptions("fixed", max_views=1)
     )
     shutil.copy(SAMPLE, folder / "scan")
+    shutil.copytree(BUNDLED_TABLE, folder / "first_frame")
+    for kind in ("depth", "poses"):
+        for later in sorted((folder / "first_frame" / kind).iterdir())[1:]:
+            later.unlink()
     return {
+        "first_frame": folder / "first_frame",
         "capture": folder / "capture",
         "scan": folder / "scan",
         "furniture": furniture,
@@ -192,6 +198,7 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
     if name.startswith("train"):
         pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("nextview.cli.demo.BUNDLED_TABLE", made["first_frame"])
     before, out, *after = WRITES[name]
     command = [
         *before.format(**made).split(),

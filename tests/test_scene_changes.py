@@ -99,15 +99,14 @@ def test_two_things_that_were_swapped_have_both_moved(ycb, meshes):
             assert np.linalg.norm(thing.place[:2] - true) < 0.02
 
 
-@pytest.mark.parametrize("metres", [0.01, 0.05])
-def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes, metres):
+def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes):
     camera = camera_over(list(meshes.values()), seed=8)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     belt = np.eye(4)
     start = camera.table
-    for number in range(4):
-        belt[0, 3] = number * metres
+    for number in range(3):
+        belt[0, 3] = number * 0.05
         things = [replace(one, pose=belt @ one.pose) for one in start.things]
         camera.change(SimulatedTable(tuple(things)))
         frame = camera.frame(view(20 + 30 * number))
