@@ -347,7 +347,6 @@ def follow(
                 "mm": off[0],
                 "degrees": off[1],
                 "lost": bool(mine.lost),
-                "found_again": bool(mine.found_again),
                 "visible": visible,
                 "seconds": spent,
                 "things": len(every),
@@ -384,8 +383,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     wrong = [one for one in every if _is_off(one) and one["visible"] > 0.3]
     said.append(
         f"off while visible: {len(wrong)} of {len(seen)} frames,"
-        f" {sum(not one['lost'] for one in wrong)} of them not told lost,"
-        f" {sum(not one['lost'] and not one['found_again'] for one in wrong)} nor found again"
+        f" {sum(not one['lost'] for one in wrong)} of them not told lost"
     )
     said.append(
         f"told lost while on the thing: {sum(one['lost'] and not _is_off(one) for one in every)}"

@@ -16,6 +16,8 @@ from nextview.types import Float, Float32
 
 LOSSES = 0.1  # expected number of losses a second
 RETURNS = 1.0  # expected number of times a second that a lost thing is in view again
+# error of the expected pose, radii, up to which a registration finds the thing and nothing else
+WIDEST = 0.5
 MOST_ODDS = 30.0  # log-odds that a pose is right
 FARTHEST_DEVIATIONS = 4.0  # at which a point may be on a surface
 LEAST_DEGREES = (
@@ -38,8 +40,7 @@ class Tracked:
         uncertainty: of the pose, standard deviations.
         visible: share of the pixels on it that nothing in front hides, 0 to 1.
         probability: that the pose is right, and the thing is not lost.
-        found_again: whether it was found by a search, after it was hidden or lost, and no scene has
-            confirmed it since: something of a similar surface may be taken for it.
+        lost: whether it is probably not where it is expected, or may be anywhere.
     """
 
     number: int
@@ -49,12 +50,7 @@ class Tracked:
     uncertainty: PoseUncertainty
     visible: float
     probability: float
-    found_again: bool = False
-
-    @property
-    def lost(self) -> bool:
-        """Return True if the thing is probably not where it is expected."""
-        return self.probability < 0.5
+    lost: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +68,8 @@ class Body:
         state: expected in the next frame, or found in the last one.
         visible: share of the pixels on it that nothing in front hides.
         probability: that the pose is right.
-        found_again: whether it was found by a search since a scene has named it.
+        adrift: whether it may be anywhere: it moved, and was hidden too long to be registered from
+            where it is expected. It is then expected where it was seen last.
     """
 
     number: int
@@ -85,7 +82,7 @@ class Body:
     state: BodyState
     visible: float = 1.0
     probability: float = 1.0
-    found_again: bool = False
+    adrift: bool = False
 
     @classmethod
     def of(cls, one: SceneObject, model: MotionModel) -> Body | None:
@@ -130,8 +127,8 @@ class Body:
 
     @property
     def lost(self) -> bool:
-        """True if it is probably not where it is expected."""
-        return self.probability < 0.5
+        """True if it is probably not where it is expected, or may be anywhere."""
+        return self.probability < 0.5 or self.adrift
 
     @property
     def pose(self) -> Float:
@@ -144,8 +141,7 @@ class Body:
     @property
     def displaced(self) -> float:
         """Standard deviation of the displacement of its surface, metres."""
-        turn, shift = _deviations(self.state)
-        return float(np.hypot(turn * self.surface.radius, shift) / np.sqrt(3))
+        return _displaced(self.state, self.surface.radius)
 
     @property
     def tracked(self) -> Tracked:
@@ -159,7 +155,7 @@ class Body:
             PoseUncertainty(float(np.degrees(turn)), float(1000 * shift)),
             self.visible,
             self.probability,
-            self.found_again,
+            self.lost,
         )
 
     def after(self, seconds: float, model: MotionModel) -> Body:
@@ -173,16 +169,21 @@ class Body:
         body = replace(
             self,
             rest=self.rest.after(seconds, model),
-            state=self.seen.after(unseen, model),
             unseen=unseen,
             probability=self.probability * float(np.exp(-LOSSES * seconds))
             + (1 - self.probability) * float(1 - np.exp(-RETURNS * seconds)),
         )
-        if not body.rests or body.lost:
-            return body
-        # it may begin to move now, whenever it was seen last
-        begins = self.seen.after(seconds, model)
-        return replace(body, state=body.rest.state_of(begins, begins.pose_covariance))
+        if body.rests and body.probability >= 0.5:
+            # it may begin to move now, whenever it was seen last
+            begins = self.seen.after(seconds, model)
+            state = body.rest.state_of(begins, begins.pose_covariance)
+            return replace(body, state=state, adrift=False)
+        state = self.seen.after(unseen, model)
+        adrift = _displaced(state, self.surface.radius) > WIDEST * self.surface.radius
+        if adrift:
+            state = self.seen.after(seconds, model)
+            state = replace(state, rotation=self.seen.rotation, centre=self.seen.centre)
+        return replace(body, state=state, adrift=adrift)
 
     def judged(self, evidence: float, visible: float) -> Body:
         """Update the probability that the pose is right.
@@ -203,8 +204,8 @@ class Body:
         """
         rest = self.rest.measured(self.state, state, errors)
         body = replace(self, rest=rest, state=state)
-        if not body.lost:
-            body = replace(body, seen=state, unseen=0.0)
+        if body.probability >= 0.5:
+            body = replace(body, seen=state, unseen=0.0, adrift=False)
         if body.rests:
             body = replace(body, state=rest.state_of(state, rest.covariance))
         return body
@@ -241,6 +242,12 @@ class Body:
         variance += noise[near] ** 2 + (self.surface.spacing / 2) ** 2
         density[near] = -0.5 * (apart**2 / variance + np.log(8 * np.pi * variance))
         return density
+
+
+def _displaced(state: BodyState, radius: float) -> float:
+    """Standard deviation of the displacement of a surface of some radius, metres."""
+    turn, shift = _deviations(state)
+    return float(np.hypot(turn * radius, shift) / np.sqrt(3))
 
 
 def _deviations(state: BodyState) -> tuple[float, float]:

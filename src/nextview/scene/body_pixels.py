@@ -38,9 +38,6 @@ AROUND_DEVIATIONS = 2.0  # the same in standard deviations of the expected place
 # error of the expected pose that is left before each step, as a share
 ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
 CHOSEN_AGAIN = 2  # step before which the pixels of the thing are chosen again
-# deviations from a pose from which a registration converges to the true one
-NEAR_TURN = 0.3  # radians
-NEAR_SHIFT = 0.25  # radii
 # share of the outline of a thing at which another surface continues its own
 TOUCHING_SHARE = 0.2
 SMOOTH_SHARE = 0.9  # share of neighbouring pixels that show one surface
@@ -136,48 +133,6 @@ class BodyPixels:
             whole=int(thing.sum()),
         )
 
-    def places(
-        self, body: Body, count: int, rng: np.random.Generator
-    ) -> list[BodyState]:
-        """Draw poses in which a thing would explain points that nothing known explains.
-
-        A point of its surface is put on a measured point, which is drawn by the expected place. The
-        rotation is drawn by its expectation.
-
-        Args:
-            body: the thing in its expected pose.
-            count: number of poses.
-            rng: source of all random numbers.
-        """
-        state = body.state
-        radius = body.surface.radius
-        free = self.without < np.log(1 / DEPTH_RANGE)
-        points = self.points[free & (self.view.kind != NOT_MEASURED)]
-        if not len(points):
-            return []
-        off = points - state.centre
-        spread = state.pose_covariance[3:, 3:] + radius**2 / 3 * np.eye(3)
-        weights = np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)
-        weights = np.exp(-0.5 * (weights - weights.min()))
-        drawn = points[rng.choice(len(points), count, p=weights / weights.sum())]
-
-        turns = (
-            rng.normal(size=(count, 3))
-            @ np.linalg.cholesky(state.pose_covariance[:3, :3]).T
-        )
-        deviations = np.repeat([NEAR_TURN, NEAR_SHIFT * radius], 3)
-        covariance = state.covariance.copy()
-        covariance[:POSE, :POSE] = np.diag(deviations**2)
-        found = []
-        samples = body.surface.nearby.data[
-            rng.integers(body.surface.nearby.n, size=count)
-        ]
-        for point, turn, sample in zip(drawn, turns, samples, strict=True):
-            turned = state.displaced(np.append(turn, np.zeros(3)))
-            centre = point - turned.rotation @ (sample - body.surface.centre)
-            found.append(replace(turned, centre=centre, covariance=covariance))
-        return found
-
     def prior(self, count: int) -> RegistrationPrior:
         """Return a registration's prior with the number of independent pixels.
 
@@ -209,21 +164,17 @@ class RegisteredBody:
     visible: float
 
 
-def registered(
-    body: Body, pixels: BodyPixels, start: Body | None = None
-) -> RegisteredBody:
+def registered(body: Body, pixels: BodyPixels) -> RegisteredBody:
     """Register a thing with the pixels around it.
 
     Args:
         body: the thing in its expected pose.
         pixels: of the frame.
-        start: the thing in another pose, near which it is registered.
     """
     expected = body.state
-    start = start or body
-    state = start.state
-    information = state.information
-    view = pixels.showing(start)
+    state = expected
+    information = expected.information
+    view = pixels.showing(body)
     if not view.whole:
         gain, visible = _gain(view, _rendered(body, state, view), pixels)
         return RegisteredBody(expected, None, gain, visible)
@@ -232,21 +183,19 @@ def registered(
     motion = np.zeros(POSE)
     for step, share in enumerate(ERRORS_LEFT):
         if step == CHOSEN_AGAIN:
-            surer = replace(state, covariance=share**2 * start.state.covariance)
+            surer = replace(state, covariance=share**2 * expected.covariance)
             again = pixels.showing(replace(body, state=surer))
             view = again if again.whole else view
         rendered = _rendered(body, state, view)
-        reach = np.array([share * start.displaced], np.float32)
+        reach = np.array([share * body.displaced], np.float32)
         pulls = pulls_of(view, rendered, state.centre[None], reach)
         left, right = normal_equations(pulls, prior)
         change = np.linalg.solve(left[0] + information, right[0] - information @ motion)
         longest = np.abs(change / np.repeat([1.0, body.surface.radius], 3)).max()
         change *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
         state = state.displaced(change)
-        motion = start.state.motion_to(state)
+        motion = expected.motion_to(state)
 
-    motion = expected.motion_to(state)
-    information = expected.information
     rendered = _rendered(body, state, view)
     held = pulls_of_outline(view, rendered, state.centre[None])
     told = left[0] + normal_equations(held, prior)[0][0]

@@ -8,14 +8,14 @@ pixels on it, against that without it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from nextview.checks import number
 from nextview.errors import SessionError
 from nextview.scene.body import Body, Tracked
-from nextview.scene.body_pixels import NEAR_SHIFT, BodyPixels, registered
+from nextview.scene.body_pixels import BodyPixels, registered
+from nextview.scene.changes import SURPRISE
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
 from nextview.sensing.facets import Noise
@@ -23,9 +23,6 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
-SEARCH_STARTS = (
-    4  # further poses near which an uncertain thing is registered in a frame
-)
 
 
 class Tracker:
@@ -36,14 +33,13 @@ class Tracker:
     ...     for thing in tracker.update(frame):
     ...         print(thing.name, thing.lost, thing.pose)
 
-    A thing that moves behind something is expected where its velocity would bring it, and searched
-    around that place. One that stands is expected to stay. If a thing stays lost, update the scene
-    with a frame and ``follow`` it again.
+    A thing that stands is expected to stay while something hides it. One that moves is expected
+    where its velocity would bring it, until that is too uncertain; then it is lost, unless it
+    comes back to where it was seen last. Update the scene with a frame and ``follow`` it again.
 
     Args:
         scene: with at least one frame; its things with confident names are followed.
         model: how things move.
-        rng: for the poses in which a thing is searched; seed 0 by default.
 
     Raises:
         SessionError: the scene has no frame yet.
@@ -53,10 +49,8 @@ class Tracker:
         self,
         scene: Scene,
         model: MotionModel = MotionModel(),
-        rng: np.random.Generator | None = None,
     ) -> None:
         self.model = model
-        self._rng = rng or np.random.default_rng(0)
         self._bodies: Mapping[int, Body] = {}
         self._time: float | None = None
         self._noise: Noise
@@ -85,7 +79,7 @@ class Tracker:
         bodies = {}
         for one in scene.objects:
             body = self._bodies.get(one.number)
-            if body is None or body.lost or body.found_again:
+            if body is None or body.lost:
                 body = Body.of(one, self.model)
             if body is not None:
                 bodies[one.number] = body
@@ -127,28 +121,13 @@ class Tracker:
 
     def _followed(self, body: Body, others: Sequence[Body], frame: Frame) -> Body:
         """Register a thing in a frame."""
-        pixels = self._pixels(body, others, frame)
+        pixels = BodyPixels.around(body, others, frame, self._noise, self._ground)
         if pixels is None:
             return body.judged(0.0, 0.0)
-        tried = [registered(body, pixels)]
-        if body.displaced > NEAR_SHIFT * body.surface.radius:
-            places = pixels.places(body, SEARCH_STARTS, self._rng)
-            for state in places:
-                start = replace(body, state=state)
-                near = self._pixels(start, others, frame)
-                if near is not None:
-                    tried.append(registered(body, near, start))
-
-        best = max(tried, key=lambda each: each.evidence)
-        body = body.judged(best.evidence, best.visible)
-        if best.errors is None or best.evidence <= 0:
+        found = registered(body, pixels)
+        body = body.judged(found.evidence, found.visible)
+        # few things that stand are moved in a frame: a few pixels do not tell it
+        enough = SURPRISE if body.rests else 0.0
+        if found.errors is None or found.evidence <= enough:
             return body
-        searched = best is not tried[0]
-        body = replace(body, found_again=body.found_again or searched)
-        return body.measured(best.state, best.errors)
-
-    def _pixels(
-        self, body: Body, others: Sequence[Body], frame: Frame
-    ) -> BodyPixels | None:
-        """Cut out the pixels around a thing; None if it is out of view."""
-        return BodyPixels.around(body, others, frame, self._noise, self._ground)
+        return body.measured(found.state, found.errors)
