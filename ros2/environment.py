@@ -210,6 +210,7 @@ def main() -> None:
     for name, step in (("wheels", install), ("paths", mend_paths)):
         print(f"{name} ...", flush=True)
         step(environment)
+    print("nextview_msgs ...", flush=True)
     build(environment, ROOT / "ros2" / "nextview_msgs")
     for repository, tag, packages in SOURCES:
         folder = sources / repository.split("/")[1]

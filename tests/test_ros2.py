@@ -444,7 +444,9 @@ def node(monkeypatch):
     for name in ROS_MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
-    ours = [f"nextview_ros.{name}" for name in ("inputs", "outputs", "parameters", "node")]
+    ours = [
+        f"nextview_ros.{name}" for name in ("inputs", "outputs", "parameters", "node")
+    ]
     for name in ours:
         monkeypatch.delitem(sys.modules, name, raising=False)
     made = object.__new__(importlib.import_module("nextview_ros.node").NextviewNode)

@@ -1,6 +1,6 @@
 """Start the node on the topics of a camera's driver:
 
-    ros2 launch nextview_ros nextview.launch.py driver:=realsense
+ros2 launch nextview_ros nextview.launch.py driver:=realsense
 """
 
 from launch import LaunchDescription
@@ -8,7 +8,6 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-
 from nextview_ros.parameters import PARAMETERS
 
 DRIVERS = {  # namespace of the first camera's depth topics, and topic of its images
@@ -27,18 +26,20 @@ BY_DRIVER = {  # empty values mean those of the driver
 
 def node(context):
     """The node, with the arguments as parameters."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
+    given = {name: LaunchConfiguration(name) for name in (*PARAMETERS, "use_sim_time")}
     camera, image = DRIVERS[LaunchConfiguration("driver").perform(context)]
-    parameters = {"cameras": (given["cameras"] or camera).split(",")}
-    parameters["image"] = given["image"] or image
-    parameters["models"] = given["models"].split(",")
-    parameters |= {
-        name: ParameterValue(value, value_type=type(PARAMETERS[name].default))
-        for name, value in given.items()
-        if name not in parameters
+    parameters = {
+        "cameras": (given.pop("cameras").perform(context) or camera).split(","),
+        "image": given.pop("image").perform(context) or image,
+        "models": given.pop("models").perform(context).split(","),
     }
-    sim = LaunchConfiguration("use_sim_time").perform(context)
-    parameters["use_sim_time"] = ParameterValue(sim, value_type=bool)
+    kinds = {
+        name: type(PARAMETERS[name].default) for name in given if name in PARAMETERS
+    }
+    parameters |= {
+        name: ParameterValue(value, value_type=kinds.get(name, bool))
+        for name, value in given.items()
+    }
     return [
         Node(
             package="nextview_ros",

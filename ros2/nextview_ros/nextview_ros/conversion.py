@@ -89,7 +89,9 @@ def frame_at(
     if late > SIMULTANEOUS:
         raise ObservationError(f"image and camera_info are {late:.3f} s apart")
     inside = None if mask is None else mask_of(mask)
-    return Frame(depth_of(image), intrinsics_of(info, rectified), pose, inside, axes=axes)
+    return Frame(
+        depth_of(image), intrinsics_of(info, rectified), pose, inside, axes=axes
+    )
 
 
 def mask_of(image: Any) -> Mask:

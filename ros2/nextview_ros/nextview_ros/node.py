@@ -49,7 +49,6 @@ from nextview_ros.inputs import DepthCamera, Transforms
 from nextview_ros.outputs import (
     Detection3DArray,
     PlanningScene,
-    called,
     detection_of,
     object_message,
     planning_scene,
@@ -136,7 +135,7 @@ class NextviewNode(Node):
                 self,
                 kind,
                 name,
-                partial(self.execute, begin=begin, result=result),
+                partial(self.execute, kind=kind, begin=begin, result=result),
                 callback_group=group,
                 goal_callback=self.accept,
                 cancel_callback=lambda goal: CancelResponse.ACCEPT,
@@ -306,7 +305,9 @@ class NextviewNode(Node):
         things = self.scene.objects
         views = number_of(len(self.scene.frames), "view")
         sure = sum(thing.confident for thing in things)
-        return f"{views}: {number_of(len(things), 'object')}, {sure} with a confident name"
+        return (
+            f"{views}: {number_of(len(things), 'object')}, {sure} with a confident name"
+        )
 
     def give_up(self) -> str:
         """Ask for another pose.
@@ -407,6 +408,7 @@ class NextviewNode(Node):
     def execute(
         self,
         goal: Any,
+        kind: Any,
         begin: Callable[[Any], None],
         result: Callable[[], Any],
     ) -> Any:
@@ -414,6 +416,7 @@ class NextviewNode(Node):
 
         Args:
             goal: its handle.
+            kind: of the action.
             begin: begins what its request asks for.
             result: returns what was found.
         """
@@ -438,7 +441,7 @@ class NextviewNode(Node):
         except NextviewError as error:
             self.get_logger().error(str(error))
             goal.abort()
-            return type(goal).Result(message=str(error))
+            return kind.Result(message=str(error))
         finally:
             with self.busy:
                 self.session = self.goal = self.mask = None

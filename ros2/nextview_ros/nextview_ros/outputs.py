@@ -163,7 +163,9 @@ def _collision_object(thing: SceneObject, header: Any) -> Any:
         fill_pose(message.pose, thing.pose)
         vertices = (vertices - thing.pose[:3, 3]) @ thing.pose[:3, :3]
     mesh = Mesh(
-        triangles=[MeshTriangle(vertex_indices=face.astype(np.uint32)) for face in faces],
+        triangles=[
+            MeshTriangle(vertex_indices=face.astype(np.uint32)) for face in faces
+        ],
         vertices=[_point(vertex) for vertex in vertices],
     )
     message.meshes, message.mesh_poses = [mesh], [Pose()]
