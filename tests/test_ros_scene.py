@@ -3,8 +3,16 @@
 Runs where rclpy and nextview_msgs are, in the environment of ``make test-ros``.
 """
 
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
 import threading
 import time
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,8 +44,8 @@ from rosidl_runtime_py.utilities import get_message
 from scipy.spatial import cKDTree
 from small_tables import camera_over, view
 
+import nextview
 from nextview.teaching.learn import learn
-from nextview.things.memory import open_memory
 
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"
@@ -247,8 +255,7 @@ def test_a_thing_that_is_learned_gets_its_name_in_the_frames_so_far(
     answer = robot.learn(path=str(scan), name="cup", unit="m")
     assert answer.success, answer.message
     assert "3 things learned" in answer.message
-    card, _ = open_memory(mine)
-    assert {thing.name for thing in card.memory.things} == {*TAUGHT, "cup"}
+    assert set(nextview.load(mine).classes) == {*TAUGHT, "cup"}
 
     results = {
         one.results[0].hypothesis.class_id: one.results[0].pose.pose
@@ -405,3 +412,44 @@ def test_parameters_have_descriptions_and_ranges(running):
     assert cameras.read_only
     (said,) = running.node.set_parameters([Parameter("threshold", value=1.5)])
     assert not said.successful
+
+
+# The page
+
+
+def commands_of(page, heading):
+    """The commands of the sh blocks below a heading."""
+    section = page.read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    blocks = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    return [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
+
+
+def test_the_first_steps_of_the_page_run_as_they_are_written(tmp_path):
+    """Launch file, stand-in for the robot, goal, topics: each in a process of its own."""
+    page = Path(__file__).parents[1] / "docs" / "ros2.md"
+    commands = [words for words in commands_of(page, "A table in ten minutes") if words]
+    prefix = Path(sys.prefix)
+    env = os.environ | {
+        "AMENT_PREFIX_PATH": str(prefix),
+        "PATH": f"{prefix / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "ROS_DOMAIN_ID": str(int(os.environ["ROS_DOMAIN_ID"]) + 100),
+        "ROS_LOG_DIR": str(tmp_path),
+    }
+    said = []
+    with ExitStack() as running:
+        for words in commands:
+            assert words[0] == "ros2"
+            if words[1] in ("launch", "run"):
+                process = subprocess.Popen(words, env=env, start_new_session=True)
+                running.callback(process.wait)
+                running.callback(os.killpg, process.pid, signal.SIGINT)
+                continue
+            done = subprocess.run(
+                words, env=env, capture_output=True, text=True, timeout=300
+            )
+            assert done.returncode == 0, done.stderr
+            said.append(done.stdout)
+    goal, detections, *_ = said
+    assert "Goal finished with status: SUCCEEDED" in goal
+    assert "done: true" in goal
+    assert "class_id: cracker_box" in detections
