@@ -437,6 +437,8 @@ def test_the_first_steps_of_the_page_run_as_they_are_written(tmp_path):
     }
     said = []
     with ExitStack() as running:
+        # the commands share a daemon, which would go on for two hours
+        running.callback(subprocess.run, ["ros2", "daemon", "stop"], env=env)
         for words in commands:
             assert words[0] == "ros2"
             if words[1] in ("launch", "run"):
