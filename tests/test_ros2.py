@@ -15,6 +15,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import trimesh
 from pipeline import TABLE, box, cast, pose_at
 from ros_messages import (
     SHAPE,
@@ -32,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError
+from nextview.errors import ObservationError, UsageError
 from nextview.sensing import Frame, ObservedObject
 
 ROS = Path(__file__).parents[1] / "ros2"
@@ -42,8 +43,14 @@ from nextview_ros import conversion
 ROS_MODULES = (
     "geometry_msgs",
     "geometry_msgs.msg",
+    "moveit_msgs",
+    "moveit_msgs.msg",
     "nextview_msgs",
     "nextview_msgs.action",
+    "nextview_msgs.msg",
+    "nextview_msgs.srv",
+    "rcl_interfaces",
+    "rcl_interfaces.msg",
     "rclpy",
     "rclpy.action",
     "rclpy.callback_groups",
@@ -52,10 +59,14 @@ ROS_MODULES = (
     "rclpy.qos",
     "sensor_msgs",
     "sensor_msgs.msg",
+    "shape_msgs",
+    "shape_msgs.msg",
     "std_srvs",
     "std_srvs.srv",
     "std_msgs",
     "std_msgs.msg",
+    "tf2_msgs",
+    "tf2_msgs.msg",
     "vision_msgs",
     "vision_msgs.msg",
 )
@@ -273,15 +284,36 @@ def outputs(monkeypatch):
             pose=told,
         )
 
-    vision = SimpleNamespace(
-        Detection3D=detection,
-        Detection3DArray=SimpleNamespace,
-        ObjectHypothesisWithPose=hypothesis,
-    )
-    geometry = SimpleNamespace(Pose=pose_message, PoseArray=SimpleNamespace)
-    for name, module in (("geometry_msgs.msg", geometry), ("vision_msgs.msg", vision)):
-        monkeypatch.setitem(sys.modules, name.split(".")[0], SimpleNamespace())
-        monkeypatch.setitem(sys.modules, name, module)
+    def collision_object(**fields):
+        return SimpleNamespace(pose=pose_message(), **fields)
+
+    def scene(**fields):
+        return SimpleNamespace(
+            world=SimpleNamespace(),
+            robot_state=SimpleNamespace(is_diff=False),
+            **fields,
+        )
+
+    collision_object.ADD, collision_object.REMOVE = b"\x00", b"\x01"
+    for name in ROS_MODULES:
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    stand_ins = {
+        "geometry_msgs": {
+            "Point": SimpleNamespace,
+            "Pose": pose_message,
+            "PoseArray": SimpleNamespace,
+        },
+        "moveit_msgs": {"CollisionObject": collision_object, "PlanningScene": scene},
+        "shape_msgs": {"Mesh": SimpleNamespace, "MeshTriangle": SimpleNamespace},
+        "vision_msgs": {
+            "Detection3D": detection,
+            "Detection3DArray": SimpleNamespace,
+            "ObjectHypothesisWithPose": hypothesis,
+        },
+    }
+    for package, kinds in stand_ins.items():
+        for kind, made in kinds.items():
+            setattr(sys.modules[f"{package}.msg"], kind, made)
     monkeypatch.delitem(sys.modules, "nextview_ros.outputs", raising=False)
     yield importlib.import_module("nextview_ros.outputs")
     sys.modules.pop("nextview_ros.outputs", None)
@@ -295,7 +327,7 @@ def seen_at(centre, **fields):
         poses_in=SimpleNamespace(from_object=from_object),
         radius=0.05,
         beliefs={},
-        **fields,
+        **({"pose": None} | fields),
     )
 
 
@@ -314,6 +346,7 @@ def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
             pose=pose,
             degrees=3.0,
             millimetres=6.0,
+            vertices=np.array([[0.0, 0, 0], [0.1, 0.06, 0.2]]),
         )
         for name, share, pose in zip(("mug", "bowl"), (0.9, 0.1), poses, strict=True)
     ]
@@ -321,10 +354,11 @@ def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
     seen = seen_at(
         (0.41, -0.08, 0.07),
         answer="mug",
+        pose=poses[0],
         pose_candidates=[*candidates, unlikely],
     )
-    (told,) = outputs.detections(seen, "world").detections
-    assert told.id == "mug"
+    told = outputs.detection_of(seen, "world", "3")
+    assert told.id == "3"
     assert [one.hypothesis.class_id for one in told.results] == ["mug", "bowl"]
     assert [one.hypothesis.score for one in told.results] == [0.9, 0.1]
     for one, pose in zip(told.results, poses, strict=True):
@@ -332,8 +366,10 @@ def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
         variances = np.diag(one.pose.covariance.reshape(6, 6))
         assert np.sqrt(variances[:3].sum()) == pytest.approx(0.006)
         assert np.degrees(np.sqrt(variances[3:].sum())) == pytest.approx(3.0)
-    np.testing.assert_allclose(matrix_of(told.bbox.center)[:3, 3], (0.41, -0.08, 0.07))
-    assert told.bbox.size.x == told.bbox.size.z == pytest.approx(0.1)
+    box = told.bbox
+    np.testing.assert_allclose([box.size.x, box.size.y, box.size.z], [0.1, 0.06, 0.2])
+    corner = matrix_of(box.center) @ [-0.05, -0.03, -0.1, 1]
+    np.testing.assert_allclose(corner[:3], poses[0][:3, 3], atol=1e-9)
 
 
 def replace_in(what, **fields):
@@ -343,7 +379,7 @@ def replace_in(what, **fields):
 def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(outputs):
     seen = seen_at((0.3, 0.2, 0.1), answer="chair", pose_candidates=[])
     seen.beliefs = {"table": 0.2, "chair": 0.795, "bed": 0.005}
-    (told,) = outputs.detections(seen, "world").detections
+    told = outputs.detection_of(seen, "world")
     assert [one.hypothesis.class_id for one in told.results] == ["chair", "table"]
     variances = np.diag(told.results[0].pose.covariance.reshape(6, 6))
     assert np.sqrt(variances[:3].sum()) == pytest.approx(0.05)
@@ -355,8 +391,48 @@ def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(ou
         (0.3, 0.2, 0.1),
     )
 
-    (told,) = outputs.detections(seen_at((0, 0, 0), answer=None), "world").detections
-    assert (told.id, told.results) == ("unknown", [])
+    told = outputs.detection_of(seen_at((0, 0, 0.2), answer=None), "world")
+    assert (told.id, told.results) == ("", [])
+    np.testing.assert_allclose(matrix_of(told.bbox.center)[:3, 3], (0, 0, 0.2))
+    assert told.bbox.size.x == told.bbox.size.z == pytest.approx(0.1)
+
+
+def test_a_planning_scene_holds_the_shapes_and_forgets_what_is_gone(outputs):
+    body = box((0.1, 0.06, 0.2), (0.3, 0.1, 0.1))  # in the frame of its scan
+    pose = pose_at(20, 70, 0.5, (0.1, 0.2, 0.3))
+    candidate = SimpleNamespace(vertices=body.vertices, faces=body.faces, pose=pose)
+    mug = SimpleNamespace(name="mug", number=3, pose=pose, candidates=[candidate])
+    corners = box((0.1, 0.1, 0.1), (0, 0, 0.05)).vertices
+    stranger = SimpleNamespace(
+        name="unknown",
+        number=4,
+        pose=None,
+        candidates=[],
+        seen_points=np.vstack([corners, corners.mean(0)]),
+    )
+    flat = SimpleNamespace(
+        **(vars(stranger) | {"number": 5, "seen_points": corners * [1, 1, 0]})
+    )
+    told = outputs.planning_scene([mug, stranger, flat], {"mug_3", "bowl_1"}, "world")
+    assert told.is_diff
+    assert told.robot_state.is_diff
+    first, second, gone = told.world.collision_objects
+    assert [first.id, second.id, gone.id] == ["mug_3", "unknown_4", "bowl_1"]
+    assert first.operation == second.operation == outputs.CollisionObject.ADD
+    assert gone.operation == outputs.CollisionObject.REMOVE
+    np.testing.assert_allclose(matrix_of(first.pose), pose, atol=1e-9)
+    made = mesh_of(first)
+    np.testing.assert_allclose(made.vertices, body.vertices, atol=1e-9)
+    assert made.volume == pytest.approx(0.1 * 0.06 * 0.2)
+    assert abs(mesh_of(second).volume) == pytest.approx(0.001)
+
+
+def mesh_of(told):
+    """The mesh of a collision object."""
+    (mesh,) = told.meshes
+    vertices = [[vertex.x, vertex.y, vertex.z] for vertex in mesh.vertices]
+    faces = [triangle.vertex_indices for triangle in mesh.triangles]
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 # The node, with stand-ins for ROS
@@ -364,26 +440,28 @@ def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(ou
 
 @pytest.fixture
 def node(monkeypatch):
-    """A node that was never started, with a session before its first look; what it publishes is
-    kept.
-    """
+    """A node that was never started, with a session before its first look."""
     for name in ROS_MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
-    monkeypatch.delitem(sys.modules, "nextview_ros.node", raising=False)
-    made = object.__new__(importlib.import_module("nextview_ros.node").RecogniseNode)
-    made.session = nextview.load().session(
+    ours = [
+        f"nextview_ros.{name}" for name in ("inputs", "outputs", "parameters", "node")
+    ]
+    for name in ours:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    made = object.__new__(importlib.import_module("nextview_ros.node").NextviewNode)
+    made.system = nextview.load()
+    made.session = made.system.session(
         object=ObservedObject(life_size=False),
         distance=0.5,
     )
-    made.taken, made.begun = False, threading.Event()
-    made.busy, made.ended, made.goal = threading.Lock(), threading.Event(), MagicMock()
-    made.next_pose, made.value, made.get_clock = (
-        MagicMock(),
-        {"axes": "opencv", "world_frame": "base"}.get,
-        MagicMock(),
-    )
-    return made
+    made.scene = nextview.Scene(made.system)
+    made.taken, made.begun, made.busy = False, threading.Event(), threading.Lock()
+    made.begun.set()
+    made.goal, made.value, made.get_clock = None, {"patience": 0.1}.get, MagicMock()
+    yield made
+    for name in ours:
+        sys.modules.pop(name, None)
 
 
 def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
@@ -392,49 +470,50 @@ def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
     assert "call look" in answer.message
     assert not node.busy.locked()
     node.session = None
-    assert (
-        node.failed(None, SimpleNamespace(success=None, message=None)).message
-        == "no goal is active"
-    )
+    answer = node.failed(None, SimpleNamespace(success=None, message=None))
+    assert answer.success is False
+    assert "no view was asked for" in answer.message
 
 
 def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
     # before the first look there is none
     monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)
-    answer = node.answer(
-        SimpleNamespace(success=None, message=None), lambda session: None
-    )
+    answer = node.answer(SimpleNamespace(success=None, message=None), lambda: "")
     assert answer.success is False
     assert answer.message
 
 
-def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
-    def empty():
-        parts = {
-            "pose": SimpleNamespace(
-                position=SimpleNamespace(),
-                orientation=SimpleNamespace(),
-            )
-        }
-        return SimpleNamespace(header=SimpleNamespace(frame_id=""), **parts)
+@pytest.mark.parametrize("name", ["../mug", "a/b"])
+def test_a_thing_cannot_be_learned_under_the_name_of_a_path(node, tmp_path, name):
+    mesh = tmp_path / "mug.ply"
+    mesh.touch()
+    node.value = {"models": [str(tmp_path)]}.get
+    with pytest.raises(UsageError, match="cannot be the name of a thing"):
+        node.add_to_memory(SimpleNamespace(path=str(mesh), name=name, unit="m"))
 
-    module = sys.modules[type(node).__module__]
-    monkeypatch.setattr(module, "PoseStamped", empty)
-    monkeypatch.setattr(module, "Header", SimpleNamespace)
-    pose = pose_at(20, 70, 0.5, (0.1, 0.2, 0.3))
-    message = node.pose_of(SimpleNamespace(pose=pose))
-    assert message.header.frame_id == "base"
-    x, y, z, w = (getattr(message.pose.orientation, part) for part in "xyzw")
-    np.testing.assert_allclose(
-        Rotation.from_quat([x, y, z, w]).as_matrix(),
-        pose[:3, :3],
-        atol=1e-9,
+
+def mask_message(rows, encoding="mono8", padding=0):
+    rows = np.pad(rows.astype(np.uint8), ((0, 0), (0, padding)), constant_values=9)
+    return message(
+        "sensor_msgs/msg/Image",
+        header=header("optical"),
+        height=len(rows),
+        width=rows.shape[1] - padding,
+        encoding=encoding,
+        is_bigendian=0,
+        step=rows.shape[1],
+        data=rows.ravel(),
     )
-    np.testing.assert_allclose(
-        [getattr(message.pose.position, part) for part in "xyz"],
-        pose[:3, 3],
-    )
-    assert node.pose_of(SimpleNamespace(pose=None)).header.frame_id == ""
+
+
+def test_a_mask_is_an_image_of_eight_bits():
+    rows = np.random.default_rng(0).random((7, 9)) < 0.3
+    given = mask_message(255 * rows, padding=3)
+    np.testing.assert_array_equal(conversion.mask_of(given), rows)
+    with pytest.raises(ObservationError, match="encoded as mono8 or 8UC1, not 'rgb8'"):
+        conversion.mask_of(replace(given, encoding="rgb8"))
+    with pytest.raises(ObservationError, match="has not 20 bytes"):
+        conversion.mask_of(replace(given, data=given.data[:20]))
 
 
 # What cannot be run here is at least well formed
@@ -457,30 +536,47 @@ def test_the_node_compiles_and_its_imports_from_nextview_exist(path):
             assert hasattr(nextview, node.attr)
 
 
-def test_the_node_fills_all_fields_of_the_action():
-    """Fields that the node gives to goal, result and feedback are those of the action file."""
-    text = (ROS / "nextview_msgs/action/Recognise.action").read_text()
-    parts = dict(zip(("Goal", "Result", "Feedback"), text.split("---\n"), strict=True))
+def fields_of(path):
+    """Names of the fields in the parts of an action, a service or a message, by part."""
+    names = {
+        ".action": ("Goal", "Result", "Feedback"),
+        ".srv": ("Request", "Response"),
+        ".msg": ("Message",),
+    }[path.suffix]
+    parts = zip(names, path.read_text().split("---\n"), strict=True)
     fields = {}
-    for name, part in parts.items():
-        kinds = get_types_from_msg(part, f"nextview_msgs/msg/{name}")
+    for name, text in parts:
+        kinds = get_types_from_msg(text, f"nextview_msgs/msg/{name}")
         fields[name] = {field[0] for field in kinds[f"nextview_msgs/msg/{name}"][1]}
+    return fields
+
+
+def test_the_node_fills_all_fields_of_its_messages():
+    """Fields that the node reads and writes are those of the files of nextview_msgs."""
+    folder = ROS / "nextview_msgs"
+    actions = {
+        name: fields_of(folder / f"action/{name}.action")
+        for name in ("LookUntilSettled", "Recognise")
+    }
     tree = ast.parse((ROS / "nextview_ros/nextview_ros/node.py").read_text())
-    used = {"asked": set(), "feedback": set()}
+    read = {"asked": set(), "request": set()}
+    filled = {}
     for node in ast.walk(tree):
         if (
             isinstance(node, ast.Attribute)
             and isinstance(node.value, ast.Name)
-            and node.value.id in used
+            and node.value.id in read
         ):
-            used[node.value.id].add(node.attr)
-        if (
-            isinstance(node, ast.Call)
-            and ast.unparse(node.func) == "Recognise.Result"
-            and node.keywords
-        ):
-            assert {word.arg for word in node.keywords} == fields["Result"]
-    assert used == {"asked": fields["Goal"], "feedback": fields["Feedback"]}
+            read[node.value.id].add(node.attr)
+        if isinstance(node, ast.Call) and node.keywords:
+            words = {word.arg for word in node.keywords}
+            filled.setdefault(ast.unparse(node.func), set()).update(words)
+    goals = [parts["Goal"] for parts in actions.values()]
+    assert read["asked"] == set.union(*goals)
+    assert read["request"] == fields_of(folder / "srv/Learn.srv")["Request"]
+    for name, parts in actions.items():
+        for part in ("Result", "Feedback"):
+            assert filled[f"{name}.{part}"] == parts[part]
 
 
 @pytest.mark.parametrize("package", ["nextview_msgs", "nextview_ros"])

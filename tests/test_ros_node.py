@@ -1,6 +1,6 @@
 """The ROS 2 node at work: a robot publishes what a simulated camera sees, and asks it to recognise.
 
-Runs where rclpy and the action of nextview_msgs are, in the environment of ``make test-ros``.
+Runs where rclpy and nextview_msgs are, in the environment of ``make test-ros``.
 """
 
 import os
@@ -10,51 +10,22 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
-rclpy = pytest.importorskip("rclpy")
-pytest.importorskip("nextview_msgs")
-sys.path.insert(0, str(Path(__file__).parents[1] / "ros2" / "nextview_ros"))
-
+pytest.importorskip("rclpy")
 import trimesh
-from geometry_msgs.msg import Point, PoseArray, PoseStamped, TransformStamped
-from nextview_msgs.action import Recognise
-from nextview_ros.conversion import fill_pose
-from nextview_ros.node import RecogniseNode
+from geometry_msgs.msg import Point
+from nextview_msgs.msg import Box
 from pipeline import box, cast, pose_at
-from rclpy.action import ActionClient
-from rclpy.executors import MultiThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from ros_robot import PACKAGE, SECONDS, Robot, Running, until, wait
 from sensor_msgs.msg import CameraInfo, Image
-from std_srvs.srv import Trigger
 
-from nextview.captured.messages import pose_of
 from nextview.data.samples import sample_mesh
 
-try:
-    from tf2_msgs.msg import TFMessage
-except ModuleNotFoundError:
-    TFMessage = None
-try:
-    from vision_msgs.msg import Detection3DArray
-except ModuleNotFoundError:
-    Detection3DArray = None
-
-K = np.array([[280.0, 0, 159.5], [0, 280.0, 119.5], [0, 0, 1]])
-SHAPE = 240, 320
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-SECONDS = 60.0
-"""After which something that is waited for will not come; the machine may be busy."""
-MOUNTED = pose_at(-20, 30, 0.05, (0.02, 0.01, 0.1))
-"""The optical frame on the arm's last link."""
+K = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
+SHAPE = 480, 640
 
 
 def chair():
@@ -65,202 +36,24 @@ def chair():
     return thing
 
 
-class Robot(Node):
-    """A camera that is wherever it is sent, and publishes all the time what it sees.
-
-    Attributes:
-        pose: of the camera, base_link, (4, 4).
-        change: what is done to an image, its camera_info and its transform before they are sent.
-        heard: the last message of each topic of the node.
-    """
-
-    def __init__(self, poses, **options):
-        super().__init__("robot", **options)
-        self.things = [box((3, 3, 0.02), (0, 0, -0.01)), chair()]
-        self.start = pose_at(40, 20, 0.7, self.things[1].bounds.mean(0))
-        self.poses = poses
-        self.depth_of = {}
-        self.heard = {}
-        self.reset()
-        self.images = self.create_publisher(Image, "depth", qos_profile_sensor_data)
-        self.infos = self.create_publisher(
-            CameraInfo,
-            "camera_info",
-            qos_profile_sensor_data,
-        )
-        self.stamped = self.create_publisher(PoseStamped, "camera_pose", 10)
-        if TFMessage is not None:
-            self.moving = self.create_publisher(TFMessage, "/tf", 10)
-            self.fixed = self.create_publisher(TFMessage, "/tf_static", LATCHED)
-            self.fixed.publish(
-                TFMessage(transforms=[self.transform(MOUNTED, "tool", "optical")])
-            )
-        kinds = {"next_pose": PoseStamped, "next_poses": PoseArray}
-        if Detection3DArray is not None:
-            kinds["detections"] = Detection3DArray
-        for topic, kind in kinds.items():
-            self.create_subscription(
-                kind,
-                topic,
-                lambda given, topic=topic: self.heard.update({topic: given}),
-                LATCHED,
-            )
-        self.look_client = self.create_client(Trigger, "look")
-        self.failed_client = self.create_client(Trigger, "failed")
-        self.action = ActionClient(self, Recognise, "recognise")
-        self.create_timer(0.1, self.publish)
-
-    def reset(self):
-        self.pose = self.start
-        self.change = lambda image, info, transform: (image, info, transform)
-        self.heard.clear()
-
-    def transform(self, pose, parent, child):
-        made = TransformStamped(child_frame_id=child)
-        made.header.frame_id = parent
-        made.header.stamp = self.get_clock().now().to_msg()
-        placed = fill_pose(PoseStamped().pose, pose)
-        made.transform.rotation = placed.orientation
-        for axis in "xyz":
-            setattr(made.transform.translation, axis, getattr(placed.position, axis))
-        return made
-
-    def publish(self):
-        pose = self.pose
-        key = pose.tobytes()
-        if key not in self.depth_of:
-            half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-            depth, _ = cast(self.things, pose, K + half, SHAPE)
-            self.depth_of[key] = np.rint(1000 * depth).astype(np.uint16)
-        depth = self.depth_of[key]
-        image = Image(
-            height=SHAPE[0],
-            width=SHAPE[1],
-            encoding="16UC1",
-            step=2 * SHAPE[1],
-        )
-        image.data = depth.tobytes()
-        image.header.frame_id = "optical"
-        image.header.stamp = self.get_clock().now().to_msg()
-        info = CameraInfo(header=image.header, height=SHAPE[0], width=SHAPE[1])
-        info.k = K.ravel()
-        info.p = np.hstack([K, np.zeros((3, 1))]).ravel()
-        tool = self.transform(pose @ np.linalg.inv(MOUNTED), "base_link", "tool")
-        tool.header.stamp = image.header.stamp
-
-        image, info, tool = self.change(image, info, tool)
-        if tool is not None and self.poses == "tf":
-            self.moving.publish(TFMessage(transforms=[tool]))
-        if tool is not None and self.poses == "topic":
-            there = PoseStamped(header=tool.header)
-            fill_pose(there.pose, pose)
-            self.stamped.publish(there)
-        # The order in which messages arrive is not that in which they are sent.
-        if info is not None:
-            self.infos.publish(info)
-        if image is not None:
-            self.images.publish(image)
-
-    # What a robot's program does; each waits for the answer
-
-    def goal(self, **asked):
-        """Send a goal; its handle, and its result when it comes."""
-        assert self.action.wait_for_server(SECONDS)
-        self.feedback = []
-        sent = self.action.send_goal_async(
-            Recognise.Goal(**asked), lambda said: self.feedback.append(said.feedback)
-        )
-        handle = wait(sent)
-        return handle, handle.get_result_async() if handle.accepted else None
-
-    def look(self):
-        assert self.look_client.wait_for_service(SECONDS)
-        return wait(self.look_client.call_async(Trigger.Request()))
-
-    def failed(self):
-        return wait(self.failed_client.call_async(Trigger.Request()))
-
-    def hears(self, topic, after=None):
-        """A message of a topic that is another than the one that was heard before."""
-        until(
-            lambda: (
-                self.heard.get(topic) is not None and self.heard[topic] is not after
-            ),
-            topic,
-        )
-        return self.heard[topic]
-
-    def target(self, after=None):
-        """The pose that the node asks for, (4, 4)."""
-        given = self.hears("next_pose", after)
-        made = TransformStamped()
-        made.transform.rotation = given.pose.orientation
-        for axis in "xyz":
-            setattr(
-                made.transform.translation,
-                axis,
-                getattr(given.pose.position, axis),
-            )
-        return pose_of(made)
+THINGS = [box((3, 3, 0.02), (0, 0, -0.01)), chair()]
+MIDDLE = THINGS[1].bounds.mean(0)
 
 
-def until(true, what):
-    end = time.monotonic() + SECONDS
-    while not true():
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
+def see(pose):
+    """What a camera sees of the chair."""
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    depth, _ = cast(THINGS, pose, K + half, SHAPE)
+    return np.rint(1000 * depth).astype(np.uint16)
 
 
-def wait(future):
-    """The result of a future of rclpy, which the executor's threads bring about."""
-    done = Future()
-    future.add_done_callback(lambda each: done.set_result(each.result()))
-    return done.result(SECONDS)
+def a_robot(**options):
+    return Robot(see, K, {"depth": pose_at(40, 20, 0.7, MIDDLE)}, **options)
 
 
-class Running:
-    """Node and robot, spinning in threads of their own."""
-
-    def __init__(self, poses, **parameters):
-        all_parameters = {
-            "life_size": False,
-            "patience": 3.0,
-            "poses": poses,
-        } | parameters
-        rclpy.init()
-        given = [Parameter(name, value=value) for name, value in all_parameters.items()]
-        self.node = RecogniseNode(parameter_overrides=given)
-        self.robot = Robot(poses)
-        self.robots = [self.robot]
-        self.executor = MultiThreadedExecutor(8)
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.robot)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
-        self.thread.start()
-
-    def another_robot(self, **options):
-        """One more, for another node; it is destroyed at the end, as the executor uses it."""
-        robot = Robot("topic", **options)
-        self.robots.append(robot)
-        self.executor.add_node(robot)
-        return robot
-
-    def close(self):
-        self.executor.shutdown(5.0)
-        self.thread.join(10.0)
-        self.node.server.destroy()
-        self.node.destroy_node()
-        for robot in self.robots:
-            robot.action.destroy()
-            robot.destroy_node()
-        rclpy.try_shutdown()
-
-
-@pytest.fixture(scope="module", params=["topic", "tf"])
-def running(request):
-    if request.param == "tf" and TFMessage is None:
-        pytest.skip("tf2_msgs is not installed")
-    made = Running(request.param, threshold=1.0, max_views=3)
+@pytest.fixture(scope="module")
+def running():
+    made = Running(a_robot, models=["modelnet10"], threshold=1.0, max_views=3)
     yield made
     made.close()
 
@@ -298,27 +91,22 @@ def test_an_episode_ends_with_the_name_of_the_thing(robot):
     until(lambda: len(robot.feedback) >= 3, "feedback")
     assert [said.views for said in robot.feedback[:3]] == [1, 2, 3]
 
-    if Detection3DArray is not None:
-        (detection,) = robot.hears("detections").detections
-        assert detection.id == "chair"
-        assert detection.results[0].hypothesis.class_id == "chair"
-        centre = detection.bbox.center.position
-        true = robot.things[1].bounds.mean(0)
-        assert np.linalg.norm(np.array([centre.x, centre.y, centre.z]) - true) < 0.05
+    (detection,) = robot.hears("detections").detections
+    assert detection.results[0].hypothesis.class_id == "chair"
+    centre = detection.bbox.center.position
+    assert np.linalg.norm(np.array([centre.x, centre.y, centre.z]) - MIDDLE) < 0.05
 
 
 def test_the_poses_asked_for_look_at_the_thing_from_the_distance(robot):
     robot.goal(distance=0.7)
     assert robot.look().success
     target = robot.target()
-    middle = robot.things[1].bounds.mean(0)
-    assert np.linalg.norm(target[:3, 3] - middle) == pytest.approx(0.7, abs=0.06)
-    towards = (middle - target[:3, 3]) / np.linalg.norm(middle - target[:3, 3])
+    assert np.linalg.norm(target[:3, 3] - MIDDLE) == pytest.approx(0.7, abs=0.06)
+    towards = (MIDDLE - target[:3, 3]) / np.linalg.norm(MIDDLE - target[:3, 3])
     assert towards @ target[:3, 2] > 0.99
 
 
 def test_a_pose_that_cannot_be_reached_is_not_asked_for_again(robot):
-    assert robot.look().message == "no goal is active"
     robot.goal(distance=0.7)
     assert "call look" in robot.failed().message
     assert robot.look().success
@@ -340,8 +128,8 @@ def test_a_goal_is_cancelled_and_the_next_one_begins_anew(robot):
     wait(handle.cancel_goal_async())
     found = wait(result)
     assert found.status == 5  # cancelled
-    assert "after 1 views" in found.result.message
-    assert robot.look().message == "no goal is active"
+    assert "ended too early: 1 view" in found.result.message
+    assert "no view was asked for" in robot.failed().message
 
     again, _ = robot.goal(distance=0.7)
     assert again.accepted
@@ -360,6 +148,59 @@ def test_a_point_where_nothing_is_is_said(robot):
     answer = robot.look()
     assert not answer.success
     assert answer.message
+
+
+def corner(x, y, z):
+    return Point(x=float(x), y=float(y), z=float(z))
+
+
+def mask_of_chair(shape=SHAPE):
+    """The pixels of the chair from the robot's first pose, as an image."""
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    _, thing = cast(THINGS, pose_at(40, 20, 0.7, MIDDLE), K + half, SHAPE)
+    rows = np.where(thing == 1, 255, 0).astype(np.uint8)[: shape[0], : shape[1]]
+    made = Image(height=shape[0], width=shape[1], encoding="mono8", step=shape[1])
+    made.data = rows.tobytes()
+    return made
+
+
+def test_an_object_is_chosen_by_a_box(robot):
+    margin = np.array([[0.02, 0.02, -0.002], [-0.02, -0.02, -0.02]])
+    low, high = THINGS[1].bounds - margin
+    robot.goal(distance=0.7, region=[Box(low=corner(*low), high=corner(*high))])
+    assert robot.look().message == "view 1 is taken in"
+    distance = np.linalg.norm(robot.target()[:3, 3] - MIDDLE)
+    assert distance == pytest.approx(0.7, abs=0.06)
+
+
+def test_an_object_is_chosen_by_a_mask_of_the_next_image(robot):
+    handle, result = robot.goal(distance=0.7, mask=[mask_of_chair((100, 640))])
+    answer = robot.look()
+    assert not answer.success
+    assert "a mask is (H, W) bool as the depth" in answer.message
+
+    wait(handle.cancel_goal_async())
+    wait(result)
+    robot.goal(distance=0.7, mask=[mask_of_chair()])
+    assert robot.look().message == "view 1 is taken in"
+    # the camera moves, and the mask was of the first image alone
+    robot.pose = robot.target()
+    assert robot.look().message == "view 2 is taken in"
+
+
+def test_a_box_without_a_volume_is_refused(robot):
+    here = corner(0.1, 0.2, 0.3)
+    _, result = robot.goal(region=[Box(low=here, high=here)])
+    found = wait(result)
+    assert found.status == 6  # aborted
+    assert "a box has a low and a high corner" in found.result.message
+
+
+def test_things_of_classes_have_no_geometry_for_any_orientation(robot):
+    _, result = robot.goal(any_orientation=True)
+    found = wait(result)
+    assert found.status == 6
+    assert "recognised by their geometry" in found.result.message
 
 
 def colour(image, info, transform):
@@ -386,12 +227,12 @@ def other_stamp(image, info, transform):
         p=info.p,
     )
     stamp = type(image.header.stamp)(sec=image.header.stamp.sec + 5, nanosec=7)
-    info.header = type(image.header)(frame_id="optical", stamp=stamp)
+    info.header = type(image.header)(frame_id=image.header.frame_id, stamp=stamp)
     return image, info, transform
 
 
 def other_size(image, info, transform):
-    info.width = 640
+    info.width = 320
     return image, info, transform
 
 
@@ -413,7 +254,7 @@ WRONG = {
     "stale": (stale, "the images are older than the look"),
     "colour": (colour, "not 'rgb8': a colour topic"),
     "cut off": (short, "this one has 1000 bytes"),
-    "of another size": (other_size, "its camera_info 640 x 240"),
+    "of another size": (other_size, "its camera_info 320 x 480"),
     "no pose": (
         lambda image, info, transform: (image, info, None),
         "tf (has nothing|does not)",
@@ -452,10 +293,10 @@ def test_images_that_come_late_are_waited_for(robot):
 def started(*options):
     """A node in a process of its own, in the namespace /second."""
     code = "from nextview_ros.node import main; main()"
-    given = ["--ros-args", "-r", "__ns:=/second", "-p", "poses:=topic"]
+    given = ["--ros-args", "-r", "__ns:=/second", "-p", "cameras:=[depth]"]
+    given += ["-p", "image:=image", "-p", "models:=[modelnet10]"]
     given += ["-p", "threshold:=1.0", *options]
-    folder = str(Path(__file__).parents[1] / "ros2" / "nextview_ros")
-    path = os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(PACKAGE), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
         [sys.executable, "-c", code, *given],
         env=os.environ | {"PYTHONPATH": path},
@@ -463,7 +304,7 @@ def started(*options):
 
 
 def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
-    second = running.another_robot(namespace="/second")
+    second = running.add(a_robot(namespace="/second"))
     process = started()
     try:
         second.goal(distance=0.7)
@@ -483,5 +324,5 @@ def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
 
 
 def test_parameters_that_make_no_sense_end_the_node_with_a_sentence():
-    process = started("-p", "poses:=gps")
+    process = started("-p", "policy:=nowhere")
     assert process.wait(SECONDS) == 2

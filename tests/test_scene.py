@@ -12,7 +12,7 @@ from small_tables import camera_over, view, without
 
 import nextview
 from nextview.cli.main import main
-from nextview.errors import ObservationError
+from nextview.errors import ObservationError, SessionError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
@@ -192,6 +192,26 @@ def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_mesh
     nowhere = nextview.Scene(ycb, reachable=lambda pose: False)
     nowhere.update(camera.frame(view(20)))
     assert nowhere.target is None
+
+
+def test_a_view_that_failed_is_no_target_again(ycb, ycb_meshes):
+    camera = camera_over(list(ycb_meshes.values()))
+    scene = nextview.Scene(ycb, distance=0.65)
+    with pytest.raises(SessionError, match="no view was asked for"):
+        scene.failed()
+    scene.update(camera.frame(view(20)))
+    before = scene.targets
+    np.testing.assert_array_equal(scene.target, before[0])
+    scene.failed()
+    rest = before[1:]
+    assert len(scene.targets) == len(rest)
+    assert {pose.tobytes() for pose in scene.targets} == {
+        pose.tobytes() for pose in rest
+    }
+
+    scene.update(camera.frame(view(200)))
+    directions = scene.targets[:, :3, 2]  # the centre moves a little with each frame
+    assert (directions @ before[0, :3, 2]).max() < np.cos(np.radians(5))
 
 
 def test_only_the_region_is_searched(ycb, ycb_meshes):

@@ -79,7 +79,7 @@ def rng() -> np.random.Generator:
 
 
 def chosen(choice, policy) -> int:
-    return NamedPolicy.of(policy).choose(choice, rng())
+    return NamedPolicy.of(policy).ranked(choice, rng())[0]
 
 
 def test_a_policy_is_told_what_the_scene_knows(seen):
@@ -127,7 +127,7 @@ def test_the_named_rules_choose_what_they_say(seen):
 
     policy = NamedPolicy.of("random")
     source = rng()
-    drawn = {policy.choose(choice, source) for _ in range(200)}
+    drawn = {policy.ranked(choice, source)[0] for _ in range(200)}
     heights = np.degrees(np.arcsin(views.directions[:, 2]))
     usual = views.free & (heights >= 30) & (heights <= 60)
     assert drawn == set(np.flatnonzero(usual))
@@ -142,7 +142,7 @@ def test_own_rules_are_functions_classes_and_names(seen):
     assert height[chosen(choice, "rules_of_mine:lowest")] == height[free].min()
     assert chosen(choice, "rules_of_mine:near_doubts") in free
     twice = NamedPolicy.of("rules_of_mine:Twice")
-    assert [twice.choose(choice, rng()) for _ in range(2)] == free[:2].tolist()
+    assert [twice.ranked(choice, rng())[0] for _ in range(2)] == free[:2].tolist()
 
     values = np.full(len(height), np.nan)
     values[free[3]] = -5
@@ -204,14 +204,14 @@ def test_what_is_no_policy_is_refused_at_once(ycb, policy, sentence):
 )
 def test_what_is_no_choice_is_refused(seen, said, sentence):
     with pytest.raises(PolicyError, match=f"^policy mine {sentence}"):
-        NamedPolicy("mine", lambda choice, rng: said).choose(seen[1], rng())
+        NamedPolicy("mine", lambda choice, rng: said).ranked(seen[1], rng())
 
 
 def test_a_view_that_is_not_free_is_refused(seen):
     _, choice = seen
     barred = int(np.flatnonzero(~choice.views.free)[0])
     with pytest.raises(PolicyError, match=f"mine chose view {barred}, which is not fr"):
-        NamedPolicy("mine", lambda choice, rng: barred).choose(choice, rng())
+        NamedPolicy("mine", lambda choice, rng: barred).ranked(choice, rng())
 
 
 def test_an_error_in_a_policy_keeps_its_traceback(seen):

@@ -82,8 +82,8 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^rerun ": "opens a window",
     r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
     r"--scheduler": "needs the scheduler of the line before",
-    r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |git clone|python3.11 ros2|AMENT_PREFIX)": (
-        "needs ROS 2; make test-ros runs the node"
+    r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |python3.11 ros2|export AMENT_PREFIX)": (
+        "needs ROS 2; make test-ros runs the node, and the first steps of its page"
     ),
     r"my_(recordings?|folder)": (
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"

@@ -9,9 +9,14 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/nextview_ros"]),
         ("share/nextview_ros", ["package.xml"]),
-        ("share/nextview_ros/launch", ["launch/recognise.launch.py"]),
+        ("share/nextview_ros/launch", ["launch/nextview.launch.py"]),
     ],
     install_requires=["setuptools", "nextview"],
-    entry_points={"console_scripts": ["recognise = nextview_ros.node:main"]},
+    entry_points={
+        "console_scripts": [
+            "nextview_node = nextview_ros.node:main",
+            "nextview_player = nextview_ros.player:main",
+        ]
+    },
     license="Apache-2.0",
 )

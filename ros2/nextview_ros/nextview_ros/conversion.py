@@ -16,9 +16,12 @@ from scipy.spatial.transform import Rotation
 from nextview.captured.messages import depth_of, intrinsics_of, pose_of, seconds
 from nextview.errors import ObservationError
 from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.sensing.object_frame import Box
+from nextview.types import Mask
 
 Float = NDArray[np.float64]
 
+MASK_ENCODINGS = ("mono8", "8UC1")
 SIMULTANEOUS = 0.02
 """Seconds that image, camera_info and transform may be apart: a camera at 30 Hz never mixes
 neighbours.
@@ -66,8 +69,12 @@ def frame_at(
     pose: Float,
     rectified: bool = False,
     axes: str = "opencv",
+    mask: Any = None,
 ) -> Frame:
-    """The same, with the pose of the image's frame in the world as a matrix, (4, 4), metres."""
+    """The same, with the pose of the image's frame in the world as a matrix, (4, 4), metres.
+
+    ``mask`` is a ``sensor_msgs/Image`` of the object's pixels, see ``mask_of``; None for none.
+    """
     if (image.width, image.height) != (info.width, info.height):
         raise ObservationError(
             f"the image has {image.width} x {image.height} pixels, its camera_info {info.width} x"
@@ -81,7 +88,42 @@ def frame_at(
     late = abs(seconds(image.header.stamp) - seconds(info.header.stamp))
     if late > SIMULTANEOUS:
         raise ObservationError(f"image and camera_info are {late:.3f} s apart")
-    return Frame(depth_of(image), intrinsics_of(info, rectified), pose, axes=axes)
+    inside = None if mask is None else mask_of(mask)
+    return Frame(
+        depth_of(image), intrinsics_of(info, rectified), pose, inside, axes=axes
+    )
+
+
+def mask_of(image: Any) -> Mask:
+    """The pixels of an image of 8 bits a pixel that are not 0, (H, W) bool.
+
+    Args:
+        image: ``sensor_msgs/Image``, such as of the encodings mono8 and 8UC1.
+
+    Raises:
+        ObservationError: it has more than 8 bits a pixel, or data is missing.
+    """
+    if image.step < image.width or len(image.data) != image.step * image.height:
+        raise ObservationError(
+            f"a mask of {image.width} x {image.height} pixels has not {len(image.data)} bytes in"
+            f" rows of {image.step}"
+        )
+    if image.encoding not in MASK_ENCODINGS:
+        raise ObservationError(
+            f"a mask is encoded as {' or '.join(MASK_ENCODINGS)}, not {image.encoding!r}"
+        )
+    rows = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)
+    return rows[:, : image.width] > 0
+
+
+def box_of(box: Any) -> Box:
+    """The box of a ``nextview_msgs/Box``.
+
+    Raises:
+        UsageError: it has no volume.
+    """
+    low, high = ([corner.x, corner.y, corner.z] for corner in (box.low, box.high))
+    return Box(low, high)
 
 
 def fill_pose(message: Any, pose: Float, axes: str = "opencv") -> Any:
@@ -96,4 +138,14 @@ def fill_pose(message: Any, pose: Float, axes: str = "opencv") -> Any:
         message.orientation.z,
         message.orientation.w,
     ) = map(float, quaternion)
+    return message
+
+
+def fill_transform(message: Any, pose: Float) -> Any:
+    """Write a pose, (4, 4), metres, into a ``geometry_msgs/Transform``."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    for axis, value in zip("xyz", pose[:3, 3], strict=True):
+        setattr(message.translation, axis, float(value))
+    for axis, value in zip("xyzw", quaternion, strict=True):
+        setattr(message.rotation, axis, float(value))
     return message

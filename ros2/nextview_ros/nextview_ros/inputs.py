@@ -1,4 +1,4 @@
-"""What the node hears: depth images with their camera_info, and where the camera was."""
+"""What the node hears: depth images with their camera_info, and tf."""
 
 from __future__ import annotations
 
@@ -8,23 +8,22 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
 
 from nextview.captured.messages import parts_of, seconds
 from nextview.captured.transforms import NoTransformError, TransformError, TransformTree
-from nextview.errors import UsageError
+from nextview.errors import ObservationError
 from nextview.types import Float
 
 UNPAIRED = 10  # images, or camera_infos, that wait for the other of the same stamp
 TRANSFORMS = 2000  # of each frame that are remembered
-CAMERA = "camera_pose"  # the frame of poses that come on the topic of this name
-POSE_SOURCES = ("tf", "topic")
 
 
 class Pairs:
-    """Depth images, each with the camera_info of its stamp, whichever comes first.
+    """Pair depth images with the camera_info of the same stamp, whichever comes first.
 
     Args:
         paired: called with an image and its camera_info.
@@ -50,7 +49,7 @@ class Pairs:
         self.paired(*((message, partner) if kind == "image" else (partner, message)))
 
     def missing(self) -> str:
-        """What is lacking where no pair comes, in words."""
+        """Return what is lacking if no pair comes, in words."""
         if self.waiting["image"] and not self.waiting["info"]:
             return "depth images come, but no camera_info"
         if self.waiting["info"] and not self.waiting["image"]:
@@ -60,109 +59,130 @@ class Pairs:
         return "no depth image came"
 
 
-class CameraPoses:
-    """Where the camera was, and when.
+class DepthCamera:
+    """The latest depth image of a camera, with its camera_info.
 
     Args:
-        node: whose subscriptions are made.
-        source: "tf", or "topic" for ``geometry_msgs/PoseStamped`` of the images' frame on
-            ``camera_pose``.
-        world: name of the world's frame.
+        node: that subscribes.
+        namespace: of the camera's topics.
+        image: topic of the depth images below it; that of their intrinsics is camera_info.
         group: callback group of the subscriptions.
-
-    Raises:
-        UsageError: there is no such source, or tf2_msgs is not installed.
     """
 
-    def __init__(self, node: Node, source: str, world: str, group: Any) -> None:
-        if source not in POSE_SOURCES:
-            raise UsageError(
-                f"poses come from {' or '.join(POSE_SOURCES)}, not {source!r}"
-            )
-        self.node = node
-        self.source = source
-        self.world = world
-        self.tree = TransformTree(kept=TRANSFORMS)
+    def __init__(self, node: Node, namespace: str, image: str, group: Any) -> None:
+        self.namespace = namespace
+        self.latest: tuple[Image, CameraInfo] | None = None
         self.arrived = threading.Condition()
-        if source == "topic":
+        self.pairs = Pairs(self.keep)
+        for kind, topic, name in (
+            (Image, image, "image"),
+            (CameraInfo, "camera_info", "info"),
+        ):
             node.create_subscription(
-                PoseStamped,
-                CAMERA,
-                self.take_pose,
-                100,
+                kind,
+                f"{namespace}/{topic}",
+                partial(self.pairs.take, name),
+                qos_profile_sensor_data,
                 callback_group=group,
             )
-            return
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ModuleNotFoundError:
-            raise UsageError(
-                "tf2_msgs is not installed: set the parameter poses to 'topic', and publish the"
-                " camera's pose on camera_pose"
-            ) from None
+
+    def keep(self, image: Image, info: CameraInfo) -> None:
+        """Keep the latest image and its camera_info."""
+        with self.arrived:
+            self.latest = image, info
+            self.arrived.notify_all()
+
+    def image_after(self, start: float, patience: float) -> tuple[Image, CameraInfo]:
+        """Return the first image that was taken after a time, with its camera_info.
+
+        Args:
+            start: seconds, in the clock of the stamps.
+            patience: seconds to wait for it.
+
+        Raises:
+            ObservationError: none came.
+        """
+
+        def is_fresh() -> bool:
+            return (
+                self.latest is not None
+                and seconds(self.latest[0].header.stamp) >= start
+            )
+
+        with self.arrived:
+            if self.arrived.wait_for(is_fresh, patience):
+                return self.latest
+            stale = self.latest is not None
+        why = "the images are older than the look" if stale else self.pairs.missing()
+        raise ObservationError(
+            f"no depth image with its camera_info came on {self.namespace} within {patience} s:"
+            f" {why}"
+        )
+
+
+class Transforms:
+    """The transforms of tf.
+
+    Args:
+        node: that subscribes.
+        group: callback group of the subscriptions.
+    """
+
+    def __init__(self, node: Node, group: Any) -> None:
+        self.log = node.get_logger()
+        self.tree = TransformTree(kept=TRANSFORMS)
+        self.arrived = threading.Condition()
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for topic, quality, fixed in (
             ("/tf", 100, False),
             ("/tf_static", latched, True),
         ):
-            take = partial(self.take_transforms, fixed)
             node.create_subscription(
                 TFMessage,
                 topic,
-                take,
+                partial(self.take, fixed),
                 quality,
                 callback_group=group,
             )
 
-    def take_transforms(self, fixed: bool, message: Any) -> None:
-        """Take in what tf says."""
-        for each in message.transforms:
-            self._add(each.child_frame_id, each.header, each.transform, fixed)
-
-    def take_pose(self, message: Any) -> None:
-        """Take in a pose of the camera."""
-        self._add(CAMERA, message.header, message.pose)
-
-    def _add(
-        self,
-        child: str,
-        header: Any,
-        transform: Any,
-        fixed: bool = False,
-    ) -> None:
-        position, quaternion = parts_of(transform)
+    def take(self, fixed: bool, message: Any) -> None:
+        """Take in a message; ``fixed`` if it is of /tf_static."""
         with self.arrived:
-            try:
-                self.tree.add(
-                    child,
-                    header.frame_id,
-                    seconds(header.stamp),
-                    position,
-                    quaternion,
-                    fixed,
-                )
-            except TransformError as error:
-                self.node.get_logger().warning(str(error))
+            for each in message.transforms:
+                position, quaternion = parts_of(each.transform)
+                parent = each.header.frame_id
+                stamp = seconds(each.header.stamp)
+                try:
+                    self.tree.add(
+                        each.child_frame_id,
+                        parent,
+                        stamp,
+                        position,
+                        quaternion,
+                        fixed,
+                    )
+                except TransformError as error:
+                    self.log.warning(str(error))
             self.arrived.notify_all()
 
-    def at(self, frame: str, stamp: float, patience: float) -> Float:
-        """Where a frame was in the world, (4, 4), metres.
+    def pose(self, frame: str, world: str, stamp: float, patience: float) -> Float:
+        """Return the pose of a frame in the world, (4, 4), metres.
 
         Args:
             frame: that of the images.
+            world: that of the world.
             stamp: seconds.
             patience: seconds to wait for it.
 
         Raises:
-            NoTransformError: nothing says it.
+            NoTransformError: tf does not say it.
         """
-        child = frame if self.source == "tf" else CAMERA
         end = time.monotonic() + patience
         with self.arrived:
             while True:
                 try:
                     self.tree.sort()
-                    return self.tree.pose(child, self.world, stamp)
+                    return self.tree.pose(frame, world, stamp)
                 except NoTransformError:
                     if time.monotonic() >= end:
                         raise

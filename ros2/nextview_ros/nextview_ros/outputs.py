@@ -1,24 +1,36 @@
-"""What the node tells, as standard messages: what the object is and where, and where to look."""
+"""What the node tells, as messages: what the objects are and where, and where to look next."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Pose, PoseArray
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, TransformStamped
+from nextview_msgs.msg import SceneObject as ObjectMessage
+from shape_msgs.msg import Mesh, MeshTriangle
+from tf2_msgs.msg import TFMessage
 
 import nextview
+from nextview.scene.objects import SceneObject
 from nextview.types import Float
-from nextview_ros.conversion import fill_pose
+from nextview.viewers.scene_shapes import placed_shape
+from nextview_ros.conversion import fill_pose, fill_transform
 
 try:
     from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 except ModuleNotFoundError:  # then there is no such topic
     Detection3DArray = None
+try:
+    from moveit_msgs.msg import CollisionObject, PlanningScene
+except ModuleNotFoundError:  # then there is no such topic
+    PlanningScene = None
 
-UNKNOWN = "unknown"
 ANY_TURN = np.pi**2 / 3  # variance of an angle of which nothing is known
 LEAST_SCORE = 0.01  # hypotheses that are less likely are not told
+
+
+# Where to look next
 
 
 def ranked_poses(session: nextview.Session) -> list[Float]:
@@ -44,7 +56,7 @@ def ranked_poses(session: nextview.Session) -> list[Float]:
     return [session.poses[k] for k in left]
 
 
-def pose_array(poses: list[Float], header: Any, axes: str) -> PoseArray:
+def pose_array(poses: Sequence[Float], header: Any, axes: str) -> PoseArray:
     """Camera poses as a message."""
     return PoseArray(
         header=header,
@@ -52,22 +64,155 @@ def pose_array(poses: list[Float], header: Any, axes: str) -> PoseArray:
     )
 
 
-def detections(result: nextview.Recognition, header: Any) -> Any:
-    """What was recognised, as a ``vision_msgs/Detection3DArray`` of one detection.
+def pose_stamped(pose: Float | None, header: Any, axes: str = "opencv") -> PoseStamped:
+    """A pose as a message; an empty one, without a frame, if it is None."""
+    if pose is None:
+        return PoseStamped()
+    return PoseStamped(header=header, pose=fill_pose(Pose(), pose, axes))
 
-    Its id is the answer, or "unknown", without a hypothesis. Each hypothesis is a thing in a pose,
-    of the frame of its scan; or a class, at the object's centre, where no geometry is known: its
-    orientation has then the variance of any turn. The box is the sphere around the object.
+
+# The objects of a scene
+
+
+def called(thing: SceneObject) -> str:
+    """The name of an object as a tf frame and in a planning scene, such as mug_3."""
+    return f"{thing.name}_{thing.number}"
+
+
+def object_message(thing: SceneObject, header: Any) -> ObjectMessage:
+    """An object as a message.
 
     Args:
-        result: of a session with frames.
+        thing: of a scene.
         header: of the world's frame.
     """
-    detection = Detection3D(header=header, id=result.answer or UNKNOWN)
+    message = ObjectMessage(
+        number=thing.number,
+        name=thing.name,
+        confidence=thing.confidence,
+        confident=thing.confident,
+        settled=thing.settled,
+        pose=pose_stamped(thing.pose, header),
+        place=_point(thing.place),
+        doubt=thing.result.doubt,
+    )
+    if thing.pose_uncertainty is not None:
+        message.pose_degrees = thing.pose_uncertainty.degrees
+        message.pose_millimetres = thing.pose_uncertainty.millimetres
+    message.size.x, message.size.y, message.size.z = map(float, thing.size)
+    return message
+
+
+def transforms_of(objects: Sequence[SceneObject], header: Any) -> TFMessage:
+    """The poses of all objects with a confident name, as transforms from the world."""
+    return TFMessage(
+        transforms=[
+            _transform(thing, header)
+            for thing in objects
+            if thing.confident and thing.pose is not None
+        ]
+    )
+
+
+def _transform(thing: SceneObject, header: Any) -> TransformStamped:
+    message = TransformStamped(header=header, child_frame_id=called(thing))
+    fill_transform(message.transform, thing.pose)
+    return message
+
+
+def planning_scene(
+    objects: Sequence[SceneObject],
+    before: Collection[str],
+    header: Any,
+) -> Any:
+    """A ``moveit_msgs/PlanningScene`` with the changes: objects to add, and those to remove.
+
+    The shape of a named thing is its scan, that of an unknown object the hull of the visible
+    points. An object whose visible points have no volume is left out.
+
+    Args:
+        objects: of the scene.
+        before: names of the objects that are in the planning scene.
+        header: of the world's frame.
+    """
+    message = PlanningScene(is_diff=True)
+    message.robot_state.is_diff = True
+    added = [
+        _collision_object(thing, header)
+        for thing in objects
+        if placed_shape(thing) is not None
+    ]
+    left = set(before) - {one.id for one in added}
+    removed = [
+        CollisionObject(header=header, id=name, operation=CollisionObject.REMOVE)
+        for name in sorted(left)
+    ]
+    message.world.collision_objects = added + removed
+    return message
+
+
+def _collision_object(thing: SceneObject, header: Any) -> Any:
+    """An object with its shape as a mesh, in the frame of its scan."""
+    message = CollisionObject(
+        header=header,
+        id=called(thing),
+        operation=CollisionObject.ADD,
+    )
+    vertices, faces = placed_shape(thing)
+    if thing.pose is not None:
+        fill_pose(message.pose, thing.pose)
+        vertices = (vertices - thing.pose[:3, 3]) @ thing.pose[:3, :3]
+    mesh = Mesh(
+        triangles=[
+            MeshTriangle(vertex_indices=face.astype(np.uint32)) for face in faces
+        ],
+        vertices=[_point(vertex) for vertex in vertices],
+    )
+    message.meshes, message.mesh_poses = [mesh], [Pose()]
+    return message
+
+
+def _point(place: Float) -> Point:
+    return Point(**dict(zip("xyz", map(float, place), strict=True)))
+
+
+# What was recognised, as detections
+
+
+def scene_detections(objects: Sequence[SceneObject], header: Any) -> Any:
+    """The objects of a scene as a ``vision_msgs/Detection3DArray``.
+
+    Args:
+        objects: of the scene; the id of a detection is the number of its object.
+        header: of the world's frame, with the time of the last image.
+    """
+    detections = []
+    for thing in objects:
+        detection = detection_of(thing.result, header, str(thing.number))
+        if thing.pose is None:
+            low, high = thing.seen_points.min(0), thing.seen_points.max(0)
+            _fill_box(detection.bbox, np.eye(4), low, high)
+        detections.append(detection)
+    return Detection3DArray(header=header, detections=detections)
+
+
+def detection_of(result: nextview.Recognition, header: Any, number: str = "") -> Any:
+    """What was recognised, as a ``vision_msgs/Detection3D``.
+
+    Each hypothesis is a thing in a pose, of the frame of its scan; or a class, at the object's
+    centre, where no geometry is known: its orientation has then the variance of any turn. An
+    unknown object has no hypothesis. The box is that of the scan in its likeliest pose, or the
+    sphere around the object.
+
+    Args:
+        result: of an object in frames.
+        header: of the world's frame, with the time of the last image.
+        number: id of the detection.
+    """
+    detection = Detection3D(header=header, id=number)
     if result.answer is None:
         pass  # nothing that is known explains it
     elif result.pose_candidates:
-        of_thing = result.pose_candidates
         detection.results = [
             _hypothesis(
                 one.thing,
@@ -76,32 +221,25 @@ def detections(result: nextview.Recognition, header: Any) -> Any:
                 one.degrees,
                 one.millimetres,
             )
-            for one in of_thing
+            for one in result.pose_candidates
             if one.probability >= LEAST_SCORE
         ]
     else:
-        place = np.eye(4)
-        place[:3, 3] = result.poses_in.from_object[:3, 3]
         scores = sorted(result.beliefs.items(), key=lambda pair: -pair[1])
-        for name, score in scores:
-            if score >= LEAST_SCORE:
-                one = _hypothesis(
-                    name,
-                    score,
-                    place,
-                    0.0,
-                    1000 * (result.radius or 0.0),
-                )
-                one.pose.covariance[21] = one.pose.covariance[28] = one.pose.covariance[
-                    35
-                ] = ANY_TURN
-                detection.results.append(one)
+        detection.results = [
+            _hypothesis_of_class(name, score, result)
+            for name, score in scores
+            if score >= LEAST_SCORE
+        ]
 
-    centre = result.poses_in.from_object
-    fill_pose(detection.bbox.center, centre)
-    across = 2.0 * (result.radius or 0.0)
-    detection.bbox.size.x = detection.bbox.size.y = detection.bbox.size.z = across
-    return Detection3DArray(header=header, detections=[detection])
+    posed = result.pose_candidates[0] if result.pose is not None else None
+    if posed is not None and posed.vertices is not None:
+        low, high = posed.vertices.min(0), posed.vertices.max(0)
+        _fill_box(detection.bbox, posed.pose, low, high)
+    else:
+        radius = np.full(3, result.radius or 0.0)
+        _fill_box(detection.bbox, result.poses_in.from_object, -radius, radius)
+    return detection
 
 
 def _hypothesis(
@@ -120,3 +258,25 @@ def _hypothesis(
     turn = np.radians(degrees) ** 2 / 3
     one.pose.covariance = np.diag([place] * 3 + [turn] * 3).ravel()
     return one
+
+
+def _hypothesis_of_class(
+    name: str,
+    score: float,
+    result: nextview.Recognition,
+) -> Any:
+    """A hypothesis without geometry: at the object's centre, in any orientation."""
+    pose = np.eye(4)
+    pose[:3, 3] = result.poses_in.from_object[:3, 3]
+    one = _hypothesis(name, score, pose, 0.0, 1000 * (result.radius or 0.0))
+    for turn in (21, 28, 35):  # on the diagonal of the matrix
+        one.pose.covariance[turn] = ANY_TURN
+    return one
+
+
+def _fill_box(box: Any, pose: Float, low: Float, high: Float) -> None:
+    """Write a box between two corners, (3,), of a frame in the world into a message."""
+    centre = np.array(pose, np.float64)
+    centre[:3, 3] += pose[:3, :3] @ ((low + high) / 2)
+    fill_pose(box.center, centre)
+    box.size.x, box.size.y, box.size.z = map(float, high - low)

@@ -156,7 +156,9 @@ class Scene:
         self._judge = Judge(self.system, CORES)
         self._widest = self._judge.widest
         self._state = SceneState(region=region)
-        self._target: Float | None = None
+        self._targets: Float | None = None
+        self._target_rows: list[int] = []
+        self._failed: set[int] = set()
         self._lock = RLock()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -219,21 +221,55 @@ class Scene:
         Raises:
             PolicyError: a policy of your own failed.
         """
+        targets = self.targets
+        return targets[0] if len(targets) else None
+
+    @property
+    def targets(self) -> Float:
+        """Candidate views, the best first, camera-to-world, (V, 4, 4); the first is ``target``.
+
+        Only views above the plane, within reach and away from the earlier ones. One view at most if
+        the ``policy`` chooses one instead of valuing all.
+
+        Raises:
+            PolicyError: a policy of your own failed.
+        """
         with self._lock:
-            state = self._state
-            around = state.around
-            if not len(around):
-                return None
-            if self._target is None:
-                views = candidates(self.system, state.tops, around, self.distance)
-                if self.reachable is not None:
-                    can = [bool(self.reachable(pose)) for pose in views.poses]
-                    views = replace(views, free=views.free & np.array(can))
-                if not views.free.any():
-                    return None
-                choice = SceneChoice(views, state, self.system)
-                self._target = views.poses[self._policy.choose(choice, self._rng)]
-            return self._target
+            if self._targets is None:
+                self._target_rows, self._targets = self._ranked()
+            return self._targets
+
+    def _ranked(self) -> tuple[list[int], Float]:
+        """Ask the policy; return the rows of the views, the best first, and their poses."""
+        around = self._state.around
+        if not len(around):
+            return [], np.zeros((0, 4, 4))
+
+        views = candidates(self.system, self._state.tops, around, self.distance)
+        free = views.free.copy()
+        free[list(self._failed)] = False
+        if self.reachable is not None:
+            free &= np.array([bool(self.reachable(pose)) for pose in views.poses])
+        if not free.any():
+            return [], np.zeros((0, 4, 4))
+
+        choice = SceneChoice(replace(views, free=free), self._state, self.system)
+        rows = self._policy.ranked(choice, self._rng)
+        return rows, views.poses[rows]
+
+    def failed(self) -> None:
+        """Report that the camera could not reach ``target``.
+
+        No view from its direction is a target again.
+
+        Raises:
+            SessionError: there is no target.
+        """
+        with self._lock:
+            if self.target is None:
+                raise SessionError("no view was asked for, so none has failed")
+            self._failed.add(self._target_rows[0])
+            self._targets = None
 
     def update(self, frame: Frame) -> Look:
         """Update the scene with a frame.
@@ -265,7 +301,7 @@ class Scene:
             top = replace(top, warnings=tuple(known.check(frame, shown)))
             state, look = self._after(before, top)
             self._state = state
-            self._target = None
+            self._targets = None
             return look
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:

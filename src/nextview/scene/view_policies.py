@@ -233,8 +233,10 @@ class NamedPolicy:
             raise PolicyError(f"policy {name} is no function, nor a class of such")
         return cls(name, found)
 
-    def choose(self, choice: SceneChoice, rng: np.random.Generator) -> int:
-        """Return the row of the chosen view.
+    def ranked(self, choice: SceneChoice, rng: np.random.Generator) -> list[int]:
+        """Return the rows of the views, the best first: of the free ones that have a value.
+
+        A policy that chooses a view gives this row alone.
 
         Args:
             choice: the candidate views, at least one of them free, and what is known now.
@@ -254,7 +256,7 @@ class NamedPolicy:
 
         free = choice.views.free
         if said.ndim == 0 and np.issubdtype(said.dtype, np.integer):
-            return self._row(said.item(), free)
+            return [self._row(said.item(), free)]
         if said.shape != free.shape or said.dtype.kind not in "fiu":
             raise PolicyError(
                 f"policy {self.name} has to return {len(free)} numbers, one for each view, or the"
@@ -265,7 +267,8 @@ class NamedPolicy:
         if not valued.any():
             raise PolicyError(f"policy {self.name} values every free view as NaN")
         rows = np.flatnonzero(valued)
-        return int(rows[said[rows].argmax()])
+        order = np.argsort(-said[rows].astype(np.float64), kind="stable")
+        return [int(row) for row in rows[order]]
 
     def _row(self, row: int, free: Any) -> int:
         """Return a row that a policy chose, checked."""

@@ -22,8 +22,8 @@ def placed_shape(thing: SceneObject) -> Triangles | None:
         thing: the object.
 
     Returns:
-        Vertices, (V, 3) float64, world, metres, and faces, (F, 3) int32; None if the points have no
-        volume.
+        Vertices, (V, 3) float64, world, metres, and faces, (F, 3) int32, those of a hull
+        counter-clockwise from outside; None if the points have no volume.
     """
     posed = thing.candidates[0] if thing.pose is not None else None
     if posed is not None and posed.vertices is not None and posed.faces is not None:
@@ -32,9 +32,14 @@ def placed_shape(thing: SceneObject) -> Triangles | None:
         hull = ConvexHull(thing.seen_points)
     except QhullError:  # coplanar points
         return None
+    first, second, third = thing.seen_points[hull.simplices].transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    inward = (normals * hull.equations[:, :3]).sum(1) < 0
+    simplices = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+
     row_of = np.full(len(thing.seen_points), -1)
     row_of[hull.vertices] = np.arange(len(hull.vertices))
-    return thing.seen_points[hull.vertices], row_of[hull.simplices].astype(np.int32)
+    return thing.seen_points[hull.vertices], row_of[simplices].astype(np.int32)
 
 
 def seen_points(scene: Scene, number: int) -> NDArray[np.float32]:

@@ -1,0 +1,457 @@
+"""The ROS 2 node before a whole table: what it tells of the things on it.
+
+Runs where rclpy and nextview_msgs are, in the environment of ``make test-ros``.
+"""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+import nextview_ros.node
+import trimesh
+from geometry_msgs.msg import Point
+from nextview_msgs.action import LookUntilSettled
+from nextview_msgs.msg import Box
+from nextview_ros.player import PlayerNode, RecordedFrames
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from ros_messages import (
+    CAMERA_INFO,
+    DEPTH,
+    at,
+    image_message,
+    info_message,
+    tf_message,
+    transform_message,
+    write_bag,
+)
+from ros_robot import Robot, Running, matrix_of, node_with, until, wait
+from rosbags.rosbag2 import Reader
+from rosgraph_msgs.msg import Clock
+from rosidl_runtime_py.utilities import get_message
+from scipy.spatial import cKDTree
+from small_tables import camera_over, view
+
+import nextview
+from nextview.teaching.learn import learn
+
+TAUGHT = ("cracker_box", "tomato_soup_can")
+STRANGER = "mug"
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+def write_scan(mesh, folder):
+    """Write the scan of a thing in metres; the path."""
+    path = folder / f"{mesh.name}.ply"
+    placed = mesh.vertices * mesh.metres + mesh.centre
+    trimesh.Trimesh(placed, mesh.faces, process=False).export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def mine(ycb_meshes, tmp_path_factory):
+    """A memory of two things."""
+    scans = tmp_path_factory.mktemp("scans")
+    for name in TAUGHT:
+        write_scan(ycb_meshes[name], scans)
+    memory = tmp_path_factory.mktemp("memory") / "mine"
+    learn(scans, memory, unit="m", workers=0)
+    return memory
+
+
+@pytest.fixture(scope="module")
+def camera(ycb_meshes):
+    """A camera over them and a stranger."""
+    return camera_over([ycb_meshes[name] for name in (*TAUGHT, STRANGER)])
+
+
+@pytest.fixture(scope="module")
+def see(camera):
+    """What the camera sees from a pose, millimetres."""
+    lock = threading.Lock()
+
+    def see(pose):
+        with lock:  # the camera draws its errors
+            depth = camera.frame(pose).depth
+        return np.rint(1000 * depth).astype(np.uint16)
+
+    return see
+
+
+@pytest.fixture(scope="module")
+def intrinsics(camera):
+    """Pinhole matrix, first pixel's centre at 0."""
+    return camera.sensor.intrinsics - HALF_PIXEL
+
+
+@pytest.fixture(scope="module")
+def running(mine, see, intrinsics):
+    def robot():
+        return Robot(see, intrinsics, {"depth": view(20)})
+
+    made = Running(robot, models=[str(mine)], max_views=4)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def robot(running):
+    running.robot.reset()
+    yield running.robot
+    node = running.node
+    node.ended.set()
+    until(lambda: not node.taken, "the goal's end")
+
+
+def is_in_place(camera, name, pose, least=0.01):
+    """Whether a scan in a pose is where the thing is: ADD-S below 10 % of the diameter."""
+    thing = next(one for one in camera.table.things if one.name == name)
+    true = thing.placed @ camera.lean[:3, :3].T + camera.lean[:3, 3]
+    placed = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+    add_s = cKDTree(placed).query(true)[0].mean()
+    return add_s < 0.1 * np.linalg.norm(np.ptp(true, axis=0))
+
+
+def wait_for_target(robot, result, heard):
+    """Whether another pose is asked for, before the result comes."""
+    until(
+        lambda: result.done() or robot.heard.get("next_pose") is not heard,
+        "a pose or the result",
+    )
+    return robot.heard.get("next_pose") is not heard
+
+
+def test_a_goal_looks_until_the_table_is_settled(robot, camera):
+    handle, result = robot.goal(LookUntilSettled, distance=0.65)
+    assert handle.accepted
+    while True:
+        heard = robot.heard.get("next_pose")
+        answer = robot.look()
+        assert answer.success, answer.message
+        if not wait_for_target(robot, result, heard):
+            break
+        assert len(robot.hears("next_poses").poses) > 5
+        robot.pose = robot.target(heard)
+    found = wait(result)
+    assert found.status == 4  # succeeded
+    assert found.result.done
+    assert 2 <= found.result.views <= 4
+    objects = {thing.name: thing for thing in found.result.objects}
+    assert set(objects) == {*TAUGHT, "unknown"}
+    for name in TAUGHT:
+        thing = objects[name]
+        assert thing.confident
+        assert thing.pose.header.frame_id == "base_link"
+        assert is_in_place(camera, name, matrix_of(thing.pose.pose))
+        assert 0 < thing.pose_millimetres < 20
+    assert objects["unknown"].pose.header.frame_id == ""
+    until(lambda: len(robot.feedback) >= found.result.views, "feedback")
+    assert [said.views for said in robot.feedback] == list(
+        range(1, found.result.views + 1)
+    )
+
+    # the same objects in all other topics
+    detections = robot.hears("detections").detections
+    assert [int(one.id) for one in detections] == [
+        thing.number for thing in found.result.objects
+    ]
+    named = {
+        one.results[0].hypothesis.class_id: one for one in detections if one.results
+    }
+    assert set(named) == set(TAUGHT)
+    told = {
+        one.id: one for one in robot.hears("planning_scene").world.collision_objects
+    }
+    names = {thing.name: f"{thing.name}_{thing.number}" for thing in objects.values()}
+    assert {name for name, one in told.items() if one.operation == one.ADD} == set(
+        names.values()
+    )
+    for name in TAUGHT:
+        pose = matrix_of(objects[name].pose.pose)
+        likeliest = named[name].results[0]
+        assert likeliest.hypothesis.score > 0.5
+        np.testing.assert_allclose(matrix_of(likeliest.pose.pose), pose, atol=1e-6)
+        one = told[names[name]]
+        np.testing.assert_allclose(matrix_of(one.pose), pose, atol=1e-6)
+        thing = next(each for each in camera.table.things if each.name == name)
+        corners = np.array([[v.x, v.y, v.z] for v in one.meshes[0].vertices])
+        for extreme in (np.min, np.max):  # the shape in the frame of the scan's file
+            np.testing.assert_allclose(
+                extreme(corners, axis=0), extreme(thing.vertices, axis=0), atol=0.004
+            )
+        until(lambda name=name: names[name] in robot.objects, "the transform")
+        np.testing.assert_allclose(robot.objects[names[name]], pose, atol=1e-6)
+    assert names["unknown"] not in robot.objects
+
+
+def test_looks_without_a_goal_go_to_the_scene_and_a_goal_begins_anew(robot):
+    _, result = robot.goal(LookUntilSettled, max_views=1)
+    assert robot.look().success
+    assert wait(result).result.views == 1
+    again = robot.look()
+    assert not again.success
+    assert "this picture was handed in before" in again.message
+    robot.pose = view(110)
+    until(lambda: "2 views" in robot.look().message, "a look from there")
+    _, result = robot.goal(LookUntilSettled, max_views=1)
+    assert robot.look().success
+    assert wait(result).result.views == 1
+
+
+def test_a_view_that_cannot_be_reached_is_not_asked_for_again(robot):
+    robot.goal(LookUntilSettled, distance=0.65)
+    assert "no view was asked for" in robot.failed().message
+    assert robot.look().success
+    first = robot.target()
+    heard = robot.heard["next_pose"]
+    assert robot.failed().success
+    second = robot.target(heard)
+    assert np.linalg.norm(second[:3, 3] - first[:3, 3]) > 0.05
+    left = [matrix_of(pose) for pose in robot.heard["next_poses"].poses]
+    assert min(np.linalg.norm(pose[:3, 3] - first[:3, 3]) for pose in left) > 0.05
+
+
+def test_only_the_region_is_searched(robot, camera):
+    thing = next(one for one in camera.table.things if one.name == "cracker_box")
+    low, high = thing.placed.min(0) - 0.02, thing.placed.max(0) + 0.02
+    low, high = (
+        Point(**dict(zip("xyz", corner, strict=True)))
+        for corner in (low.tolist(), high.tolist())
+    )
+    _, result = robot.goal(
+        LookUntilSettled, region=[Box(low=low, high=high)], max_views=1
+    )
+    assert robot.look().success
+    objects = wait(result).result.objects
+    assert "cracker_box" in {one.name for one in objects}
+    assert "tomato_soup_can" not in {one.name for one in objects}
+
+
+def test_a_thing_that_is_learned_gets_its_name_in_the_frames_so_far(
+    robot, mine, camera, ycb_meshes, tmp_path
+):
+    _, result = robot.goal(LookUntilSettled, max_views=1)
+    assert "a goal is active" in robot.learn(path="any").message
+    assert robot.look().success
+    assert "unknown" in {one.name for one in wait(result).result.objects}
+    heard = robot.hears("detections")
+
+    scan = write_scan(ycb_meshes[STRANGER], tmp_path)
+    answer = robot.learn(path=str(tmp_path / "none.ply"), unit="m")
+    assert not answer.success
+    assert "there is no such file" in answer.message
+    answer = robot.learn(path=str(scan), name="cup", unit="m")
+    assert answer.success, answer.message
+    assert "3 things learned" in answer.message
+    assert set(nextview.load(mine).classes) == {*TAUGHT, "cup"}
+
+    results = {
+        one.results[0].hypothesis.class_id: one.results[0].pose.pose
+        for one in robot.hears("detections", heard).detections
+        if one.results
+    }
+    assert set(results) == {*TAUGHT, "cup"}
+    assert is_in_place(camera, STRANGER, matrix_of(results["cup"]))
+    answer = robot.learn(path=str(scan), name="cup", unit="m")
+    assert "is known already" in answer.message
+
+
+def test_two_cameras_look_at_one_scene(running, mine, see, intrinsics):
+    poses = {"left": view(20), "right": view(140)}
+    pair = running.add(Robot(see, intrinsics, poses, namespace="/pair"))
+    running.add(node_with("/pair", models=[str(mine)], cameras=["left", "right"]))
+    answer = pair.look()
+    assert answer.success, answer.message
+    assert answer.message.startswith("2 views")
+    until(lambda: "detections" in pair.heard, "detections")
+
+    # one of them is covered, the other one still counts
+    pair.poses = {"left": view(80), "right": view(80)}
+    pair.change = lambda image, info, transform: (
+        (None if "right" in image.header.frame_id else image),
+        info,
+        transform,
+    )
+    time.sleep(0.5)
+    answer = pair.look()
+    assert answer.success, answer.message
+    assert answer.message.startswith("3 views")
+    assert "no depth image with its camera_info came on right" in answer.message
+
+
+# Recordings
+
+
+@pytest.fixture(scope="module")
+def bag(see, intrinsics, tmp_path_factory):
+    """A bag of two seconds, with two poses of the camera."""
+    messages = []
+    for k in range(20):
+        pose = view(20 if k < 10 else 110)
+        time = 100 + k / 10
+        depth = see(pose)
+        image = at(image_message(depth, "16UC1"), time)
+        info = at(info_message(intrinsics, depth.shape), time)
+        there = transform_message(pose, "optical", time, "base_link")
+        messages += [
+            ("/tf", time, tf_message(there)),
+            (CAMERA_INFO, time, info),
+            (DEPTH, time, image),
+        ]
+    return write_bag(tmp_path_factory.mktemp("bags") / "table", messages)
+
+
+class BagPlayer(Node):
+    """Publishes the messages of a bag and the clock, as ``ros2 bag play --clock`` does."""
+
+    def __init__(self, bag):
+        super().__init__("bag_player")
+        self.clock = self.create_publisher(Clock, "/clock", 10)
+        self.topics = {}
+        self.stopped = threading.Event()
+        with Reader(bag) as read:
+            self.recorded = [
+                (one.topic, get_message(one.msgtype), time, bytes(data))
+                for one, time, data in read.messages()
+            ]
+        for topic, kind, _, _ in self.recorded:
+            if topic not in self.topics:
+                quality = 10 if topic == "/tf" else qos_profile_sensor_data
+                self.topics[topic] = self.create_publisher(kind, topic, quality)
+
+    def play(self):
+        """Publish all at the rate at which they were recorded."""
+        last = self.recorded[0][2]
+        for topic, _, time_ns, data in self.recorded:
+            if self.stopped.wait((time_ns - last) / 1e9):
+                return
+            last = time_ns
+            now = Clock()
+            now.clock.sec, now.clock.nanosec = divmod(time_ns, 10**9)
+            self.clock.publish(now)
+            self.topics[topic].publish(data)
+
+
+def test_a_bag_is_played_to_the_node(running, mine, bag):
+    player = running.add(BagPlayer(bag))
+    namespace = DEPTH.rpartition("/")[0]
+    node = running.add(
+        node_with(
+            "/bag",
+            models=[str(mine)],
+            cameras=[namespace],
+            image=DEPTH.rpartition("/")[2],
+            period=0.5,
+            max_views=2,
+            use_sim_time=True,
+        )
+    )
+    end = time.monotonic() + 60
+    while not node.scene.done and time.monotonic() < end:
+        player.play()
+    player.stopped.set()
+    assert len(node.scene.frames) == 2
+    assert {thing.name for thing in node.scene.objects} >= set(TAUGHT)
+
+
+def test_a_recording_is_played_as_a_camera(running, mine, bag):
+    given = [Parameter("camera", value="/played/depth")]
+    source = RecordedFrames(bag)
+    running.add(PlayerNode(source, namespace="/played", parameter_overrides=given))
+    node = running.add(
+        node_with(
+            "/played",
+            models=[str(mine)],
+            cameras=["depth"],
+            image="image_rect_raw",
+            period=0.5,
+            max_views=2,
+        )
+    )
+    until(lambda: node.scene.done, "the end of the looks")
+    assert {thing.name for thing in node.scene.objects} >= set(TAUGHT)
+    seen = [frame.camera_to_world for frame in node.scene.frames]
+    for pose in seen:
+        true = min((view(20), view(110)), key=lambda one: np.abs(one - pose).max())
+        np.testing.assert_allclose(pose, true, atol=1e-6)
+
+
+# What is installed
+
+
+def test_without_moveit_there_is_one_line_and_no_topic(
+    running, mine, monkeypatch, capfd
+):
+    monkeypatch.setattr(nextview_ros.node, "PlanningScene", None)
+    node = running.add(node_with("/bare", models=[str(mine)]))
+    assert node.planning_scene is None
+    said = capfd.readouterr()
+    lines = [line for line in (said.out + said.err).splitlines() if "moveit" in line]
+    assert len(lines) == 1
+    assert "moveit_msgs is not installed: no topic planning_scene" in lines[0]
+
+
+def test_parameters_have_descriptions_and_ranges(running):
+    described = running.node.describe_parameters(["threshold", "max_views", "cameras"])
+    threshold, views, cameras = described
+    assert all(one.description for one in described)
+    assert threshold.floating_point_range[0].to_value == 1.0
+    assert views.integer_range[0].from_value == 1
+    assert cameras.read_only
+    (said,) = running.node.set_parameters([Parameter("threshold", value=1.5)])
+    assert not said.successful
+
+
+# The page
+
+
+def commands_of(page, heading):
+    """The commands of the sh blocks below a heading."""
+    section = page.read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    blocks = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    return [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
+
+
+def test_the_first_steps_of_the_page_run_as_they_are_written(tmp_path):
+    """Launch file, stand-in for the robot, goal, topics: each in a process of its own."""
+    page = Path(__file__).parents[1] / "docs" / "ros2.md"
+    commands = [words for words in commands_of(page, "A table in ten minutes") if words]
+    prefix = Path(sys.prefix)
+    env = os.environ | {
+        "AMENT_PREFIX_PATH": str(prefix),
+        "PATH": f"{prefix / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "ROS_DOMAIN_ID": str(int(os.environ["ROS_DOMAIN_ID"]) + 100),
+        "ROS_LOG_DIR": str(tmp_path),
+    }
+    said = []
+    with ExitStack() as running:
+        # the commands share a daemon, which would go on for two hours
+        running.callback(subprocess.run, ["ros2", "daemon", "stop"], env=env)
+        for words in commands:
+            assert words[0] == "ros2"
+            if words[1] in ("launch", "run"):
+                process = subprocess.Popen(words, env=env, start_new_session=True)
+                running.callback(process.wait)
+                running.callback(os.killpg, process.pid, signal.SIGINT)
+                continue
+            done = subprocess.run(
+                words, env=env, capture_output=True, text=True, timeout=300
+            )
+            assert done.returncode == 0, done.stderr
+            said.append(done.stdout)
+    goal, detections, *_ = said
+    assert "Goal finished with status: SUCCEEDED" in goal
+    assert "done: true" in goal
+    assert "class_id: cracker_box" in detections
