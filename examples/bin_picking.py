@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 ACCURACY = (1.0, 0.1)  # of the camera poses, millimetres and degrees: see bin_cell.SENSOR
+GRASPS = 800  # of each part: it may lie in any way, and others around it
 NO_STRANGERS = 0.001  # significance of the test for strangers: nothing else is in the bin
 DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
@@ -96,7 +97,9 @@ def teach(folder: Path) -> tuple[nextview.System, dict[str, tuple[Grasp, ...]]]:
     write_parts(scans)
     nextview.learn(scans, folder / "taught", unit="mm", workers=0)
     grasps = {
-        path.stem: propose_grasps(nextview.load_mesh(path, unit="mm"), GRIPPER)
+        path.stem: propose_grasps(
+            nextview.load_mesh(path, unit="mm"), GRIPPER, GRASPS
+        )
         for path in sorted(scans.iterdir())
     }
     system = nextview.load(
@@ -254,7 +257,6 @@ class Picker:
         cell.open(grasp.opening)
         cell.follow(motion.there)
         cell.follow(motion.down, 0.15)
-        cell.wait(0.2)
         cell.close()
         cell.wait(0.6)
         cell.follow(motion.up, 0.15)

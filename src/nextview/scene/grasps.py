@@ -19,6 +19,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from nextview.checks import number, whole
@@ -28,14 +29,19 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import checked_pose
 from nextview.geometry.ray_caster import embree_scene
 from nextview.scene.objects import SceneObject
+from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import TableTop
 from nextview.things.surface import Surface
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Floats, Index, Mask
 
 GRASP_CLEARANCE = 0.003  # metres, error of a good pose and of a good hand-eye calibration
 FRICTION = 0.4  # coefficient of steel on dry rubber or plastic, the lower end of tables
-OBSTACLE_STEP = 0.003  # metres between the points that stand for obstacles
+OBSTACLE_STEP = 0.003  # metres between the points that stand for obstacles of fingers
+PALM_STEP = 0.01  # metres between those of the palm
+STEEPEST_SURFACE = 4.0  # of depth along the image; what is steeper mixes an edge and its background
+LEAST_COVERED = 0.25  # of a cell's side by pixels: a surface seen at 75 degrees; less is noise
 OWN_SURFACE = 0.004  # metres from a thing's scan within which measured points are its own
+OWN_PIXELS = 0.01  # the same for points in its mask, which noise has displaced
 FINGER_STEPS = (3, 3, 9)  # sample points of a finger across, along y, and along its length
 MOST_UNSEEN = 0.25  # share of the fingers' space; less needs more views, more touches more
 APPROACH = 0.10  # metres of the straight way to a grasp
@@ -44,7 +50,7 @@ COARSE_STEP = 16  # of so many points one is tested first
 SURFACE_POINTS = 1000  # of a thing, tested against the gripper
 CONTACT_POINTS = 300  # of a thing, on which a finger may press
 APPROACHES = 16  # directions around the closing axis from which a pair of contacts is tried
-TIP_DEPTHS = (0.004, 0.012)  # metres by which the fingertips reach beyond the contacts
+TIP_DEPTHS = (0.002, 0.01)  # metres by which the fingertips reach beyond the contacts
 PAD_GRID = (-0.4, 0.0, 0.4)  # places on a finger, in its widths, that should touch the thing
 PAD_TOUCH = 0.001  # metres within which they do
 ALIKE_PLACE = 0.008  # metres; of grasps from the same side that are closer the best is kept
@@ -202,7 +208,7 @@ def load_grasps(path: str | Path) -> dict[str, tuple[Grasp, ...]]:
 def propose_grasps(
     mesh: Mesh,
     gripper: Gripper,
-    most: int = 200,
+    most: int = 400,
     friction: float = FRICTION,
     seed: int = 0,
 ) -> tuple[Grasp, ...]:
@@ -409,6 +415,7 @@ def free_grasps(
     gripper: Gripper,
     clearance: float = GRASP_CLEARANCE,
     most_unseen: float = MOST_UNSEEN,
+    region: Box | None = None,
 ) -> list[FreeGrasp]:
     """Find the grasps that nothing known is in the way of; see ``Scene.grasps``.
 
@@ -419,6 +426,7 @@ def free_grasps(
         gripper: that grasps.
         clearance: distance that fingers and palm keep from everything else, metres.
         most_unseen: largest share of the fingers' space that no frame has shown to be empty.
+        region: box that contains the things; None for everywhere.
 
     Returns:
         The grasps of all confident objects, the best first.
@@ -428,11 +436,17 @@ def free_grasps(
     """
     number(clearance, "the clearance", 0, 0.1)
     number(most_unseen, "the largest unseen share", 0, 1)
-    offering = [one for one in objects if one.confident and grasps.get(one.name)]
+    known = {one.number: points for one in objects if (points := _known(one)) is not None}
+    offering = [
+        one
+        for one in objects
+        if one.number in known
+        and grasps.get(one.name)
+        and (region is None or _within(known[one.number], region))
+    ]
     if not offering:
         return []
-    measured = _measured(tops)
-    known = {one.number: points for one in objects if (points := _known(one)) is not None}
+    measured = _Measured.of(tops, objects)
 
     found = []
     for one in offering:
@@ -443,14 +457,24 @@ def free_grasps(
         openings = np.minimum(widths + 4 * clearance, gripper.opening)
         fits = widths + 2 * clearance <= gripper.opening
         own = known[one.number]
-        near, _ = cKDTree(own).query(measured, distance_upper_bound=OWN_SURFACE)
+        away, _ = cKDTree(own).query(measured.points, distance_upper_bound=OWN_PIXELS)
+        itself = (away < OWN_SURFACE) | (away < OWN_PIXELS) & (
+            measured.owner == one.number
+        )
         others = [points for other, points in known.items() if other != one.number]
-        obstacles = np.concatenate([measured[np.isinf(near)], *others])
+        obstacles = np.concatenate([measured.points[~itself], *others])
 
         rows = np.flatnonzero(fits)
+        far = _thinned(obstacles, PALM_STEP)
+        rows = rows[~_palm_blocked(far, poses[rows], gripper, clearance)]
+        reach = np.linalg.norm(poses[:, :3, 3] - one.place, axis=1).max()
+        reach += gripper.finger_length + gripper.opening
+        near_by = obstacles[np.linalg.norm(obstacles - one.place, axis=1) < reach]
         for step in (COARSE_STEP, 1):
-            some_points = obstacles[::step]
-            hit = _blocked(some_points, poses[rows], openings[rows], gripper, clearance)
+            own_poses, own_openings = poses[rows], openings[rows]
+            hit = _fingers_blocked(
+                near_by[::step], own_poses, own_openings, gripper, clearance
+            )
             rows = rows[~hit]
         unseen = _unseen(tops, poses[rows], openings[rows], gripper)
         for row, share in zip(rows, unseen, strict=True):
@@ -487,27 +511,83 @@ def within_reach(
     return kept
 
 
-def _measured(tops: Sequence[TableTop]) -> Float:
-    """Points that the frames measured, (N, 3), metres, without those that a later one sees past."""
-    found = []
-    for number_of_frame, top in enumerate(tops):
-        frame = top.frame
-        rows, columns = np.nonzero(frame.depth[::2, ::2] > 0)
-        points = frame.positions(2 * rows, 2 * columns)
-        for later in tops[number_of_frame + 1 :]:
-            past = _depth_behind(later, points) > 2 * OBSTACLE_STEP
-            points = points[~past]
-        found.append(points)
-    return _thinned(np.concatenate(found))
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """What the frames measured, as the mean points of small cells.
+
+    Attributes:
+        points: (N, 3), world, metres.
+        owner: number of the object in whose mask most pixels of the cell are, 0 for none, (N,).
+    """
+
+    points: Float
+    owner: Index
+
+    @classmethod
+    def of(cls, tops: Sequence[TableTop], objects: Sequence[SceneObject]) -> _Measured:
+        """Measure all frames.
+
+        Left out are pixels at depth steps, which cameras measure between the two surfaces, cells
+        that hardly any pixel covers, and what a later frame sees past.
+
+        Args:
+            tops: support surfaces of the frames.
+            objects: of the scene.
+        """
+        points = []
+        owners = []
+        for row, top in enumerate(tops):
+            depth = top.frame.depth
+            owner = np.zeros(depth.shape, np.int64)
+            for one in objects:
+                if row in one.pixels:
+                    owner[one.pixels[row]] = one.number
+            shown = depth > 0
+            nearest = ndimage.minimum_filter(np.where(shown, depth, np.inf), 3)
+            pixel = depth / top.frame.intrinsics[0, 0]
+            shown &= depth - nearest < STEEPEST_SURFACE * pixel + OBSTACLE_STEP
+            cells, own = _cells(
+                top.frame.positions(*np.nonzero(shown)), pixel[shown], owner[shown]
+            )
+            past = np.zeros(len(cells), bool)
+            for later in tops[row + 1 :]:
+                past |= _depth_behind(later, cells) > 2 * OBSTACLE_STEP
+            points.append(cells[~past])
+            owners.append(own[~past])
+        return cls(np.concatenate(points), np.concatenate(owners))
 
 
-def _thinned(points: Float) -> Float:
-    """One point of each cell of OBSTACLE_STEP."""
-    cells = np.floor(points / OBSTACLE_STEP).astype(np.int64)
+def _cells(points: Float, pixels: Floats, owner: Index) -> tuple[Float, Index]:
+    """Average points in cells of OBSTACLE_STEP.
+
+    Args:
+        points: (N, 3), metres.
+        pixels: side of the pixel of each point, metres, (N,).
+        owner: object of each point, (N,).
+
+    Returns:
+        The mean of each cell, (C, 3), and the owner of one of its points, (C,).
+    """
+    flat = _cell_of(points, OBSTACLE_STEP)
+    _, first, cell = np.unique(flat, return_index=True, return_inverse=True)
+    count = np.bincount(cell)
+    means = np.stack([np.bincount(cell, axis) for axis in points.T], 1) / count[:, None]
+    covered = np.bincount(cell, pixels.astype(np.float64) ** 2) / OBSTACLE_STEP**2
+    kept = covered >= LEAST_COVERED
+    return means[kept], owner[first[kept]]
+
+
+def _cell_of(points: Float, step: float) -> Index:
+    """Number of the cell of each point, (N,), of cells with a side of some metres."""
+    cells = np.floor(points / step).astype(np.int64)
     cells -= cells.min(0, initial=0)
     size = cells.max(0, initial=0) + 1
-    flat = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-    return points[np.unique(flat, return_index=True)[1]]
+    return np.asarray((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2])
+
+
+def _thinned(points: Float, step: float) -> Float:
+    """Keep one point of each cell with a side of some metres."""
+    return points[np.unique(_cell_of(points, step), return_index=True)[1]]
 
 
 def _known(one: SceneObject) -> Float | None:
@@ -520,29 +600,46 @@ def _known(one: SceneObject) -> Float | None:
         return None
     surface = Surface(one.name, shown.vertices, shown.faces)
     points, _ = _surface_points(surface, 4 * SURFACE_POINTS, np.random.default_rng(0))
-    return _thinned(points @ one.pose[:3, :3].T + one.pose[:3, 3])
+    return _thinned(points @ one.pose[:3, :3].T + one.pose[:3, 3], OBSTACLE_STEP)
 
 
-def _blocked(
+def _within(points: Float, region: Box) -> bool:
+    """Whether all points, (N, 3), are in a box, but for the error of a pose."""
+    along = points @ region.axes.T
+    inside = (along > region.low - OWN_SURFACE) & (along < region.high + OWN_SURFACE)
+    return bool(inside.all())
+
+
+def _palm_blocked(
+    points: Float, poses: Float, gripper: Gripper, clearance: float
+) -> Mask:
+    """Whether something is on the straight way of the palm to a grasp, (G,) bool."""
+    x, y, z = _in_gripper(points.astype(np.float32), poses.astype(np.float32))
+    palm = np.abs(x) < gripper.palm[0] / 2 + clearance
+    palm &= np.abs(y) < gripper.palm[1] / 2 + clearance
+    back = -gripper.finger_length
+    palm &= (z < back + clearance) & (z > back - gripper.palm[2] - APPROACH)
+    return np.asarray(palm.any(1))
+
+
+def _fingers_blocked(
     points: Float,
     poses: Float,
     openings: Float,
     gripper: Gripper,
     clearance: float,
 ) -> Mask:
-    """Whether something is on the straight way of the open gripper, (G,) bool.
+    """Whether something is where the open fingers are in a grasp, or between them, (G,) bool.
 
-    The space between the fingers counts, so that they do not close on two things.
+    What is between them may not be another thing, so that they do not close on two. The way of the
+    fingers is within that of the palm.
     """
     x, y, z = _in_gripper(points.astype(np.float32), poses.astype(np.float32))
-    x, y = np.abs(x), np.abs(y)
     span = openings[:, None] / 2 + gripper.finger_thickness + clearance
-    fingers = (x < gripper.finger_width / 2 + clearance) & (y < span)
-    back = -gripper.finger_length
-    fingers &= (z < clearance) & (z > back - APPROACH)
-    palm = (x < gripper.palm[0] / 2 + clearance) & (y < gripper.palm[1] / 2 + clearance)
-    palm &= (z < back) & (z > back - gripper.palm[2] - APPROACH)
-    return np.asarray((fingers | palm).any(1))
+    fingers = np.abs(x) < gripper.finger_width / 2 + clearance
+    fingers &= np.abs(y) < span
+    fingers &= (z < clearance) & (z > -gripper.finger_length)
+    return np.asarray(fingers.any(1))
 
 
 def _unseen(

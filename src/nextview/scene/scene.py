@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number
-from nextview.errors import ObservationError, SessionError
+from nextview.checks import did_you_mean, number, one_line
+from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import Change, changes, wrong_pose
 from nextview.scene.following import SAME_OBJECT_SHARE, assign
@@ -281,7 +281,8 @@ class Scene:
 
         The open gripper comes along its z axis in a straight line. It must not meet measured points
         of other objects, walls or the support, nor the scans of other confident objects, and the
-        space between its fingers must not hold a part of another object.
+        space between its fingers must not hold a part of another object. An object that reaches out
+        of ``region`` offers none: where that is the inside of a bin, it is a wall.
 
         Args:
             grasps: of each thing, by its name; see ``scene.grasps``.
@@ -297,8 +298,13 @@ class Scene:
             The grasps, the best first; [] before the first frame.
 
         Raises:
-            UsageError: a number is out of range.
+            UsageError: a number is out of range, or the scene knows no thing of a name.
         """
+        known = self.system.models.classes
+        for name in grasps:
+            if name not in known:
+                what = f"grasps of {one_line(name)}, which is none of the taught things"
+                raise UsageError(f"{what}{did_you_mean(name, known)}")
         with self._lock:
             found = free_grasps(
                 self.objects,
@@ -307,6 +313,7 @@ class Scene:
                 gripper,
                 clearance,
                 most_unseen,
+                self.region,
             )
             if reachable is not None:
                 return within_reach(found, reachable, most)
