@@ -1,8 +1,8 @@
-"""A simulated cell for picking: a Panda with two long fingers, a full bin and an empty box, in MuJoCo.
+"""A simulated cell for picking, in MuJoCo: a Panda with long fingers, a full bin and an empty box.
 
-Parts fall into the bin, touch each other, and are held by friction alone. The depth of the camera on
-the wrist is cast by Embree and has the noise of a stereo camera; the poses that the arm reports are
-off by the error of a hand-eye calibration. The arm's model is the one in ``gymnasium-robotics``.
+Parts fall into the bin, touch each other, and are held by friction alone. The depth of the camera
+on the wrist is cast by Embree and has the noise of a stereo camera; the poses that the arm reports
+have the error of a hand-eye calibration. The arm's model is the one in ``gymnasium-robotics``.
 """
 
 from __future__ import annotations
@@ -38,6 +38,9 @@ FUNNEL = 0.35  # metres, height of the walls while parts are poured
 DENSITY = 2700.0  # of aluminium, kg/m^3
 FRICTION = 0.35  # of metal on metal and on plastic
 PAD_FRICTION = 1.0  # of a rubber pad on metal
+FINGER_INERTIA = 1.0  # kilograms, of a finger with its drive
+FINGER_STIFFNESS = 4000.0  # newtons a metre
+FINGER_DAMPING = 2 * np.sqrt(FINGER_STIFFNESS * FINGER_INERTIA)  # critical
 GRIP_FORCE = 40.0  # newtons of each finger; a Panda's hand holds with up to 70
 
 GRIPPER = Gripper(
@@ -75,7 +78,8 @@ WORLD = """
 <mujoco>
   <include file="{assets}/assets.xml"/>
   <compiler meshdir="{assets}/meshes" angle="radian"/>
-  <option timestep="{timestep}" cone="elliptic" impratio="10" integrator="implicitfast" noslip_iterations="5">
+  <option timestep="{timestep}" cone="elliptic" impratio="10" noslip_iterations="5"
+    integrator="implicitfast">
     <flag multiccd="enable"/>
   </option>
   <worldbody>
@@ -97,7 +101,9 @@ COLOURS = np.array(
 )
 
 
-def walls(centre: np.ndarray, inside: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def walls(
+    centre: np.ndarray, inside: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Centre and half sides, (3,) each, of the bottom and the four walls of a container."""
     x, y, height = *inside[:2] / 2, inside[2]
     flat = [(0, 0, WALL / 2)], [(x + WALL, y + WALL, WALL / 2)]
@@ -107,7 +113,7 @@ def walls(centre: np.ndarray, inside: np.ndarray) -> list[tuple[np.ndarray, np.n
         flat[1].append((WALL / 2, y + WALL, middle))
         flat[0].append((0, sign * (y + WALL / 2), middle))
         flat[1].append((x, WALL / 2, middle))
-    places = np.array(flat[0]) + [*centre, 0]
+    places = np.add(flat[0], [*centre, 0])
     return list(zip(places, np.array(flat[1]), strict=True))
 
 
@@ -120,14 +126,20 @@ def cell_spec() -> Any:
     for k, limits in enumerate(RANGES - OFFSETS[:, None]):
         spec.joint(f"robot:panda0_joint{k + 1}").range = limits
     turn = np.zeros(4)
-    mujoco.mju_mat2Quat(turn, np.stack([HAND[:, 1], -HAND[:, 0], HAND[:, 2]], 1).ravel())
+    mujoco.mju_mat2Quat(
+        turn, np.stack([HAND[:, 1], -HAND[:, 0], HAND[:, 2]], 1).ravel()
+    )
     upright = np.zeros(4)
     mujoco.mju_mat2Quat(upright, HAND.ravel())
     wrist = spec.body("panda0_link7")
     wrist.add_site(name="camera", pos=HAND @ CAMERA, quat=turn)
     tip = [0, 0, HAND_END + GRIPPER.finger_length]
     wrist.add_site(name="grip", pos=tip, quat=upright)
-    back = CAMERA - [0, 0, 0.02]  # its lens is well before its case, whatever the errors
+    back = CAMERA - [
+        0,
+        0,
+        0.02,
+    ]  # its lens is well before its case, whatever the errors
     for name, size, pos in (
         ("camera", [0.0125, 0.045, 0.012], back),
         ("mount", [0.03, 0.015, 0.006], back / [2, 1, 1]),
@@ -160,6 +172,7 @@ def cell_spec() -> Any:
                 mass=0.02,
                 friction=[PAD_FRICTION if name == "pad" else FRICTION, 0.01, 0.0001],
                 condim=4,
+                solref=[2 * TIMESTEP, 1],  # the stiffest contact that is stable
                 contype=1,
                 conaffinity=1,
                 group=0,
@@ -191,7 +204,9 @@ class Planner:
         self.data = mujoco.MjData(self.model)
         self._rest = mink.PostureTask(self.model, cost=1e-3)
         self._rest.set_target(HOME)
-        self._fingers = [self.model.body(f"panda0_{s}finger").id for s in ("left", "right")]
+        self._fingers = [
+            self.model.body(f"panda0_{s}finger").id for s in ("left", "right")
+        ]
         names = [self.model.joint(k).name for k in range(7)]
         self._limits = [
             mink.ConfigurationLimit(self.model),
@@ -219,7 +234,9 @@ class Planner:
         mujoco.mj_collision(self.model, self.data)
         return self.data.ncon > 0
 
-    def solve(self, pose: np.ndarray, site: str, start: np.ndarray) -> np.ndarray | None:
+    def solve(
+        self, pose: np.ndarray, site: str, start: np.ndarray
+    ) -> np.ndarray | None:
         """Joints, (7,), near some others, with which a site is at a pose; None without any.
 
         The camera may turn about its line of sight, which shows nothing new.
@@ -235,7 +252,10 @@ class Planner:
                 target[:3, :3] = turned_least(here[:3, :3], pose[:3, 2])
             task.set_target(mink.SE3.from_matrix(target))
             error = task.compute_error(arm)
-            if np.linalg.norm(error[:3]) < CLOSE and np.linalg.norm(error[3:]) < 5 * CLOSE:
+            if (
+                np.linalg.norm(error[:3]) < CLOSE
+                and np.linalg.norm(error[3:]) < 5 * CLOSE
+            ):
                 return arm.q.copy()
             try:
                 speed = mink.solve_ik(
@@ -279,7 +299,9 @@ class Planner:
             joints = self.solve(there, site, found[-1])
             if joints is None or self.touches(joints):
                 return None
-            if np.abs(joints - found[-1]).max() > 0.3:  # another branch of the solutions
+            if (
+                np.abs(joints - found[-1]).max() > 0.3
+            ):  # another branch of the solutions
                 return None
             found.append(joints)
         return found
@@ -321,7 +343,9 @@ class Cell:
         }
         self._steps = 0
         self._build(parts, rng)
-        self._rays = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
+        self._rays = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(
+            -1, 3
+        )
         self._pour()
 
     def _build(self, parts: Mapping[str, BinPart], rng: np.random.Generator) -> None:
@@ -330,16 +354,17 @@ class Cell:
             if body.name.startswith("panda0"):
                 body.gravcomp = 1.0
         for k, kp in enumerate(STIFFNESS):
-            act = spec.add_actuator(name=f"joint{k}", target=f"robot:panda0_joint{k + 1}")
+            act = spec.add_actuator(
+                name=f"joint{k}", target=f"robot:panda0_joint{k + 1}"
+            )
             act.trntype = mujoco.mjtTrn.mjTRN_JOINT
             act.set_to_position(kp=kp, kv=kp / 10)
         for finger in (1, 2):
             joint = spec.joint(f"robot:panda0_finger_joint{finger}")
-            joint.armature = 0.1
-            joint.damping = [10.0, 0, 0]
+            joint.armature = FINGER_INERTIA
             act = spec.add_actuator(name=f"finger{finger}", target=joint.name)
             act.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            act.set_to_position(kp=4000.0, kv=60.0)
+            act.set_to_position(kp=FINGER_STIFFNESS, kv=FINGER_DAMPING)
             act.forcerange = [-GRIP_FORCE, GRIP_FORCE]
             act.forcelimited = True
         together = spec.add_equality(
@@ -388,7 +413,9 @@ class Cell:
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:7] = self.joints
         self.open()
-        self._parts = [self.model.body(f"part{row}").id for row in range(len(self.names))]
+        self._parts = [
+            self.model.body(f"part{row}").id for row in range(len(self.names))
+        ]
         self._speeds = [
             slice(adr, adr + 3)
             for adr in (self.model.body_dofadr[body] for body in self._parts)
@@ -475,7 +502,9 @@ class Cell:
     def inside(self, centre: np.ndarray, inside: np.ndarray) -> list[int]:
         """Parts whose origin is above the bottom of a container, by row."""
         places = np.array([self.pose_of(row)[:2, 3] for row in range(len(self.names))])
-        return np.flatnonzero((np.abs(places - centre) < inside[:2] / 2).all(1)).tolist()
+        return np.flatnonzero(
+            (np.abs(places - centre) < inside[:2] / 2).all(1)
+        ).tolist()
 
     def things(self) -> list[tuple[Any, np.ndarray]]:
         """All that can be seen: triangles and colour, (3,); first the parts, by row."""

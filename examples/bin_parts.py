@@ -53,7 +53,8 @@ def part_of(layers: Sequence[tuple[Sequence[np.ndarray], float, float]]) -> BinP
         moved(extruded(rings, thick), by=(0, 0, low)) for rings, low, thick in layers
     ]
     pieces = [
-        moved(extruded(rings[:1], thick), by=(0, 0, low)) for rings, low, thick in layers
+        moved(extruded(rings[:1], thick), by=(0, 0, low))
+        for rings, low, thick in layers
     ]
     return BinPart(joined(solids), tuple(pieces))
 
@@ -78,9 +79,7 @@ def bin_parts() -> dict[str, BinPart]:
             ([ring_points(9, ROUND)], 34, 40),
         ]
     )
-    bolt = part_of(
-        [([ring_points(15, 6)], 0, 12), ([ring_points(8, ROUND)], 12, 45)]
-    )
+    bolt = part_of([([ring_points(15, 6)], 0, 12), ([ring_points(8, ROUND)], 12, 45)])
 
     holes = [ring_points(3.5, 16, (36, 10)), ring_points(3.5, 16, (36, 24))]
     flat = extruded([rectangle(0, 0, 50, 34), *holes], 7)

@@ -3,10 +3,10 @@
 pip install './research[arm]'
 python examples/bin_picking.py [--parts 12] [--seed 0] [--film picking.gif]
 
-Five generated parts (``bin_parts.py``) are taught and poured into a bin (``bin_cell.py``). The camera
-on the wrist looks from above, and from elsewhere while no grasp is free; what is held is held by
-friction. Printed is each pick, and at the end how many parts are out, how many had another name than
-was said, and how many views and seconds a pick took.
+Parts of five generated kinds (``bin_parts.py``) are taught and poured into a bin (``bin_cell.py``).
+The camera on the wrist looks from above, and from elsewhere while no grasp is free; what is held is
+held by friction. Printed is each pick, and at the end how many parts are out, how many had another
+name than was said, and how many views and seconds a pick took.
 """
 
 from __future__ import annotations
@@ -35,9 +35,14 @@ if TYPE_CHECKING:
     from bin_cell import Cell
 
 NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
-ACCURACY = (1.0, 0.1)  # of the camera poses, millimetres and degrees: see bin_cell.SENSOR
+ACCURACY = (
+    1.0,
+    0.1,
+)  # of the camera poses, millimetres and degrees: see bin_cell.SENSOR
 GRASPS = 800  # of each part: it may lie in any way, and others around it
-NO_STRANGERS = 0.001  # significance of the test for strangers: nothing else is in the bin
+NO_STRANGERS = (
+    0.001  # significance of the test for strangers: nothing else is in the bin
+)
 DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
 MOST_LOOKS = 4  # views of one state of the bin
@@ -97,9 +102,7 @@ def teach(folder: Path) -> tuple[nextview.System, dict[str, tuple[Grasp, ...]]]:
     write_parts(scans)
     nextview.learn(scans, folder / "taught", unit="mm", workers=0)
     grasps = {
-        path.stem: propose_grasps(
-            nextview.load_mesh(path, unit="mm"), GRIPPER, GRASPS
-        )
+        path.stem: propose_grasps(nextview.load_mesh(path, unit="mm"), GRIPPER, GRASPS)
         for path in sorted(scans.iterdir())
     }
     system = nextview.load(
@@ -139,7 +142,7 @@ class Picker:
         top = np.array([0, 0, ROOM_ABOVE])
         self.region = Box(middle - half - [0, 0, 0.01], middle + half + top)
         self.first_pose = look_at_origin(FIRST_ELEVATION, np.pi, DISTANCE)
-        self.first_pose[:3, 3] += middle + [0, 0, 0.03]
+        self.first_pose[:3, 3] += np.add(middle, [0, 0, 0.03])
         self.thinking = 0.0
         self.picks: list[Pick] = []
         self._motions: dict[bytes, Motion] = {}
@@ -215,7 +218,9 @@ class Picker:
         joints = planner.joints_for(pose, "camera", self.cell.joints)
         way = None if joints is None else planner.way(self.cell.joints, joints)
         if way is None:
-            raise NextviewError("the camera cannot be brought where it has to look from")
+            raise NextviewError(
+                "the camera cannot be brought where it has to look from"
+            )
         self.cell.follow(way)
 
     def can_grasp(self, pose: np.ndarray) -> bool:
@@ -279,7 +284,7 @@ def table(picker: Picker, poured: int) -> str:
     thinking = picker.thinking / count
     return "\n".join(
         [
-            "| parts out | wrong picks | grasps | views per pick | seconds of motion | of thought |",
+            "| parts out | wrong picks | grasps | views a pick | s of motion | s of thought |",
             "|---|---|---|---|---|---|",
             f"| {out} of {poured} | {wrong} | {len(picker.picks)} | {views:.2f} |"
             f" {seconds:.1f} | {thinking:.1f} |",
@@ -291,7 +296,6 @@ def main(
     parts: int = 12,
     seed: int = 0,
     film: Path | None = None,
-    taught: Path | None = None,
 ) -> None:
     """Empty a bin.
 
@@ -299,7 +303,6 @@ def main(
         parts: number of parts in the bin.
         seed: of their kinds and places, and of all errors.
         film: GIF that is written; one of that name is replaced.
-        taught: folder in which the memory is kept for the next run.
     """
     for package in NEEDED:
         if find_spec(package) is None:
@@ -307,6 +310,7 @@ def main(
                 f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'"
             )
     from bin_cell import Cell
+    from bin_film import BinFilm
 
     with tempfile.TemporaryDirectory() as folder:
         system, grasps = teach(Path(folder))
@@ -314,10 +318,12 @@ def main(
     known = bin_parts()
     poured = [str(name) for name in rng.choice(sorted(known), parts)]
     cell = Cell(known, poured, rng)
-    picker = Picker(cell, system, grasps)
+    shown = BinFilm(cell, film)
+    picker = Picker(cell, system, grasps, shown.looked)
     poured_in = len(picker.still_inside)
     picker.run()
     print(table(picker, poured_in))
+    shown.save()
 
 
 if __name__ == "__main__":

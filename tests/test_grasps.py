@@ -30,7 +30,9 @@ from nextview.sensing import Frame
 from nextview.simulation.sensor import SENSORS
 
 ROOT = Path(__file__).parents[1]
-SIDES = np.array([0.03, 0.05, 0.12])  # of a box, metres; the last one is too long to grip
+SIDES = np.array(
+    [0.03, 0.05, 0.12]
+)  # of a box, metres; the last one is too long to grip
 GRIPPER = Gripper(
     opening=0.08,
     finger_width=0.018,
@@ -89,8 +91,17 @@ def test_what_is_too_wide_has_no_grasp():
 def test_a_wedge_steeper_than_the_friction_has_no_grasp_on_its_slopes():
     corners = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0, 0.03, 0.0]])  # of 67 degrees
     wedge = trimesh.Trimesh(
-        np.concatenate([corners, corners + [0, 0, 0.03]]),
-        [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]],
+        np.concatenate([corners, np.add(corners, [0, 0, 0.03])]),
+        [
+            [0, 2, 1],
+            [3, 4, 5],
+            [0, 1, 4],
+            [0, 4, 3],
+            [1, 2, 5],
+            [1, 5, 4],
+            [2, 0, 3],
+            [2, 3, 5],
+        ],
     )
     mesh = make_mesh(wedge.vertices, wedge.faces, "wedge", "m")
     found = propose_grasps(mesh, GRIPPER, friction=0.3)
@@ -152,7 +163,9 @@ class StandIn:
     def depth(self):
         rays = PinholeCamera.of(self.SENSOR.intrinsics, self.SENSOR.shape).rays
         rays = rays.reshape(-1, 3) @ self.pose[:3, :3].T
-        depth, _ = RayCaster([*self.parts.values(), *walls()]).cast(self.pose[:3, 3], rays)
+        depth, _ = RayCaster([*self.parts.values(), *walls()]).cast(
+            self.pose[:3, 3], rays
+        )
         depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         return self.SENSOR.measure(depth.reshape(self.SENSOR.shape), self.rng)[0]
 
@@ -177,7 +190,7 @@ def walls():
     sides += [(0.006, 0.252, 0.07, side * 0.163, 0, 0.035) for side in (-1, 1)]
     sides += [(0.32, 0.006, 0.07, 0, side * 0.123, 0.035) for side in (-1, 1)]
     for x, y, z, *at in sides:
-        box = trimesh.creation.box((x, y, z)).apply_translation(np.array(at) + [0.5, 0, 0])
+        box = trimesh.creation.box((x, y, z)).apply_translation(np.add(at, [0.5, 0, 0]))
         yield np.asarray(box.vertices), np.asarray(box.faces, np.int32)
 
 
@@ -202,7 +215,9 @@ def emptied(parts, tmp_path_factory):
     for k, (name, solid) in enumerate(parts.items()):
         trimesh.Trimesh(*solid, process=False).export(folder / f"parts/{name}.stl")
         turn = Rotation.from_euler("z", 25 + 40 * k, degrees=True)
-        vertices = turn.apply(0.001 * solid[0]) + [0.44 + 0.12 * k, 0.02 - 0.05 * k, 0]
+        vertices = np.add(
+            turn.apply(0.001 * solid[0]), [0.44 + 0.12 * k, 0.02 - 0.05 * k, 0]
+        )
         placed[name] = vertices, solid[1].astype(np.int32)
 
     robot = StandIn(placed)
@@ -243,7 +258,9 @@ def lonely(emptied, parts):
     """A flange in the middle of the bin: the scene, all free grasps, and the robot."""
     names, _, _ = emptied
     solid = parts["flange"]
-    robot = StandIn({"flange": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))})
+    robot = StandIn(
+        {"flange": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))}
+    )
     scene = scene_of(names, robot)
     found = scene.grasps(names["grasps"], names["GRIPPER"])
     return names, scene, found, robot
@@ -252,7 +269,9 @@ def lonely(emptied, parts):
 def test_free_grasps_come_best_first_and_reach_neither_bottom_nor_walls(lonely):
     names, scene, found, _ = lonely
     assert found
-    assert [one.score for one in found] == sorted((o.score for o in found), reverse=True)
+    assert [one.score for one in found] == sorted(
+        (o.score for o in found), reverse=True
+    )
     gripper = names["GRIPPER"]
     for one in found:
         assert one.name == "flange"
@@ -325,7 +344,7 @@ def test_what_no_frame_has_shown_is_not_free(lonely):
 
 
 def test_an_uncertain_object_offers_no_grasp(lonely):
-    names, scene, found, _ = lonely
+    names, scene, _, _ = lonely
     unsure = [replace(one, confident=False) for one in scene.objects]
     own = names["grasps"], names["GRIPPER"]
     assert free_grasps(scene.objects, scene.tops, *own)
@@ -335,5 +354,5 @@ def test_an_uncertain_object_offers_no_grasp(lonely):
 
 def test_grasps_of_a_thing_that_is_not_taught_are_refused(lonely):
     names, scene, _, _ = lonely
-    with pytest.raises(UsageError, match="grasps of flang, .* taught things.*flange"):
+    with pytest.raises(UsageError, match=r"grasps of flang, .* taught things.*flange"):
         scene.grasps({"flang": names["grasps"]["flange"]}, names["GRIPPER"])

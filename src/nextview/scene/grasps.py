@@ -2,8 +2,8 @@
 
 A grasp is annotated once, in the frame of the thing's scan: by hand, from CAD, or proposed from the
 mesh (``propose_grasps``). In a scene it is free if the open gripper, on its straight way to the
-grasp, meets nothing that was measured and no other known thing, and if its fingers need little space
-that no frame has shown to be empty.
+grasp, meets nothing that was measured and no other known thing, and if its fingers need little
+space that no frame has shown to be empty.
 
 The frame of a gripper is that of a Panda's hand: the origin is midway between the fingertips, z
 points forward, and the fingers close along y.
@@ -34,28 +34,55 @@ from nextview.sensing.tabletop import TableTop
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats, Index, Mask
 
-GRASP_CLEARANCE = 0.003  # metres, error of a good pose and of a good hand-eye calibration
+GRASP_CLEARANCE = (
+    0.003  # metres, error of a good pose and of a good hand-eye calibration
+)
 FRICTION = 0.4  # coefficient of steel on dry rubber or plastic, the lower end of tables
 OBSTACLE_STEP = 0.003  # metres between the points that stand for obstacles of fingers
 PALM_STEP = 0.01  # metres between those of the palm
-STEEPEST_SURFACE = 4.0  # of depth along the image; what is steeper mixes an edge and its background
-LEAST_COVERED = 0.25  # of a cell's side by pixels: a surface seen at 75 degrees; less is noise
-OWN_SURFACE = 0.004  # metres from a thing's scan within which measured points are its own
+STEEPEST_SURFACE = (
+    4.0  # of depth along the image; what is steeper mixes an edge and its background
+)
+FEWEST_PIXELS = (
+    3  # of a cell that faces the camera, whose mean has less noise than a pixel
+)
+LEAST_COVERED = (
+    0.25  # of a cell's side by pixels: a surface seen at 75 degrees; less is noise
+)
+OWN_SURFACE = (
+    0.004  # metres from a thing's scan within which measured points are its own
+)
 OWN_PIXELS = 0.01  # the same for points in its mask, which noise has displaced
-FINGER_STEPS = (3, 3, 9)  # sample points of a finger across, along y, and along its length
-MOST_UNSEEN = 0.25  # share of the fingers' space; less needs more views, more touches more
+FINGER_STEPS = (
+    3,
+    3,
+    9,
+)  # sample points of a finger across, along y, and along its length
+MOST_UNSEEN = (
+    0.25  # share of the fingers' space; less needs more views, more touches more
+)
 APPROACH = 0.10  # metres of the straight way to a grasp
 COARSE_STEP = 16  # of so many points one is tested first
 
 SURFACE_POINTS = 1000  # of a thing, tested against the gripper
 CONTACT_POINTS = 300  # of a thing, on which a finger may press
-APPROACHES = 16  # directions around the closing axis from which a pair of contacts is tried
+APPROACHES = (
+    16  # directions around the closing axis from which a pair of contacts is tried
+)
 TIP_DEPTHS = (0.002, 0.01)  # metres by which the fingertips reach beyond the contacts
-PAD_GRID = (-0.4, 0.0, 0.4)  # places on a finger, in its widths, that should touch the thing
+PAD_GRID = (
+    -0.4,
+    0.0,
+    0.4,
+)  # places on a finger, in its widths, that should touch the thing
 PAD_TOUCH = 0.001  # metres within which they do
-ALIKE_PLACE = 0.008  # metres; of grasps from the same side that are closer the best is kept
+ALIKE_PLACE = (
+    0.008  # metres; of grasps from the same side that are closer the best is kept
+)
 
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the gripper, which exchanges the fingers
+HALF_TURN = np.diag(
+    [-1.0, -1.0, 1.0, 1.0]
+)  # of the gripper, which exchanges the fingers
 
 
 @dataclass(frozen=True)
@@ -436,7 +463,9 @@ def free_grasps(
     """
     number(clearance, "the clearance", 0, 0.1)
     number(most_unseen, "the largest unseen share", 0, 1)
-    known = {one.number: points for one in objects if (points := _known(one)) is not None}
+    known = {
+        one.number: points for one in objects if (points := _known(one)) is not None
+    }
     offering = [
         one
         for one in objects
@@ -447,50 +476,69 @@ def free_grasps(
     if not offering:
         return []
     measured = _Measured.of(tops, objects)
-
     found = []
     for one in offering:
-        some = grasps[one.name]
-        assert one.pose is not None
-        poses = one.pose @ np.stack([grasp.pose for grasp in some])
-        widths = np.array([grasp.width for grasp in some])
-        openings = np.minimum(widths + 4 * clearance, gripper.opening)
-        fits = widths + 2 * clearance <= gripper.opening
-        own = known[one.number]
-        away, _ = cKDTree(own).query(measured.points, distance_upper_bound=OWN_PIXELS)
-        itself = (away < OWN_SURFACE) | (away < OWN_PIXELS) & (
-            measured.owner == one.number
-        )
         others = [points for other, points in known.items() if other != one.number]
-        obstacles = np.concatenate([measured.points[~itself], *others])
-
-        rows = np.flatnonzero(fits)
-        far = _thinned(obstacles, PALM_STEP)
-        rows = rows[~_palm_blocked(far, poses[rows], gripper, clearance)]
-        reach = np.linalg.norm(poses[:, :3, 3] - one.place, axis=1).max()
-        reach += gripper.finger_length + gripper.opening
-        near_by = obstacles[np.linalg.norm(obstacles - one.place, axis=1) < reach]
-        for step in (COARSE_STEP, 1):
-            own_poses, own_openings = poses[rows], openings[rows]
-            hit = _fingers_blocked(
-                near_by[::step], own_poses, own_openings, gripper, clearance
-            )
-            rows = rows[~hit]
-        unseen = _unseen(tops, poses[rows], openings[rows], gripper)
-        for row, share in zip(rows, unseen, strict=True):
-            if share <= most_unseen:
-                found.append(
-                    FreeGrasp(
-                        one.number,
-                        one.name,
-                        poses[row],
-                        float(widths[row]),
-                        float(openings[row]),
-                        float(share),
-                        float(some[row].quality * (1 - share)),
-                    )
-                )
+        obstacles = np.concatenate(
+            [measured.beside(one.number, known[one.number]), *others]
+        )
+        found += _free_of(
+            one, grasps[one.name], obstacles, tops, gripper, clearance, most_unseen
+        )
     return sorted(found, key=lambda grasp: -grasp.score)
+
+
+def _free_of(
+    one: SceneObject,
+    grasps: Sequence[Grasp],
+    obstacles: Float,
+    tops: Sequence[TableTop],
+    gripper: Gripper,
+    clearance: float,
+    most_unseen: float,
+) -> list[FreeGrasp]:
+    """Find the free grasps of one object, in the order in which they are given.
+
+    Args:
+        one: the object, with a pose.
+        grasps: of its thing.
+        obstacles: points of everything else, (N, 3), world, metres.
+        tops: support surfaces of the frames.
+        gripper: see ``free_grasps``, as the rest.
+        clearance: metres.
+        most_unseen: share.
+    """
+    assert one.pose is not None
+    poses = one.pose @ np.stack([grasp.pose for grasp in grasps])
+    widths = np.array([grasp.width for grasp in grasps])
+    openings = np.minimum(widths + 4 * clearance, gripper.opening)
+    rows = np.flatnonzero(widths + 2 * clearance <= gripper.opening)
+
+    far = _thinned(obstacles, PALM_STEP)
+    rows = rows[~_palm_blocked(far, poses[rows], gripper, clearance)]
+    reach = np.linalg.norm(poses[:, :3, 3] - one.place, axis=1).max()
+    reach += gripper.finger_length + gripper.opening
+    near = obstacles[np.linalg.norm(obstacles - one.place, axis=1) < reach]
+    for step in (COARSE_STEP, 1):
+        hit = _fingers_blocked(
+            near[::step], poses[rows], openings[rows], gripper, clearance
+        )
+        rows = rows[~hit]
+
+    unseen = _unseen(tops, poses[rows], openings[rows], gripper)
+    return [
+        FreeGrasp(
+            one.number,
+            one.name,
+            poses[row],
+            float(widths[row]),
+            float(openings[row]),
+            float(share),
+            float(grasps[row].quality * (1 - share)),
+        )
+        for row, share in zip(rows.tolist(), unseen, strict=True)
+        if share <= most_unseen
+    ]
 
 
 def within_reach(
@@ -536,25 +584,50 @@ class _Measured:
         """
         points = []
         owners = []
-        for row, top in enumerate(tops):
+        for number_of_frame, top in enumerate(tops):
             depth = top.frame.depth
             owner = np.zeros(depth.shape, np.int64)
             for one in objects:
-                if row in one.pixels:
-                    owner[one.pixels[row]] = one.number
+                if number_of_frame in one.pixels:
+                    owner[one.pixels[number_of_frame]] = one.number
             shown = depth > 0
             nearest = ndimage.minimum_filter(np.where(shown, depth, np.inf), 3)
             pixel = depth / top.frame.intrinsics[0, 0]
             shown &= depth - nearest < STEEPEST_SURFACE * pixel + OBSTACLE_STEP
+            if not shown.any():
+                continue
+            usual = float(np.median(pixel[shown][::COARSE_STEP]))
+            step = max(1, int(OBSTACLE_STEP / usual / np.sqrt(FEWEST_PIXELS)))
+            rows, columns = step * np.stack(np.nonzero(shown[::step, ::step]))
             cells, own = _cells(
-                top.frame.positions(*np.nonzero(shown)), pixel[shown], owner[shown]
+                top.frame.positions(rows, columns),
+                step * pixel[rows, columns],
+                owner[rows, columns],
             )
             past = np.zeros(len(cells), bool)
-            for later in tops[row + 1 :]:
+            for later in tops[number_of_frame + 1 :]:
                 past |= _depth_behind(later, cells) > 2 * OBSTACLE_STEP
             points.append(cells[~past])
             owners.append(own[~past])
-        return cls(np.concatenate(points), np.concatenate(owners))
+        return cls(
+            np.concatenate([np.zeros((0, 3)), *points]),
+            np.concatenate([np.zeros(0, np.int64), *owners]),
+        )
+
+    def beside(self, number_of_object: int, own: Float) -> Float:
+        """Points that do not belong to an object, (M, 3).
+
+        Args:
+            number_of_object: of the object.
+            own: points on its scan, (K, 3), metres.
+        """
+        low, high = own.min(0) - OWN_PIXELS, own.max(0) + OWN_PIXELS
+        near = ((self.points > low) & (self.points < high)).all(1)
+        away, _ = cKDTree(own).query(self.points[near])
+        mine = self.owner[near] == number_of_object
+        itself = np.zeros(len(self.points), bool)
+        itself[near] = (away < OWN_SURFACE) | mine & (away < OWN_PIXELS)
+        return self.points[~itself]
 
 
 def _cells(points: Float, pixels: Floats, owner: Index) -> tuple[Float, Index]:
