@@ -43,7 +43,7 @@ PALM_STEP = 0.01  # metres between those of the palm
 STEEPEST_SURFACE = (
     4.0  # of depth along the image; what is steeper mixes an edge and its background
 )
-FEWEST_PIXELS = (
+FEWEST_CELL_PIXELS = (
     3  # of a cell that faces the camera, whose mean has less noise than a pixel
 )
 LEAST_COVERED = (
@@ -64,7 +64,7 @@ MOST_UNSEEN = (
 APPROACH = 0.10  # metres of the straight way to a grasp
 COARSE_STEP = 16  # of so many points one is tested first
 
-SURFACE_POINTS = 1000  # of a thing, tested against the gripper
+GRASPED_POINTS = 1000  # of a thing, tested against the gripper
 CONTACT_POINTS = 300  # of a thing, on which a finger may press
 APPROACHES = (
     16  # directions around the closing axis from which a pair of contacts is tried
@@ -264,7 +264,7 @@ def propose_grasps(
     number(friction, "the coefficient of friction", above=0, most=10)
     surface = Surface.from_mesh(mesh, mesh.name)
     rng = np.random.default_rng(seed)
-    points = _surface_points(surface, SURFACE_POINTS, rng)[0]
+    points = _surface_points(surface, GRASPED_POINTS, rng)[0]
     rays = embree_scene([(surface.vertices, surface.faces)])
     pairs = _contact_pairs(surface, rays, gripper, friction, rng)
     poses, widths = _around_contacts(*pairs)
@@ -597,7 +597,7 @@ class _Measured:
             if not shown.any():
                 continue
             usual = float(np.median(pixel[shown][::COARSE_STEP]))
-            step = max(1, int(OBSTACLE_STEP / usual / np.sqrt(FEWEST_PIXELS)))
+            step = max(1, int(OBSTACLE_STEP / usual / np.sqrt(FEWEST_CELL_PIXELS)))
             rows, columns = step * np.stack(np.nonzero(shown[::step, ::step]))
             cells, own = _cells(
                 top.frame.positions(rows, columns),
@@ -672,7 +672,7 @@ def _known(one: SceneObject) -> Float | None:
     if shown.vertices is None or shown.faces is None:
         return None
     surface = Surface(one.name, shown.vertices, shown.faces)
-    points, _ = _surface_points(surface, 4 * SURFACE_POINTS, np.random.default_rng(0))
+    points, _ = _surface_points(surface, 4 * GRASPED_POINTS, np.random.default_rng(0))
     return _thinned(points @ one.pose[:3, :3].T + one.pose[:3, 3], OBSTACLE_STEP)
 
 
