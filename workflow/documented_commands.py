@@ -130,7 +130,7 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"--explorer|viewers\.scene_page": "nextview[explore]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
     r"research\.train_agent": "research[rl]",
-    r"research\.arm|examples/panda": "research[arm]",
+    r"research\.arm|examples/(panda|bin_picking)": "research[arm]",
 }
 SMALL = {  # options that make a command quick
     "nextview render": "--workers 1",
@@ -148,6 +148,7 @@ SMALL = {  # options that make a command quick
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
     "python -m research.train_agent": "--steps 2000",
+    "python examples/bin_picking.py": "--parts 1",
     "python -m research.measure": "--workers 1",
     "python -m research.plan": "--workers 1",
     "python benchmarks/views.py": "--runs 2",

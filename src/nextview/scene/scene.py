@@ -12,11 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number
-from nextview.errors import ObservationError, SessionError
+from nextview.checks import did_you_mean, number, one_line
+from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import Change, changes, wrong_pose
 from nextview.scene.following import SAME_OBJECT_SHARE, assign
+from nextview.scene.grasps import (
+    GRASP_CLEARANCE,
+    MOST_UNSEEN,
+    FreeGrasp,
+    Grasp,
+    Gripper,
+    free_grasps,
+    within_reach,
+)
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import candidates
 from nextview.scene.objects import SceneObject
@@ -303,6 +312,57 @@ class Scene:
             self._state = state
             self._targets = None
             return look
+
+    def grasps(
+        self,
+        grasps: Mapping[str, Sequence[Grasp]],
+        gripper: Gripper,
+        reachable: Callable[[Float], bool] | None = None,
+        most: int | None = None,
+        clearance: float = GRASP_CLEARANCE,
+        most_unseen: float = MOST_UNSEEN,
+    ) -> list[FreeGrasp]:
+        """Find the grasps of confident objects that nothing known is in the way of.
+
+        The open gripper comes along its z axis in a straight line. It must not meet measured points
+        of other objects, walls or the support, nor the scans of other confident objects, and the
+        space between its fingers must not hold a part of another object. An object that reaches out
+        of ``region`` offers none: where that is the inside of a bin, it is a wall.
+
+        Args:
+            grasps: of each thing, by its name; see ``scene.grasps``.
+            gripper: that grasps.
+            reachable: function that returns True if the arm can bring the gripper to a pose,
+                gripper-to-world, (4, 4). The best grasps are asked first, each as it is and with
+                the fingers exchanged.
+            most: largest number of grasps; with ``reachable`` no more than these are searched for.
+            clearance: distance that fingers and palm keep from everything else, metres.
+            most_unseen: largest share of the fingers' space that no frame has shown to be empty.
+
+        Returns:
+            The grasps, the best first; [] before the first frame.
+
+        Raises:
+            UsageError: a number is out of range, or the scene knows no thing of a name.
+        """
+        known = self.system.models.classes
+        for name in grasps:
+            if name not in known:
+                what = f"grasps of {one_line(name)}, which is none of the taught things"
+                raise UsageError(f"{what}{did_you_mean(name, known)}")
+        with self._lock:
+            found = free_grasps(
+                self.objects,
+                self.tops,
+                grasps,
+                gripper,
+                clearance,
+                most_unseen,
+                self.region,
+            )
+            if reachable is not None:
+                return within_reach(found, reachable, most)
+            return found[:most]
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
         """Draw the last frame with outlines, names and axes of the poses, and a top view.
