@@ -463,7 +463,7 @@ def _shift_to_segment(
     depth = surface.shown()
     shows = np.isfinite(depth)
     points = surface.rays[shows] * depth[shows, None]
-    column, row = np.floor(top.frame.camera.project(points)).astype(np.int64).T
+    column, row = np.floor(top.frame.pinhole.project(points)).astype(np.int64).T
     over = [np.count_nonzero(mask[row, column]) for mask in segments]
     if not max(over):
         return none

@@ -204,7 +204,7 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
         return 0.0
 
     height, width = frame.shape
-    column, row = frame.camera.project(in_camera[None])[0].astype(int).tolist()
+    column, row = frame.pinhole.project(in_camera[None])[0].astype(int).tolist()
     if not (0 <= column < width and 0 <= row < height):
         return 0.0
 
