@@ -243,7 +243,7 @@ class _Surface:
         weights = 1 / (1 + (off / (reach * scale)) ** 2) / scale**2
         both_flat = flat_one & flat_two
         for kind in (both_flat, ~both_flat):
-            weights[kind] *= min(1.0, ALIKE / max(1, np.count_nonzero(met & kind)))
+            weights[kind] *= min(1.0, ALIKE / max(1, int(np.count_nonzero(met & kind))))
 
         coefficients = np.zeros((np.count_nonzero(met), MOTION * len(poses)))
         back = normals[met] @ there[:3, :3]
@@ -312,13 +312,14 @@ def _registered(
         # the first camera is the reference
         information = square[MOTION:, MOTION:] + np.diag(prior)
         towards = pull[MOTION:] - prior * motions[1:].ravel()
-        change = np.linalg.solve(information, towards).reshape(-1, MOTION)
-        for number, motion in enumerate(change, 1):
+        change = np.asarray(np.linalg.solve(information, towards), np.float64)
+        for number, motion in enumerate(change.reshape(-1, MOTION), 1):
             poses[number] = poses[number] @ _rigid(motion)
             turn = Rotation.from_matrix(poses[number, :3, :3]).as_rotvec()
             motions[number] = [*turn, *poses[number, :3, 3]]
 
-    covariances = np.linalg.inv(information).reshape(2 * (count - 1, MOTION))
+    covariances = np.asarray(np.linalg.inv(information), np.float64)
+    covariances = covariances.reshape(2 * (count - 1, MOTION))
     return [
         CameraOffset(
             names[number],

@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import InitVar, dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +29,8 @@ ASPECTS = (
     512 / 424,
     640 / 576,
 )  # width over height of uncropped images
+# tolerance of equal poses, for metres and elements of rotation matrices
+SAME_POSE = 1e-3
 CAMERA_AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -230,6 +233,25 @@ class Frame:
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
         towards = (a * x)[None, part[1]] + (b * y + c)[part[0], None]
         return self.depth[part] * towards + np.float32(direction @ pose[:3, 3] + offset)
+
+
+class PosedCamera(Protocol):
+    """A camera with a name at a pose."""
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def pose(self) -> Float | None:
+        """Camera-to-world, (4, 4); None if it is not known."""
+
+
+def one_stand(one: PosedCamera, other: PosedCamera) -> bool:
+    """Return True if one camera took two frames without moving in between."""
+    if one.camera != other.camera or one.pose is None or other.pose is None:
+        return False
+    return float(np.abs(one.pose - other.pose).max()) <= SAME_POSE
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
