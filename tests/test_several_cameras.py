@@ -1,0 +1,271 @@
+"""Several cameras at one table: names of frames, sets of frames, errors of the cameras' poses,
+folders of several cameras, and what a standing camera changes.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from pipeline import TABLE, box, pose_at, refused
+from scipy.spatial.transform import Rotation
+
+from nextview.captured.check import check_capture
+from nextview.captured.folders import read_capture
+from nextview.cli.main import main
+from nextview.errors import DatasetError, ObservationError
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
+from nextview.sensing import Frame
+from nextview.sensing.camera_offsets import camera_offsets
+from nextview.sensing.known_frames import KnownFrames
+from nextview.simulation.sensor import SENSORS
+
+SENSOR = SENSORS["stereo"]
+RAYS = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
+LEFT = pose_at(45, 20, 0.65, (0, 0, 0.04))
+RIGHT = pose_at(50, 100, 0.7, (0, 0, 0.04))
+
+
+def things(rng) -> list[trimesh.Trimesh]:
+    """Boxes and cans that stand on a table at random."""
+    found = [TABLE]
+    for k, (x, y) in enumerate(
+        [(-0.12, -0.1), (0.1, -0.11), (-0.1, 0.12), (0.13, 0.1)]
+    ):
+        size = rng.uniform(0.06, 0.14, 3)
+        thing = (
+            box(size, (0, 0, size[2] / 2))
+            if k % 2
+            else trimesh.creation.cylinder(size[0] / 2, size[2]).apply_translation(
+                (0, 0, size[2] / 2)
+            )
+        )
+        turn = trimesh.transformations.rotation_matrix(rng.uniform(0, 6.28), (0, 0, 1))
+        thing.apply_transform(turn)
+        found.append(thing.apply_translation((x, y, 0)))
+    return found
+
+
+def seen(meshes, pose, rng, camera="", told=None) -> Frame:
+    """A frame through the stereo sensor, with the pose that it was taken from or another one."""
+    caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes])
+    depth, _ = caster.cast(pose[:3, 3], RAYS @ pose[:3, :3].T)
+    clean = np.where(np.isfinite(depth), depth, 0).reshape(SENSOR.shape)
+    measured, _ = SENSOR.measure(clean.astype(np.float32), rng)
+    return Frame(
+        measured,
+        SENSOR.intrinsics,
+        pose if told is None else told,
+        pixel_centre=0.5,
+        camera=camera,
+    )
+
+
+def an_error(rng, millimetres=4.0, degrees=0.6):
+    """A rigid motion in the axes of a camera, in a random direction."""
+    turn, shift = rng.normal(size=(2, 3))
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(
+        np.radians(degrees) * turn / np.linalg.norm(turn)
+    ).as_matrix()
+    error[:3, 3] = millimetres / 1000 * shift / np.linalg.norm(shift)
+    return error
+
+
+def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
+    """Frames of several cameras; the stated poses of all but the first err."""
+    names = ("left", "right", "top")
+    found = []
+    for _ in range(count):
+        table = things(rng)
+        found.append(
+            [
+                seen(table, pose, rng, name, pose @ np.linalg.inv(error) if k else pose)
+                for k, (name, pose) in enumerate(zip(names, cameras, strict=False))
+            ]
+        )
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_error_of_a_camera_is_told(seed):
+    """4 mm and .6 degrees, within 1 mm and .15 degrees."""
+    rng = np.random.default_rng(seed)
+    error = an_error(rng)
+    (offset,) = camera_offsets(moments_of(rng, error))
+    assert offset.noticed
+    assert (offset.camera, offset.reference) == ("right", "left")
+    assert offset.millimetres == pytest.approx(4, abs=1)
+    assert offset.degrees == pytest.approx(0.6, abs=0.15)
+    np.testing.assert_allclose(offset.correction[:3, 3], error[:3, 3], atol=0.002)
+    assert str(offset).startswith("camera right is ")
+    assert "relative to camera left" in str(offset)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_cameras_are_not_reported(seed):
+    rng = np.random.default_rng(seed + 50)
+    (offset,) = camera_offsets(moments_of(rng, np.eye(4), 2))
+    assert not offset.noticed
+
+
+def test_a_third_camera_is_compared_with_all_and_one_that_sees_nothing_in_common_is_left_out():
+    rng = np.random.default_rng(7)
+    error = an_error(rng)
+    top = pose_at(80, 200, 0.7, (0, 0, 0.04))
+    away = top.copy()
+    away[:3, 3] += [9, 0, 0]
+    moments = moments_of(rng, error, 2, (LEFT, RIGHT, top))
+    both = camera_offsets(moments)
+    assert [one.camera for one in both] == ["right", "top"]
+    assert all(one.noticed for one in both)
+
+    elsewhere = [[*pair[:2], pair[2].with_pose(away)] for pair in moments[:1]]
+    assert [one.camera for one in camera_offsets(elsewhere)] == ["right"]
+
+
+def test_a_single_plane_says_nothing_of_motions_along_it():
+    """Only height and tilt are seen; the uncertainty says so."""
+    rng = np.random.default_rng(3)
+    pair = [seen([TABLE], LEFT, rng, "left"), seen([TABLE], RIGHT, rng, "right")]
+    (offset,) = camera_offsets([pair])
+    assert not offset.noticed
+    assert offset.uncertainty[0] > 5
+
+
+# A known world
+
+
+def test_cameras_are_named_by_text():
+    with pytest.raises(ObservationError, match="the name of a camera is text, not 3"):
+        Frame(
+            np.ones((20, 20)),
+            np.array([[20, 0, 10], [0, 20, 10], [0, 0, 1.0]]),
+            camera=3,
+        )
+
+
+def test_an_error_of_a_camera_is_a_warning_that_leaves_names_confident():
+    rng = np.random.default_rng(1)
+    ((left, right),) = moments_of(rng, an_error(rng, 12, 1.5), 1)
+    found = KnownFrames((left,), (None,)).check(right, None)
+    assert [warning.name for warning in found] == ["camera"]
+    assert not found[0].holds
+    assert "camera right is " in found[0].message
+    assert KnownFrames((left,), (None,)).check(replace_name(right, ""), None) == []
+
+
+def replace_name(frame, name):
+    """The same frame of a camera with another name."""
+    other = frame.with_depth(frame.depth)
+    object.__setattr__(other, "camera", name)
+    return other
+
+
+def test_a_camera_with_a_name_may_stand_still_while_the_scene_changes():
+    """Without a name the pose may be an old one."""
+    rng = np.random.default_rng(2)
+    before = seen([TABLE], LEFT, rng)
+    after = seen([TABLE, box((0.3, 0.3, 0.3), (0, 0, 0.15))], LEFT, rng)
+    known = KnownFrames((before,), (None,))
+    assert [warning.name for warning in known.check(after, None)] == ["stale pose"]
+
+    left = replace_name(before, "left")
+    named = KnownFrames((left,), (None,))
+    assert named.stands(replace_name(after, "left"))
+    assert named.check(replace_name(after, "left"), None) == []
+    # once it has moved, it may have an old pose
+    moved = KnownFrames(
+        (replace_name(seen([TABLE], RIGHT, rng), "left"), left), (None, None)
+    )
+    found = moved.check(replace_name(after, "left"), None)
+    assert [warning.name for warning in found] == ["stale pose"]
+
+
+# A folder
+
+
+def write_rig(folder, moments):
+    """A folder with one folder for each camera."""
+    for number, frames in enumerate(moments):
+        for frame in frames:
+            own = folder / frame.camera
+            (own / "depth").mkdir(parents=True, exist_ok=True)
+            steps = np.rint(1e4 * frame.depth).astype(np.uint16)
+            Image.fromarray(steps).save(own / f"depth/{number:06d}.png")
+            np.savetxt(own / "pose.txt", frame.pose)
+            k = frame.intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+            camera = {"fx": k[0, 0], "fy": k[1, 1], "ppx": k[0, 2], "ppy": k[1, 2]}
+            camera |= {"depth_scale": 1e-4}
+            (own / "intrinsics.json").write_text(json.dumps(camera))
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """A folder of two cameras, of which the right one errs, and its frames."""
+    folder = tmp_path_factory.mktemp("rigs") / "rig"
+    rng = np.random.default_rng(11)
+    moments = moments_of(rng, an_error(rng), 4)
+    write_rig(folder, moments)
+    return folder, moments
+
+
+def test_a_folder_of_several_cameras_is_read(rig):
+    folder, moments = rig
+    capture = read_capture(folder)
+    assert capture.layout == "several cameras"
+    assert capture.cameras == ("left", "right")
+    assert capture.stands
+    assert [frame.name for frame in capture.frames[:2]] == [
+        "left/000000",
+        "left/000001",
+    ]
+    assert [[one.camera for one in together] for together in capture.moments] == [
+        ["left", "right"]
+    ] * 4
+    for together, given in zip(capture.moments, moments, strict=True):
+        for captured, frame in zip(together, given, strict=True):
+            read = captured.read()
+            assert read.camera == frame.camera
+            np.testing.assert_allclose(read.pose, frame.pose, atol=1e-6)
+            np.testing.assert_allclose(read.intrinsics, frame.intrinsics)
+            np.testing.assert_allclose(read.depth, frame.depth, atol=1e-4)
+    # the scene changed between the moments, which is no contradiction
+    usable, refused_frames = check_capture(capture)
+    assert len(usable.frames) == 8
+    assert refused_frames == {}
+
+
+def test_check_tells_the_error_of_a_camera(rig, capsys):
+    folder, _ = rig
+    main(["check", str(folder)])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "8 frames contradict each other nowhere" in said
+    _, told = said.split("camera right is ")
+    millimetres, degrees = (
+        told.split(" mm and ")[0],
+        told.split(" mm and ")[1].split()[0],
+    )
+    assert float(millimetres) == pytest.approx(4, abs=1)
+    assert float(degrees) == pytest.approx(0.6, abs=0.15)
+
+
+def test_a_pose_in_another_world_is_refused(rig, tmp_path):
+    _, moments = rig
+    turned = trimesh.transformations.rotation_matrix(0.5, (1, 0, 0))
+    wrong = [[left, right.with_pose(right.pose @ turned)] for left, right in moments]
+    write_rig(tmp_path / "rig", wrong)
+    with pytest.raises(
+        DatasetError, match="is the pose of a camera that of another one"
+    ):
+        check_capture(read_capture(tmp_path / "rig"))
+
+
+def test_a_camera_without_a_pose_is_refused(rig, tmp_path, capsys):
+    _, moments = rig
+    write_rig(tmp_path / "rig", moments[:1])
+    (tmp_path / "rig/left/pose.txt").unlink()
+    said = refused(capsys, "check", tmp_path / "rig")
+    assert "the pose of camera left is missing" in said
