@@ -3,24 +3,45 @@ folders of several cameras, and what a standing camera changes.
 """
 
 import json
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 from pipeline import TABLE, box, pose_at, refused
+from ros_messages import (
+    CAMERA_INFO,
+    DEPTH,
+    header,
+    image_message,
+    info_message,
+    tf_message,
+    transform_message,
+    write_bag,
+)
 from scipy.spatial.transform import Rotation
+from small_tables import camera_over, meshes_of, view
 
+import nextview
 from nextview.captured.check import check_capture
 from nextview.captured.folders import read_capture
+from nextview.captured.still_moments import still_moments
 from nextview.cli.main import main
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
-from nextview.sensing import Frame
+from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.known_frames import KnownFrames
 from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "workflow"))
+import documented_commands
 
 SENSOR = SENSORS["stereo"]
 RAYS = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
@@ -269,3 +290,179 @@ def test_a_camera_without_a_pose_is_refused(rig, tmp_path, capsys):
     (tmp_path / "rig/left/pose.txt").unlink()
     said = refused(capsys, "check", tmp_path / "rig")
     assert "the pose of camera left is missing" in said
+
+
+# A camera that stands still
+
+
+def recording(folder, moments, step=0.5):
+    """A bag of a standing camera that takes these frames, one each half a second."""
+    start = 1_700_000_000.0
+    stand = transform_message(moments[0].pose, "optical", 0.0, "base")
+    said = [("/tf_static", start, tf_message(stand))]
+    k = moments[0].intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    for number, frame in enumerate(moments):
+        stamped = header("optical", start + step * number)
+        image = image_message(frame.depth, "32FC1", header=stamped)
+        info = info_message(k, frame.shape, header=stamped)
+        said.append((DEPTH, start + step * number, image))
+        said.append((CAMERA_INFO, start + step * number, info))
+    return write_bag(folder, said)
+
+
+def hand(x, y):
+    """Something that reaches over the table."""
+    return box((0.1, 0.5, 0.06), (x, y + 0.2, 0.15))
+
+
+def test_moments_are_those_at_which_the_scene_stands_still_and_has_changed(tmp_path):
+    rng = np.random.default_rng(5)
+    carton = box((0.08, 0.06, 0.1), (0, 0, 0.05))
+    nudged = box((0.08, 0.06, 0.1), (0.02, 0, 0.05))
+    scenes = [
+        [TABLE],
+        [TABLE],
+        [TABLE, hand(0.1, 0)],
+        [TABLE, carton, hand(0, 0)],
+        [TABLE, carton],
+        [TABLE, carton],
+        [TABLE, nudged],
+        [TABLE, nudged],
+        [TABLE, hand(0.02, 0.1)],
+        [TABLE],
+    ]
+    bag = recording(tmp_path / "bag", [seen(scene, LEFT, rng) for scene in scenes])
+    moments = still_moments(read_capture(bag))
+    assert [captured.name for (captured,) in moments] == [
+        "0.000",
+        "2.000",
+        "3.000",
+        "4.500",
+    ]
+
+
+def test_a_scene_takes_the_frames_of_a_standing_camera_over_time(tmp_path, capsys):
+    """A can comes, a box is moved and goes away; the names and the poses are those of the truth."""
+    meshes = meshes_of(["cracker_box", "tomato_soup_can"])
+    poses = {"cracker_box": (-0.1, 0.02), "tomato_soup_can": (0.1, -0.05)}
+
+    def table(**places):
+        things = []
+        for name, (x, y) in places.items():
+            metres = meshes[name].vertices * meshes[name].radius + meshes[name].centre
+            pose = np.eye(4)
+            pose[:3, 3] = x, y, -metres[:, 2].min()
+            things.append(PlacedThing(name, metres, meshes[name].faces, pose))
+        return SimulatedTable(tuple(things))
+
+    box_only = {"cracker_box": poses["cracker_box"]}
+    moved = poses | {"cracker_box": (-0.06, 0.1)}
+    can_only = {"tomato_soup_can": poses["tomato_soup_can"]}
+    camera = TableCamera(table(**box_only), SENSOR, np.random.default_rng(1))
+    frames = []
+    for places in (box_only, poses, moved, can_only):
+        camera.change(table(**places))
+        frames += [camera.frame(view(20)) for _ in range(2)]
+
+    bag = recording(tmp_path / "bag", frames)
+    main(["look", str(bag), "--json", "--up", "z"])
+    told = json.loads(capsys.readouterr().out)
+    looks = told["frames"]
+    assert [look["name"] for look in looks] == ["0.000", "1.000", "2.000", "3.000"]
+    assert all(look["taken"] for look in looks)
+    assert [look["appeared"] for look in looks] == [[1], [2], [], []]
+    (move,) = looks[2]["moved"]
+    assert move["number"] == 1
+    way = np.array(move["after"])[:3, 3] - np.array(move["before"])[:3, 3]
+    np.testing.assert_allclose(way, [0.04, 0.08, 0], atol=0.005)
+    assert looks[3]["gone"] == [1]
+    (left,) = told["objects"]
+    assert left["name"] == "tomato_soup_can"
+    assert left["confident"]
+
+    main(["look", str(bag), "--at", "1.2", "--up", "z"])
+    said = capsys.readouterr()
+    assert "its image at 1.500 s is used" in " ".join(said.err.split())
+    assert "cracker_box" in said.out
+
+
+# Sets of frames
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two cameras' frames of a box and a can, of which the second pose errs by 3 mm."""
+    meshes = meshes_of(["cracker_box", "tomato_soup_can"])
+    camera = camera_over(list(meshes.values()), 2)
+    poses = view(20), view(110)
+    left, right = (camera.frame(pose) for pose in poses)
+    stated = poses[1].copy()
+    stated[:3, 3] += [0.002, -0.002, 0.001]
+    return (
+        replace_name(left, "left"),
+        replace_name(right.with_pose(stated), "right"),
+        camera.truth,
+    )
+
+
+def test_a_scene_takes_frames_of_both_cameras_together(pair):
+    left, right, truth = pair
+    scene = nextview.Scene("ycb")
+    looks = scene.update([left, right])
+    assert [look.taken for look in looks] == [True, True]
+    assert scene.frames == (left, right)
+    for thing in scene.objects:
+        assert thing.confident
+        # the mean of both cameras is off by half of the error
+        centre = (thing.pose @ [0, 0, 0, 1])[:3]
+        np.testing.assert_allclose(centre, truth[thing.name][:3, 3], atol=0.008)
+    assert {thing.name for thing in scene.objects} == set(truth)
+
+
+def test_frames_enter_together_or_not_at_all(pair):
+    left, right, _ = pair
+    scene = nextview.Scene("ycb")
+    lost = Frame(right.depth, SENSOR.intrinsics, camera="right")
+    with pytest.raises(ObservationError):
+        scene.update([left, lost])
+    assert scene.frames == ()
+
+    session = nextview.load("ycb").session(object=ObservedObject(point=(0, 0, 0.05)))
+    with pytest.raises(ObservationError):
+        session.update([left, lost])
+    assert session.views == []
+    assert session.object.sightings == ()
+    alone = nextview.load("ycb").session(object=ObservedObject(point=(0, 0, 0.05)))
+    np.testing.assert_array_equal(
+        session.update(left).belief,
+        alone.update(left).belief,
+    )
+
+
+def test_a_session_takes_frames_of_both_cameras_until_it_ends(pair):
+    left, right, truth = pair
+    name, pose = next(iter(truth.items()))
+    thing = ObservedObject(point=pose[:3, 3])
+    session = nextview.load("ycb", threshold=1.0).session(object=thing)
+    views = session.update([left, right])
+    assert len(views) == len(session.views) == 2
+    assert session.result.answer == name
+
+    quick = nextview.load("ycb", max_views=1).session(
+        object=ObservedObject(point=pose[:3, 3])
+    )
+    assert len(quick.update([left, right])) == 1
+    assert quick.done
+
+
+def test_the_examples_of_the_page_run(capsys):
+    page = "docs/several_cameras.md"
+    names: dict = {}
+    exec(documented_commands.BEFORE[page], names)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
+    for block in blocks:
+        exec(block, names)
+    assert {thing.name for thing in names["scene"].objects} == {"mug", "mustard_bottle"}
+    assert len(names["look"].gone) == 1
+    assert names["look"].moved == ()
+    assert "camera right is" in capsys.readouterr().out

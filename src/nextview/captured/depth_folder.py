@@ -44,7 +44,7 @@ CAMERA_FILES = (
 CAMERA_TABLES = ("cam_K.txt", "intrinsics.txt")  # contain only a pinhole matrix
 POSES = ("poses", "pose")
 ONE_POSE = "pose.txt"  # of a camera that stands still
-NO_POSE = "no pose: the camera is the world"
+CAMERA_IS_WORLD = "no pose: the camera is the world"
 MASKS = ("masks", "mask")
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
@@ -94,7 +94,7 @@ def read_camera_folders(
     views = LayoutViews([], [], z_is_up=False)
     for path in camera_folders(folder):
         own = read_depth_folder(path, given, scale)
-        if any(note == NO_POSE for note in own.notes):
+        if any(note == CAMERA_IS_WORLD for note in own.notes):
             raise DatasetError(
                 f"{path}: the pose of camera {path.name} is missing, in the world of the other"
                 " cameras: put it into pose.txt, or poses of its images into poses/NAME.txt"
@@ -240,7 +240,7 @@ def _poses(
         return *_in_order(log, _log(log), names), "poses of trajectory.log"
 
     if len(names) == 1:
-        return {names[0]: np.eye(4)}, {}, NO_POSE
+        return {names[0]: np.eye(4)}, {}, CAMERA_IS_WORLD
     raise DatasetError(
         f"{folder}: has {len(names)} depth images and no poses of their camera: put them into"
         " poses/NAME.txt, poses.json or trajectory.log, or that of a camera that stands still into"

@@ -71,7 +71,7 @@ class Reading:
         depth_scale: metres per unit of the depth images; 0.001 for millimetres.
         depth_topic: of a ROS 2 bag with several depth topics.
         world_frame: of a ROS 2 bag: tf frame of the world, z up; by default the root of the tree.
-        at: of a ROS 2 bag of a static camera: image to use; see ``read_bag``.
+        at: of a ROS 2 bag of a static camera: image to use; by default all, see ``read_bag``.
     """
 
     intrinsics: Intrinsics = None
@@ -195,7 +195,7 @@ def _layout_of(path: Path) -> str:
     if _cloud_files(path):
         return CLOUDS
     if camera_folders(path):
-        return CAMERAS
+        return SEVERAL_CAMERAS
     raise DatasetError(_no_capture(path))
 
 
@@ -413,7 +413,7 @@ LAYOUT_MARKS = {  # a file that identifies each layout
     "GraspNet": "meta/*.mat",
 }
 DEPTH_FOLDER = "depth folder"
-CAMERAS = "several cameras"
+SEVERAL_CAMERAS = "several cameras"
 ONE_IMAGE = "depth image"
 CLOUDS = "PCD"
 BAG = "ROS 2 bag"
@@ -480,7 +480,7 @@ FOLDER_LAYOUTS: dict[
         camera,
         how.depth_scale,
     ),
-    CAMERAS: lambda path, camera, how: read_camera_folders(
+    SEVERAL_CAMERAS: lambda path, camera, how: read_camera_folders(
         path,
         camera,
         how.depth_scale,

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -218,6 +218,16 @@ class Capture:
         several = len(self.cameras) > 1
         order = sorted(together) if several else list(together)
         return tuple(tuple(together[name]) for name in order)
+
+    @property
+    def at_one_moment(self) -> "Capture":
+        """The frames of the first moment, if cameras stand still; otherwise all."""
+        if not self.stands or len(self.moments) == 1:
+            return self
+        first = self.moments[0]
+        names = ", ".join(frame.name for frame in first)
+        note = f"cameras that stand still show an object at one moment: {names} is used"
+        return replace(self, frames=first, notes=(*self.notes, note))
 
     def __repr__(self) -> str:
         count = "1 frame" if len(self.frames) == 1 else f"{len(self.frames)} frames"

@@ -30,7 +30,6 @@ from nextview.sensing.displacement import (
     FURTHER,
     OUTLINE_PITCHES,
     PLANE_ERROR,
-    REACHES,
     RELATIVE_DEPTH_ERROR,
     SAME_SIDE,
 )
@@ -40,7 +39,12 @@ from nextview.sensing.planes import Plane, find_plane, sample
 from nextview.sensing.sighting import sighting_of
 from nextview.types import Float, Index, Mask
 
-COMPARED_POINTS = 4000  # points of a frame that are compared with each other frame
+# Standard deviations at which the weight of a distance is a quarter, in each step, and beyond which
+# it is 0. They end lower than those of a single object: of the many points of a whole frame those
+# that agree best may decide, and wrong pairs, at edges, are many too.
+CAMERA_REACHES = (4.0, 2.5, 1.0, 0.5, 0.3)
+FARTHEST_PAIR = 2.0
+WHOLE_POINTS = 4000  # points of a frame that are compared with each other frame
 STEPS_PER_REACH = 3  # more than for an object, as a camera also turns
 FALSE_ALARMS = 0.001  # share of exact cameras that are reported
 MOTION = 6  # unknowns of a camera: rotation vector and translation
@@ -186,7 +190,7 @@ class _Surface:
             flat |= on
 
         kinds = [np.flatnonzero(flat == kind) for kind in (False, True)]
-        few = [rows[:: 1 + len(rows) // COMPARED_POINTS] for rows in kinds]
+        few = [rows[:: 1 + len(rows) // WHOLE_POINTS] for rows in kinds]
         return cls(
             camera=camera,
             pose=pose,
@@ -212,7 +216,7 @@ class _Surface:
             other: the surface of the other frame.
             poses: corrections of the poses of all cameras, (C, 4, 4).
             further: additional tolerance of the points, metres.
-            reach: standard deviations at which a distance has half its weight.
+            reach: standard deviations at which a distance has a quarter of its weight.
         """
         here = self.pose @ poses[self.camera]
         there = np.linalg.inv(here) @ other.pose @ poses[other.camera]
@@ -237,10 +241,10 @@ class _Surface:
             other.deviations[other.compared],
         )
         scale = np.hypot(deviations, further)
-        met = ahead & (away < self.reach) & (np.abs(off) < NOISE_TOLERANCE * scale)
+        met = ahead & (away < self.reach) & (np.abs(off) < FARTHEST_PAIR * scale)
         met &= np.einsum("ni,ni->n", one, two) > SAME_SIDE
 
-        weights = 1 / (1 + (off / (reach * scale)) ** 2) / scale**2
+        weights = 1 / (1 + (off / (reach * scale)) ** 2) ** 2 / scale**2
         both_flat = flat_one & flat_two
         for kind in (both_flat, ~both_flat):
             weights[kind] *= min(1.0, ALIKE / max(1, int(np.count_nonzero(met & kind))))
@@ -297,13 +301,13 @@ def _registered(
     information = np.diag(prior)
     met = np.zeros(count, np.int64)
 
-    for step in np.repeat(np.arange(len(REACHES)), STEPS_PER_REACH):
+    for step in np.repeat(np.arange(len(CAMERA_REACHES)), STEPS_PER_REACH):
         further = FURTHER[step] * FARTHEST_SHIFT * CAMERA_PLACE
         square = np.zeros((MOTION * count, MOTION * count))
         pull = np.zeros(MOTION * count)
         met[:] = 0
         for one, other in pairs:
-            rows = one.equations(other, poses, further, REACHES[step])
+            rows = one.equations(other, poses, further, CAMERA_REACHES[step])
             weighted = rows.coefficients.T * rows.weights
             square += weighted @ rows.coefficients
             pull += weighted @ rows.distances
