@@ -200,8 +200,9 @@ def test_one_of_several_topics_is_named_and_the_world_too(tmp_path):
         read_capture(bag)
     capture = read_capture(bag, depth_topic=DEPTH, world_frame="tool")
     # in the link's own frame the camera does not move
-    assert len(capture.frames) == 1
-    np.testing.assert_allclose(capture.frames[0].pose, MOUNTED, atol=1e-6)
+    assert capture.stands
+    for frame in capture.frames:
+        np.testing.assert_allclose(frame.pose, MOUNTED, atol=1e-6)
 
 
 def standing(times):
@@ -210,15 +211,24 @@ def standing(times):
     return [("/tf_static", START, tf_message(stand)), *images_at(times)]
 
 
-def test_a_static_camera_gives_one_image_with_up_from_its_plane(tmp_path):
+def test_a_static_camera_gives_all_images_with_up_from_its_plane(tmp_path):
     bag = write_bag(tmp_path / "bag", standing([1.0, 1.1, 1.2]))
     capture = read_capture(bag)
-    assert len(capture.frames) == 1
+    assert [frame.name for frame in capture.frames] == ["1.000", "1.100", "1.200"]
+    assert {frame.camera for frame in capture.frames} == {"optical"}
+    assert capture.stands
     assert capture.up is None
     assert any(
-        note.startswith("tf does not move the camera: its image at 1.000 s is used")
+        note.startswith("tf does not move the camera (one image: --at first")
         for note in capture.notes
     )
+    # the images differ everywhere, and no pose can be the reason
+    usable, left_out = check_capture(capture)
+    assert (len(usable.frames), left_out) == (3, {})
+    # an object is recognised at one moment
+    one = capture.at_one_moment
+    assert [frame.name for frame in one.frames] == ["1.000"]
+    assert "show an object at one moment: 1.000 is used" in one.notes[-1]
     # who names the frame says that its z axis is up
     assert read_capture(bag, world_frame="camera_link").up == (0, 0, 1)
 
@@ -234,7 +244,8 @@ def test_the_image_of_a_standing_camera_can_be_chosen(
     monkeypatch.setattr(bag_reader, "MOST_FRAMES", most)
     times = [1.0, 2.5, 4.0, 5.5, 7.0, 7.2]
     bag = write_bag(tmp_path / "bag", standing(times))
-    chosen = {None: 0, "first": 0, "last": 5, 0: 0, 2.5: 1, 2.6: 2, 7.1: 5}
+    assert len(read_capture(bag).frames) == min(most, 6)
+    chosen = {"first": 0, "last": 5, 0: 0, 2.5: 1, 2.6: 2, 7.1: 5}
     for at, number in chosen.items():
         capture = read_capture(bag, at=at)
         (captured,) = capture.frames

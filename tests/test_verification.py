@@ -212,6 +212,23 @@ def test_camera_position_errors_are_separated_from_the_object_pose():
     assert likely[0] > best[0] - 0.3
 
 
+@pytest.mark.parametrize("frames", [1, 4])
+def test_frames_of_a_standing_camera_share_its_error(frames):
+    """However many it takes, the thing is in the middle of what two cameras say."""
+    mesh = l_block()
+    one, other, _ = views_of(mesh, 0.5)
+    error = np.array([0.004, -0.003, 0.002])
+    views = [displaced(one, error)] * frames + [other]
+    found, poses, _ = aligned(mesh, views, np.array([0.4]))
+    true = true_pose(mesh, 0.5)
+    true[:3, 3] += error / 2
+    assert off_by(poses[0], true, mesh.centre)[1] < 0.7
+    np.testing.assert_array_equal(
+        found.cameras[0, :frames], np.tile(found.cameras[0, 0], (frames, 1))
+    )
+    np.testing.assert_allclose(found.cameras[0, 0], error / 2, atol=0.0007)
+
+
 def test_a_missing_handle_lowers_the_likelihood():
     caster = SurfaceCaster(
         [Surface.from_mesh(cup(handle), str(handle)) for handle in (True, False)]

@@ -85,6 +85,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |python3.11 ros2|export AMENT_PREFIX)": (
         "needs ROS 2; make test-ros runs the node, and the first steps of its page"
     ),
+    r"my_rig": (
+        "needs frames of several cameras; tests/test_several_cameras.py writes such and checks them"
+    ),
     r"my_(recordings?|folder)": (
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
     ),
@@ -152,6 +155,7 @@ SMALL = {  # options that make a command quick
     "python -m research.measure": "--workers 1",
     "python -m research.plan": "--workers 1",
     "python benchmarks/views.py": "--runs 2",
+    "python benchmarks/fixed_cameras.py": "--seeds 100 101 --moments 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--scenes \d+": "--scenes 4",
@@ -228,6 +232,40 @@ class Camera:
 
 camera = Camera()
 intrinsics = table.sensor.intrinsics
+"""
+    ),
+    "docs/several_cameras.md": (
+        """
+from types import SimpleNamespace
+
+import numpy as np
+
+from nextview.geometry.mesh import make_mesh
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.things.memory import open_memory
+
+card, memory = open_memory("ycb")
+names = [thing.name for thing in card.memory.things]
+
+
+def mesh_of(name):
+    surface = memory.surfaces.surface(names.index(name), name)
+    return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
+
+
+rng = np.random.default_rng(4)
+meshes = [mesh_of(name) for name in ("cracker_box", "mug", "mustard_bottle")]
+upright = SimulatedTable.draw(meshes, rng, resting=lambda mesh: np.eye(3)[None])
+camera = TableCamera(upright, SENSORS["stereo"], rng)
+intrinsics = camera.sensor.intrinsics
+poses = poses_around(np.radians([30, 110]), np.radians(45), 0.65, np.zeros(3))
+left, right = (
+    SimpleNamespace(depth=camera.frame(pose).depth, intrinsics=intrinsics, pose=pose)
+    for pose in poses
+)
+camera.change(SimulatedTable(upright.things[1:]))
+later = SimpleNamespace(depth=camera.frame(poses[0]).depth)
 """
     ),
     "docs/see_it.md": "import nextview",

@@ -9,7 +9,7 @@ import os
 import weakref
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -50,6 +50,9 @@ if TYPE_CHECKING:
 ENDINGS = (".mcap", ".db3")
 OLD_ENDING = ".bag"  # of ROS 1
 METADATA = "metadata.yaml"
+STANDING_CAMERA = (
+    "tf does not move the camera (one image: --at first, --at last, --at SECONDS)"
+)
 MOST_FRAMES = 120  # largest number of frames used, evenly spread in time
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -66,7 +69,7 @@ LARGEST_METADATA = 2**24  # bytes of metadata.yaml
 LARGEST_BAG_CHUNK = 2**28
 # nanoseconds, first interval in which the last image is searched; doubled until one is found
 FIRST_REACH = 1_000_000_000
-# image of a static camera: first, last, or seconds after the bag's first message
+# image of a static camera: first, last, or seconds after the bag's first message; None for all
 At = Literal["first", "last"] | float | None
 
 
@@ -94,9 +97,9 @@ def read_bag(
         intrinsics: pinhole matrix, (3, 3), pixels; by default from camera_info.
         depth_topic: topic of the depth images, if there are several.
         world_frame: tf frame of the world, z up; by default the root of the camera's tf tree.
-        at: image to use if the camera is static, as frames of a static camera cannot be
-            distinguished from frames of a changing scene: the first, the last, or the first one
-            after a number of seconds since the bag's first message. The first by default.
+        at: image to use if the camera is static: the first, the last, or the first one after a
+            number of seconds since the bag's first message. By default all of them, as for a camera
+            that moves; the scene may then change, and the frames have the name of the camera.
 
     Raises:
         DatasetError: the bag is damaged, or lacks depth images, camera_info or transforms.
@@ -126,11 +129,14 @@ def read_bag(
         )
 
     notes = [f"depth of {topic.topic}", f"poses of {camera} in {world} by tf"]
-    if topic.msgcount > len(images) and tree.moves(camera, world):
+    stands = not tree.moves(camera, world)
+    if topic.msgcount > len(images) and at is None:
         notes.append(f"{len(images)} of {topic.msgcount} images, evenly spread")
-    if not tree.moves(camera, world):
+    if stands and at is not None:
         images = [_image_at(bag, topic, images, at)]
-        notes.append(_which_image(images[0], topic, at))
+        notes.append(f"its image at {images[0].name} s is used")
+    elif stands:
+        notes.append(STANDING_CAMERA)
     elif at is not None:
         raise UsageError(
             f"{path}: tf moves its camera, so all images are used; --at is for one that stands"
@@ -144,9 +150,11 @@ def read_bag(
     views = LayoutViews(
         [],
         notes,
-        z_is_up=world_frame is not None or tree.moves(camera, world),
+        z_is_up=world_frame is not None or not stands,
     )
     lost = _add_frames(views, images, tree, world, intrinsics, first.size)
+    if stands:
+        views.frames = [replace(frame, camera=camera) for frame in views.frames]
     if lost:
         notes.append(f"{lost} images have no pose in tf and are left out")
     if not views.frames and not views.unreadable:
@@ -541,7 +549,7 @@ def _image_at(
         DatasetError: there is no image from that time on.
         UsageError: the time is invalid.
     """
-    if at is None or at == "first":
+    if at == "first":
         return images[0]
     if at == "last":
         return _last_image(bag, topic, images)
@@ -575,14 +583,6 @@ def _last_image(
         if start == bag.start:
             return images[-1]
         reach *= 2
-
-
-def _which_image(image: RecordedImage, topic: "Connection", at: At) -> str:
-    """Return a note that names the image used for a static camera."""
-    said = f"tf does not move the camera: its image at {image.name} s is used"
-    if topic.msgcount == 1 or at is not None:
-        return said
-    return f"{said}, the first of {topic.msgcount} (others: --at last, --at SECONDS)"
 
 
 def _recorded(bag: Bag, topic: "Connection", time: int, message: Any) -> RecordedImage:

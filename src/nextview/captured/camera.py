@@ -49,7 +49,8 @@ class CapturedCamera:
     and the next nearest one answers.
 
     Args:
-        capture: captured views, which are checked first, see ``check_capture``.
+        capture: captured views, which are checked first, see ``check_capture``. Of cameras that
+            stand still, those of the first moment are used, as the scene may change.
         up: against gravity, world, (3,); by default from the layout, or the normal of the support
             plane.
         point: near the object, world, metres, (3,); by default the largest object on the support
@@ -83,6 +84,7 @@ class CapturedCamera:
         life_size: bool = True,
     ) -> None:
         self._masked = point is None and box is None
+        capture = capture.at_one_moment
         self._total = len(capture.frames) + len(capture.unreadable)
         self.capture, self.left_out = check_capture(capture, self._masked)
         self.taken: list[TakenView] = []

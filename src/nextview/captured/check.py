@@ -67,6 +67,15 @@ def check_capture(
         with_mask = [i for i, frame in enumerate(frames) if frame.mask is not None]
         compared = compared[with_mask]
         frames = [frames[i] for i in with_mask]
+    if (
+        capture.stands
+    ):  # the scene may have changed, except between frames taken together
+        together = {frame.name for frame in max(capture.moments, key=len)}
+        kept = [
+            i for i, row in enumerate(compared) if capture.frames[row].name in together
+        ]
+        compared = compared[kept]
+        frames = [frames[i] for i in kept]
     if len(frames) > 1:
         refused |= _contradicting(capture, compared, frames)
         refuse_many(capture, refused, len(capture.frames) + len(capture.unreadable))
@@ -111,10 +120,7 @@ def _read_some(
     refused: dict[str, str],
 ) -> tuple[np.ndarray, list[Frame]]:
     """Read evenly spread frames; unreadable ones are added to ``refused``."""
-    count = len(capture.frames)
-    spread = np.unique(
-        np.linspace(0, count - 1, min(count, MOST_COMPARED_FRAMES)).astype(int)
-    )
+    spread = _evenly_spread(capture)
     indices = []
     frames = []
 
@@ -130,6 +136,22 @@ def _read_some(
                 frames.append(frame)
 
     return np.array(indices, int), frames
+
+
+def _evenly_spread(capture: Capture) -> list[int]:
+    """Return the indices of frames that are evenly spread over the capture.
+
+    Those that were taken together stay together.
+    """
+    moments = capture.moments
+    most = max(1, MOST_COMPARED_FRAMES // len(capture.cameras))
+    few = np.unique(
+        np.linspace(0, len(moments) - 1, min(len(moments), most)).astype(int)
+    )
+    names = {frame.name for k in few for frame in moments[k]}
+    if capture.stands:
+        names |= {frame.name for frame in max(moments, key=len)}
+    return [i for i, frame in enumerate(capture.frames) if frame.name in names]
 
 
 def _read(captured: CapturedFrame, masked: bool) -> Frame | None:
@@ -293,7 +315,9 @@ def _unexplained(
     problem += "show in common is contradicted), and no usual mistake explains it"
     hint = "are the poses of another recording, or did the object move in between?"
     first = _break(evidence.standing)
-    if first:
+    if len(capture.cameras) > 1:
+        hint = "is the pose of a camera that of another one, or in another world?"
+    elif first:
         name = capture.frames[compared[first]].name
         hint = (
             f"the frames from {name} on contradict those before: did the object or the camera's"

@@ -3,7 +3,8 @@
 Depth images are ``depth/NAME.png``; the intrinsics are in one of ``CAMERA_FILES``. Optional are
 ``color/NAME.png`` or .jpg of the same size, ``masks/NAME.png``, and camera-to-world poses in
 metres: a file ``poses/NAME.txt`` for each image, ``poses.json`` (matrices by name, or a list in the
-order of the images), or ``trajectory.log`` (Open3D).
+order of the images), ``trajectory.log`` (Open3D), or ``pose.txt`` with the only pose of a camera
+that stands still. The folders of several cameras are in one folder, by the names of the cameras.
 """
 
 from dataclasses import replace
@@ -42,6 +43,8 @@ CAMERA_FILES = (
 )
 CAMERA_TABLES = ("cam_K.txt", "intrinsics.txt")  # contain only a pinhole matrix
 POSES = ("poses", "pose")
+ONE_POSE = "pose.txt"  # of a camera that stands still
+CAMERA_IS_WORLD = "no pose: the camera is the world"
 MASKS = ("masks", "mask")
 COLOUR_FOLDERS = ("color", "colour", "rgb")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
@@ -62,6 +65,48 @@ def is_depth_folder(folder: Path) -> bool:
     if (folder / "mask_visib").is_dir():
         return False
     return next(folder.glob("depth/*.png"), None) is not None
+
+
+def camera_folders(folder: Path) -> list[Path]:
+    """Return the folders of depth images of several cameras in a folder, by name."""
+    found = [
+        path for path in folder.iterdir() if path.is_dir() and is_depth_folder(path)
+    ]
+    scenes = [path for path in found if (path / "scene_camera.json").exists()]
+    return sorted(found) if len(found) > 1 and not scenes else []
+
+
+def read_camera_folders(
+    folder: Path,
+    given: CameraFile | None,
+    scale: float | None,
+) -> LayoutViews:
+    """Read the folders of depth images of several cameras, whose poses are in one world.
+
+    Args:
+        folder: see ``camera_folders``.
+        given: camera that replaces those of the folders.
+        scale: metres per unit of the images, which replaces those of the folders.
+
+    Raises:
+        DatasetError: as of ``read_depth_folder``; or the poses of a camera are missing.
+    """
+    views = LayoutViews([], [], z_is_up=False)
+    for path in camera_folders(folder):
+        own = read_depth_folder(path, given, scale)
+        if any(note == CAMERA_IS_WORLD for note in own.notes):
+            raise DatasetError(
+                f"{path}: the pose of camera {path.name} is missing, in the world of the other"
+                " cameras: put it into pose.txt, or poses of its images into poses/NAME.txt"
+            )
+        views.frames += [
+            replace(frame, name=f"{path.name}/{frame.name}", camera=path.name)
+            for frame in own.frames
+        ]
+        for name, reason in own.unreadable.items():
+            views.unreadable[f"{path.name}/{name}"] = reason
+        views.notes.append(f"camera {path.name}: {', '.join(own.notes)}")
+    return views
 
 
 def read_depth_folder(
@@ -101,16 +146,16 @@ def read_depth_folder(
         colour = _beside(folder, COLOUR_FOLDERS, path.stem)
         if colour is not None and not _same_size(colour, depth):
             colour = None  # not registered to the depth
-        pose = poses[path.stem]
         views.frames.append(
             CapturedFrame(
                 path.stem,
                 depth,
                 scale,
                 camera.intrinsics,
-                pose,
+                poses[path.stem],
                 mask,
                 colour,
+                folder.name if (folder / ONE_POSE).exists() else "",
             )
         )
     return views
@@ -182,6 +227,10 @@ def _poses(
         if next(folder.glob(f"{inside}/*.txt"), None):
             poses, unreadable = _pose_files(folder / inside, names)
             return poses, unreadable, f"poses of {inside}/"
+    if (folder / ONE_POSE).exists():
+        path = folder / ONE_POSE
+        pose = rigid(read_table(path, "the camera's pose", 4), str(path))
+        return dict.fromkeys(names, pose), {}, f"the pose of {ONE_POSE}"
     listed = folder / "poses.json"
 
     if listed.exists():
@@ -191,10 +240,11 @@ def _poses(
         return *_in_order(log, _log(log), names), "poses of trajectory.log"
 
     if len(names) == 1:
-        return {names[0]: np.eye(4)}, {}, "no pose: the camera is the world"
+        return {names[0]: np.eye(4)}, {}, CAMERA_IS_WORLD
     raise DatasetError(
         f"{folder}: has {len(names)} depth images and no poses of their camera: put them into"
-        " poses/NAME.txt, poses.json or trajectory.log, or give a single image"
+        " poses/NAME.txt, poses.json or trajectory.log, or that of a camera that stands still into"
+        f" {ONE_POSE}, or give a single image"
     )
 
 

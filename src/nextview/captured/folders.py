@@ -19,7 +19,9 @@ from nextview.captured.bag import At, is_bag, read_bag
 from nextview.captured.bop_scene import ThreeNumbers, read_bop_scene
 from nextview.captured.camera_file import CameraFile, check_size, read_camera_file
 from nextview.captured.depth_folder import (
+    camera_folders,
     is_depth_folder,
+    read_camera_folders,
     read_depth_folder,
     read_depth_image,
 )
@@ -69,7 +71,7 @@ class Reading:
         depth_scale: metres per unit of the depth images; 0.001 for millimetres.
         depth_topic: of a ROS 2 bag with several depth topics.
         world_frame: of a ROS 2 bag: tf frame of the world, z up; by default the root of the tree.
-        at: of a ROS 2 bag of a static camera: image to use; see ``read_bag``.
+        at: of a ROS 2 bag of a static camera: image to use; by default all, see ``read_bag``.
     """
 
     intrinsics: Intrinsics = None
@@ -192,6 +194,8 @@ def _layout_of(path: Path) -> str:
         return DEPTH_FOLDER
     if _cloud_files(path):
         return CLOUDS
+    if camera_folders(path):
+        return SEVERAL_CAMERAS
     raise DatasetError(_no_capture(path))
 
 
@@ -409,6 +413,7 @@ LAYOUT_MARKS = {  # a file that identifies each layout
     "GraspNet": "meta/*.mat",
 }
 DEPTH_FOLDER = "depth folder"
+SEVERAL_CAMERAS = "several cameras"
 ONE_IMAGE = "depth image"
 CLOUDS = "PCD"
 BAG = "ROS 2 bag"
@@ -471,6 +476,11 @@ FOLDER_LAYOUTS: dict[
         _cloud_files(path) if path.is_dir() else [path], camera
     ),
     DEPTH_FOLDER: lambda path, camera, how: read_depth_folder(
+        path,
+        camera,
+        how.depth_scale,
+    ),
+    SEVERAL_CAMERAS: lambda path, camera, how: read_camera_folders(
         path,
         camera,
         how.depth_scale,

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -15,7 +15,13 @@ from PIL import Image
 from nextview.checks import one_line
 from nextview.errors import DAMAGED, DatasetError, NextviewError, ObservationError
 from nextview.files import regular_file
-from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
+from nextview.sensing.frame import (
+    LARGEST_MEDIAN,
+    NEAREST_MEDIAN,
+    Frame,
+    check_pose,
+    one_stand,
+)
 from nextview.types import Float, Float32
 
 NO_DEPTH = np.iinfo(
@@ -95,6 +101,7 @@ class CapturedFrame:
         pose: camera-to-world, (4, 4) float64, metres, OpenCV axes.
         mask: image that is not black on the object, if there is one.
         image: grey or colour image registered to the depth, if there is one.
+        camera: name of the camera, see ``Frame``.
     """
 
     name: str
@@ -104,6 +111,7 @@ class CapturedFrame:
     pose: Float
     mask: Path | None = None
     image: Path | None = None
+    camera: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -129,7 +137,7 @@ class CapturedFrame:
         if masked and self.mask is not None:
             mask = _as_grey(self.mask, raw.shape) > 0
         image = None if self.image is None else _picture(self.image, raw.shape)
-        return Frame(depth, self.intrinsics, self.pose, mask, image)
+        return Frame(depth, self.intrinsics, self.pose, mask, image, camera=self.camera)
 
     def _check_scale(self, depth: Float32) -> None:
         """Reject implausible depth with a message about the scale, before ``Frame`` does."""
@@ -185,6 +193,41 @@ class Capture:
     unreadable: tuple[tuple[str, str], ...] = ()
     object_is_world: bool = False
     scale_given: bool = False
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, in the order of the frames."""
+        return tuple(dict.fromkeys(frame.camera for frame in self.frames))
+
+    @property
+    def stands(self) -> bool:
+        """True if each camera has a name and never moves, so that the scene may change."""
+        first: dict[str, CapturedFrame] = {}
+        return all(
+            frame.camera and one_stand(frame, first.setdefault(frame.camera, frame))
+            for frame in self.frames
+        )
+
+    @property
+    def moments(self) -> tuple[tuple[CapturedFrame, ...], ...]:
+        """Frames of all cameras that were taken together, in order; they share their name."""
+        together: dict[str, list[CapturedFrame]] = {}
+        for frame in self.frames:
+            name = frame.name.removeprefix(f"{frame.camera}/")
+            together.setdefault(name, []).append(frame)
+        several = len(self.cameras) > 1
+        order = sorted(together) if several else list(together)
+        return tuple(tuple(together[name]) for name in order)
+
+    @property
+    def at_one_moment(self) -> "Capture":
+        """The frames of the first moment, if cameras stand still; otherwise all."""
+        if not self.stands or len(self.moments) == 1:
+            return self
+        first = self.moments[0]
+        names = ", ".join(frame.name for frame in first)
+        note = f"cameras that stand still show an object at one moment: {names} is used"
+        return replace(self, frames=first, notes=(*self.notes, note))
 
     def __repr__(self) -> str:
         count = "1 frame" if len(self.frames) == 1 else f"{len(self.frames)} frames"

@@ -80,7 +80,10 @@ COMMANDS = {  # by name, in the order of the printed list
         f"{CLI}.stores:render",
         "render every view of a dataset into a view store",
     ),
-    "check": Command(f"{CLI}.stores:check", "check a view store for damage"),
+    "check": Command(
+        f"{CLI}.check:check",
+        "check captured frames and cameras, or a view store",
+    ),
     "measure": Command(
         f"{CLI}.stores:measure",
         "compute measures of the views in a store",

@@ -167,6 +167,7 @@ class ObjectOptions:
             self.world_frame,
             self.at,
         )
+        capture = capture.at_one_moment
         console.print(f"{capture!r}")
         return camera_of(
             capture,

@@ -15,13 +15,20 @@ from nextview.captured.bag import At
 from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
+from nextview.captured.still_moments import still_moments
 from nextview.checks import extras
 from nextview.cli.common_options import Three, check_file, say_written
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
 from nextview.geometry.axes import upright_axes
-from nextview.scene.report import REPORT_COLUMNS, doubts_of, row_of, scene_as_json
+from nextview.scene.report import (
+    REPORT_COLUMNS,
+    changes_in_words,
+    doubts_of,
+    row_of,
+    scene_as_json,
+)
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.object_frame import Box
 from nextview.session.result_json import plain
@@ -41,13 +48,14 @@ class LookOptions:
             read from the folder.
         depth_topic: for ROS 2 bags with several depth topics: the topic to read.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
-        at: for ROS 2 bags of a static camera: the image to use: first (the default), last, or the
-            number of seconds after the first message of the bag.
+        at: for ROS 2 bags of a static camera: use one image: first, last, or the number of seconds
+            after the first message of the bag; by default those at which the scene has changed.
         up: up axis of the world, or a direction; by default that of the layout, or the normal of
             the support plane.
         region: upright box that limits the search: its low and its high corner, metres (heights
             along --up).
-        frames: number of frames to use, evenly spread over the recording.
+        frames: number of frames to use, evenly spread over the recording; for cameras that stand
+            still, over the moments at which the scene has changed.
         unknown: significance level of the test for unknown objects: an object with a smaller
             p-value is called unknown. The default of 0.02 also rejects one known thing in 50.
             0 always names a thing.
@@ -141,7 +149,11 @@ def look(
         print(json.dumps(plain(scene_as_json(scene, looks, left_out)), indent=1))
     else:
         print_scene(scene, path.name)
+    first = next((name for name, one in looks.items() if one.taken), "")
     for name, one in looks.items():
+        if capture.stands and name != first:
+            for sentence in changes_in_words(one):
+                console.print(f"{name}: {sentence}")
         for ended, whole in one.joined:
             console.print(f"{name}: {ended} turned out to be a part of {whole}")
         for warning in one.warnings:
@@ -181,18 +193,24 @@ def _look_at_frames(
         The changes of each frame, by frame name.
     """
     looks: dict[str, Look] = {}
-    there = len(capture.frames)
-    few = np.unique(np.linspace(0, there - 1, most).round().astype(int))
+    moments = capture.moments
+    kind = "frames"
+    if capture.stands and len(moments) > 1:
+        moments = still_moments(capture)
+        kind = "frames at which the scene stands still and has changed"
+    there = sum(len(together) for together in moments)
+    at_once = max(1, most // len(capture.cameras))
+    rows = np.unique(np.linspace(0, len(moments) - 1, at_once).round().astype(int))
+    few = [captured for row in rows for captured in moments[row]]
     if len(few) < there:
         console.print(
-            f"{len(few)} of the {there} frames are looked at, evenly spread; --frames {there} for"
+            f"{len(few)} of the {there} {kind} are looked at, evenly spread; --frames {there} for"
             " all",
             soft_wrap=True,
         )
 
     def each() -> Any:
-        for done, row in enumerate(few, 1):
-            captured = capture.frames[row]
+        for done, captured in enumerate(few, 1):
             try:
                 looks[captured.name] = scene.update(captured.read(masked=False))
             except ObservationError as error:

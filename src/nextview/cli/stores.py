@@ -1,4 +1,4 @@
-"""``nextview render``, ``check`` and ``measure``: create and process view stores."""
+"""``nextview render`` and ``measure``: create and process view stores."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,6 @@ from nextview.cli.common_options import NamedSplit, Workers
 from nextview.cli.progress import console, follow, say_done, track_all
 from nextview.data import measures as view_measures
 from nextview.data import rendering
-from nextview.data import store as view_store
 from nextview.data.splits import some_objects
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
@@ -93,42 +92,6 @@ def render(
         f"{store}: {done} of {len(made)} objects, {len(sphere)} views each",
         soft_wrap=True,
     )
-
-
-def check(
-    store: Path,
-    /,
-    workers: Workers = Workers(),
-) -> None:
-    """Verify the checksum of every object in a view store.
-
-    The exit status is 2 if an object is damaged.
-
-    Args:
-        store: view store made by nextview render.
-    """
-    views = ViewStore.open(store)
-    done = int(views.done.sum())
-
-    damaged = track_all(
-        view_store.check(store, **vars(workers)),
-        done,
-        f"checking {store.name}",
-    )
-    for reason in views.attributes.failures.values():
-        console.print(f"left out: {reason}", style="yellow")
-
-    missing = len(views) - done - len(views.attributes.failures)
-    console.print(
-        f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not"
-        " rendered"
-    )
-
-    if damaged:
-        raise DatasetError(
-            f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render"
-            " again"
-        )
 
 
 def measure(

@@ -24,7 +24,7 @@ from nextview.scene.placing import (
 )
 from nextview.scene.tracks import Track
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
-from nextview.sensing.frame import Frame
+from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.tabletop import TableTop
 from nextview.things.registration import scan_errors
 from nextview.types import Float, Mask
@@ -63,6 +63,27 @@ class CameraError:
         """
         variances = np.zeros(6) if first else _variances()
         return cls(frame.camera_to_world[:3, 3], np.zeros(6), np.diag(variances))
+
+    @classmethod
+    def before(
+        cls,
+        frame: Frame,
+        tops: Sequence[TableTop],
+        cameras: Sequence[CameraError],
+    ) -> CameraError:
+        """Return the error of a frame before it is compared with known objects.
+
+        A camera that has not moved has the error of its last frame.
+
+        Args:
+            frame: the frame.
+            tops: support surfaces of the earlier frames.
+            cameras: errors of their poses.
+        """
+        for top, camera in zip(reversed(tops), reversed(cameras), strict=True):
+            if frame.camera and one_stand(top.frame, frame):
+                return camera
+        return cls.expected(frame, first=not tops)
 
     def at(self, place: Float) -> Float:
         """Matrix, (6, 6), from ``motion`` to the motion of an object at a place, (3,)."""
@@ -209,7 +230,7 @@ def changes(
     Returns:
         The change of each object, and the error of the pose of the new frame.
     """
-    expected = CameraError.expected(top.frame, first=not tops)
+    expected = CameraError.before(top.frame, tops, cameras)
     named = {}
     for row, track in enumerate(tracks):
         posed = track.posed
@@ -463,7 +484,7 @@ def _shift_to_segment(
     depth = surface.shown()
     shows = np.isfinite(depth)
     points = surface.rays[shows] * depth[shows, None]
-    column, row = np.floor(top.frame.camera.project(points)).astype(np.int64).T
+    column, row = np.floor(top.frame.pinhole.project(points)).astype(np.int64).T
     over = [np.count_nonzero(mask[row, column]) for mask in segments]
     if not max(over):
         return none

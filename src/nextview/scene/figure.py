@@ -263,7 +263,7 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
     in_camera = (ends - camera[:3, 3]) @ camera[:3, :3]
     if (in_camera[:, 2] < 0.01).any():
         return
-    at = frame.camera.project(in_camera) - 0.5
+    at = frame.pinhole.project(in_camera) - 0.5
 
     for end, colour in zip(at[1:], AXIS_COLOURS, strict=True):
         line = axes.plot(

@@ -207,7 +207,7 @@ def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]
     now = frame.camera_to_world
     in_camera = (points - now[:3, 3]) @ now[:3, :3]
     in_camera = in_camera[in_camera[:, 2] > 0.01]
-    column, row = np.floor(frame.camera.project(in_camera)).astype(np.int64).T
+    column, row = np.floor(frame.pinhole.project(in_camera)).astype(np.int64).T
     inside = (
         (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
     )

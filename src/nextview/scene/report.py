@@ -63,6 +63,22 @@ def doubts_of(scene: Scene) -> list[str]:
     return said
 
 
+def changes_in_words(look: Look) -> list[str]:
+    """Return a phrase for each object that has appeared, moved or gone.
+
+    Args:
+        look: changes made by a frame.
+    """
+    said = [f"{number} has appeared" for number in look.appeared]
+    for move in look.moved:
+        how_far = ""
+        if move.before is not None and move.after is not None:
+            metres = np.linalg.norm(move.after[:3, 3] - move.before[:3, 3])
+            how_far = f" by {1000 * metres:.0f} mm"
+        said.append(f"{move.number} has moved{how_far}")
+    return said + [f"{number} is gone" for number in look.gone]
+
+
 def scene_as_json(
     scene: Scene,
     looks: Mapping[str, Look],

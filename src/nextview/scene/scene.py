@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -280,38 +280,55 @@ class Scene:
             self._failed.add(self._target_rows[0])
             self._targets = None
 
-    def update(self, frame: Frame) -> Look:
-        """Update the scene with a frame.
+    @overload
+    def update(self, frame: Frame) -> Look: ...
+
+    @overload
+    def update(self, frame: Sequence[Frame]) -> tuple[Look, ...]: ...
+
+    def update(self, frame: Frame | Sequence[Frame]) -> Look | tuple[Look, ...]:
+        """Update the scene with a frame, or with frames of several cameras.
 
         If an error is raised, the scene is unchanged.
 
         Args:
-            frame: of a depth camera. A pose is needed unless it is the only frame. Its mask, if it
-                has one, limits the search.
+            frame: of a depth camera, or frames that several cameras took together. A pose is needed
+                unless it is the only frame. Its mask, if it has one, limits the search.
 
         Returns:
-            The changes. A frame with an inconsistent pose, and a repeated frame, is left out with a
-            warning.
+            The changes; a tuple of those of each frame, if there were several. A frame with an
+            inconsistent pose, and a repeated frame, is left out with a warning.
 
         Raises:
             ObservationError: the frame is invalid or has no pose, it shows no support plane, it
                 does not fit the known world, or ``segmentation`` returned no masks.
         """
         with self._lock:
-            known = self._known_frames
-            known.refuse(frame)
-            if known.repeats(frame):
-                return Look(False, warnings=(REPEATED,))
-
+            if not isinstance(frame, Sequence):
+                return self._update(frame)
             before = self._state
-            instances = instances_of(self.segmentation, frame, self.up)
-            top = self._top_of(frame, instances, before.tops)
-            shown = top.plane if top.shows_ground else None
-            top = replace(top, warnings=tuple(known.check(frame, shown)))
-            state, look = self._after(before, top)
-            self._state = state
-            self._targets = None
-            return look
+            try:
+                return tuple([self._update(one) for one in frame])
+            except BaseException:
+                self._state = before
+                raise
+
+    def _update(self, frame: Frame) -> Look:
+        """Update the scene with one frame."""
+        known = self._known_frames
+        known.refuse(frame)
+        if known.repeats(frame):
+            return Look(False, warnings=(REPEATED,))
+
+        before = self._state
+        instances = instances_of(self.segmentation, frame, self.up)
+        top = self._top_of(frame, instances, before.tops)
+        shown = top.plane if top.shows_ground else None
+        top = replace(top, warnings=tuple(known.check(frame, shown)))
+        state, look = self._after(before, top)
+        self._state = state
+        self._targets = None
+        return look
 
     def grasps(
         self,
@@ -431,7 +448,9 @@ class Scene:
             before.tops,
             before.cameras,
         )
-        if wrong_pose(found, camera):
+        # the pose of a camera that has not moved is as right as before
+        stands = self._known_frames.stands(top.frame)
+        if not stands and wrong_pose(found, camera):
             return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
         seen_again = any(one.confirms for one in found)
         if before.tops and not (top.shows_ground or seen_again):
@@ -439,7 +458,7 @@ class Scene:
 
         state, look = self._taken(before, top, found)
         state = replace(state, cameras=(*before.cameras, camera))
-        if look.moved and not seen_again:
+        if look.moved and not (seen_again or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
 

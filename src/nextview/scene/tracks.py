@@ -278,7 +278,7 @@ def window_around(corners: Float, frame: Frame) -> Part | None:
     ahead = corners[corners[:, 2] > 0.01]
     if not len(ahead):
         return None
-    at = frame.camera.project(ahead)
+    at = frame.pinhole.project(ahead)
     low = at.min(0)[::-1] - WINDOW_EDGE
     high = at.max(0)[::-1] + WINDOW_EDGE
     part = spans(low, high, frame.shape)

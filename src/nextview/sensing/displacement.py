@@ -255,7 +255,7 @@ class _Surface:
         The points are given by their rays, (N, 2), and depths.
         """
         frame = self.sighting.frame
-        at = frame.camera.project(np.column_stack([rays, np.ones(len(rays))]))
+        at = frame.pinhole.project(np.column_stack([rays, np.ones(len(rays))]))
         column, row = np.floor(at).astype(int).T
         height, width = frame.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)

@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import InitVar, dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +29,8 @@ ASPECTS = (
     512 / 424,
     640 / 576,
 )  # width over height of uncropped images
+# tolerance of equal poses, for metres and elements of rotation matrices
+SAME_POSE = 1e-3
 CAMERA_AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -62,6 +65,8 @@ class Frame:
         axes: of the input pose: "opencv", "opengl" or "ros", see CAMERA_AXES.
         pixel_centre: coordinate of the first pixel's centre in the input intrinsics: 0 for OpenCV
             and ROS, 0.5 for OpenGL and for nextview's own ``Observation``.
+        camera: name of the camera, where there are several, or where one stands still; "" for the
+            one camera.
     """
 
     depth: Float32
@@ -73,6 +78,7 @@ class Frame:
     colour: NDArray[np.uint8] | None = field(init=False, default=None)
     axes: InitVar[str] = "opencv"
     pixel_centre: InitVar[float] = 0.0
+    camera: str = ""
 
     def __post_init__(self, axes: str, pixel_centre: float) -> None:
         values = numbers(self.depth, "the depth")
@@ -83,6 +89,11 @@ class Frame:
             raise ObservationError(
                 f"the first pixel's centre has the coordinate 0 or 0.5, not"
                 f" {one_line(repr(pixel_centre))}"
+            )
+
+        if not isinstance(self.camera, str):
+            raise ObservationError(
+                f"the name of a camera is text, not {one_line(repr(self.camera))}"
             )
 
         intrinsics[:2, 2] += 0.5 - pixel_centre
@@ -138,9 +149,13 @@ class Frame:
         """Return the frame with its pose, which must exist, shifted in the world, (3,), metres."""
         pose = self.camera_to_world.copy()
         pose[:3, 3] += shift
-        moved = copy(self)  # skips validation
-        object.__setattr__(moved, "pose", pose)
-        return moved
+        return self.with_pose(pose)
+
+    def with_pose(self, pose: Float) -> "Frame":
+        """Return the frame with another rigid pose, camera-to-world, (4, 4), metres."""
+        other = copy(self)  # skips validation
+        object.__setattr__(other, "pose", pose)
+        return other
 
     def with_depth(self, depth: Float32) -> "Frame":
         """Return the frame with another depth image, (H, W) float32, metres."""
@@ -155,7 +170,7 @@ class Frame:
         return other
 
     @property
-    def camera(self) -> PinholeCamera:
+    def pinhole(self) -> PinholeCamera:
         """Pinhole camera of the frame."""
         return PinholeCamera.of(self.intrinsics, self.shape)
 
@@ -167,7 +182,7 @@ class Frame:
     @property
     def rays(self) -> tuple[Float32, Float32]:
         """x and y of the rays (x, y, 1) through the columns, (W,), and the rows, (H,), float32."""
-        x, y = self.camera.image_slopes
+        x, y = self.pinhole.image_slopes
         return x.astype(np.float32), y.astype(np.float32)
 
     def positions(self, rows: Index, columns: Index) -> Float:
@@ -218,6 +233,25 @@ class Frame:
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
         towards = (a * x)[None, part[1]] + (b * y + c)[part[0], None]
         return self.depth[part] * towards + np.float32(direction @ pose[:3, 3] + offset)
+
+
+class PosedCamera(Protocol):
+    """A camera with a name at a pose."""
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def pose(self) -> Float | None:
+        """Camera-to-world, (4, 4); None if it is not known."""
+
+
+def one_stand(one: PosedCamera, other: PosedCamera) -> bool:
+    """Return True if one camera took two frames without moving in between."""
+    if one.camera != other.camera or one.pose is None or other.pose is None:
+        return False
+    return float(np.abs(one.pose - other.pose).max()) <= SAME_POSE
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:

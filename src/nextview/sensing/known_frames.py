@@ -9,7 +9,8 @@ import numpy as np
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
-from nextview.sensing.frame import Frame
+from nextview.sensing.camera_offsets import camera_offsets
+from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.lean import lean_of
 from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
@@ -74,16 +75,28 @@ class KnownFrames:
             ObservationError: the pose is in millimetres.
         """
         warnings = check_frame(frame)
-        if self.frames:
-            warnings += check_pose_moved(frame, self.frames[-1])
+        own = [one for one in self.frames if one.camera == frame.camera]
+        if own and not self.stands(frame):
+            warnings += check_pose_moved(frame, own[-1])
         if frame.pose is None:
             return warnings
+        warnings += self._check_cameras(frame)
         if plane is not None and not self.frames:
             up = plane.normal if self.up is None else self.up
             height = float(plane.height(frame.pose[:3, 3]))
             refuse_millimetres(frame.pose, height, up)
             warnings += check_steps(frame, height, up)
         return warnings + self._check_lean(frame, plane)
+
+    def stands(self, frame: Frame) -> bool:
+        """Return True if the camera of a frame has a name and has never moved.
+
+        Args:
+            frame: new frame.
+        """
+        own = [one for one in self.frames if one.camera == frame.camera]
+        named = frame.camera != "" and bool(own)
+        return named and all(one_stand(one, frame) for one in own)
 
     def repeats(self, frame: Frame) -> bool:
         """Return True if a frame is bitwise identical to an earlier one.
@@ -95,6 +108,18 @@ class KnownFrames:
             np.array_equal(one.depth, frame.depth) and _same_mask(one, frame)
             for one in self.frames
         )
+
+    def _check_cameras(self, frame: Frame) -> list[ViewWarning]:
+        """Warn if the pose of a camera has an error relative to the first camera with a name."""
+        named = [one for one in self.frames if one.camera]
+        if not frame.camera or not named or named[0].camera == frame.camera:
+            return []
+        reference = [one for one in named if one.camera == named[0].camera]
+        return [
+            ViewWarning("camera", str(offset), holds=False)
+            for offset in camera_offsets([[reference[-1], frame]])
+            if offset.noticed
+        ]
 
     def _check_lean(self, frame: Frame, plane: Plane | None) -> list[ViewWarning]:
         """Warn if the planes of all frames are tilted; a single one may have depth errors."""

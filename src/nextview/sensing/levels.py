@@ -137,6 +137,17 @@ class Supports:
             carriers = _on_others(carriers, masks, frame, noise, upright)
         return cls(frame, tuple(masks), surface, tuple(levels), tuple(carriers))
 
+    @classmethod
+    def none(cls, frame: Frame, masks: Sequence[Mask]) -> Supports:
+        """Return the instances of a frame without support surfaces, as of things that are held.
+
+        Args:
+            frame: of a depth camera.
+            masks: mask of each instance, (H, W) bool each.
+        """
+        surface = np.zeros(frame.shape, bool)
+        return cls(frame, tuple(masks), surface, (), (None,) * len(masks))
+
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
         """Return the level that carries most pixels of candidate objects.
 

@@ -20,7 +20,7 @@ from nextview.sensing.agreement import (
     compare,
     quick_view,
 )
-from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.sensing.frame import CAMERA_AXES, SAME_POSE, Frame
 from nextview.types import Float, Index, Mask
 
 # A mistake explains contradictions if undoing it leaves at most this share of them, ...
@@ -40,9 +40,6 @@ WELL_EXPLAINED = 0.75
 HALF_AGREES = 0.5
 # Cameras closer than this, relative to the depth, count as being in one place.
 ONE_PLACE = ROUGH.depth_tolerance
-SAME_POSE = (
-    1e-3  # tolerance of equal poses, for metres and elements of rotation matrices
-)
 
 UNIT_NAMES = {
     1.0: "metres",

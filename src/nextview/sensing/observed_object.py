@@ -48,8 +48,8 @@ OTHER_SHARE = 0.03
 SAME_FRAME = 0.01
 NO_OUTLINE = (
     "an object that stands on no plane (support=False) is told from what holds it by a mask in each"
-    " frame, Frame(..., mask=...), or by a box, ObservedObject(box=...); a point selects a thing on"
-    " a support plane only"
+    " frame, Frame(..., mask=...), by a point on it, ObservedObject(point=...), or by a box,"
+    " ObservedObject(box=...)"
 )
 NO_PLANE = ViewWarning(
     "support",
@@ -100,8 +100,8 @@ class ObservedObject:
         point: near the object, world, metres, (3,).
         box: upright bounding box of the object.
         support: whether the object stands on a visible plane. Set False for a gripper or a
-            turntable; the object must then be given by the mask of each frame, by a box or by its
-            known frame.
+            turntable; the object must then be given by the mask of each frame, by a point on it, by
+            a box or by its known frame.
         known: the object frame, if it need not be estimated; the object is everything in its
             sphere.
         denoise: smooth depth, fill holes and drop flying pixels. For real sensors; not needed for
@@ -218,6 +218,9 @@ class ObservedObject:
         if self.support:
             instances = self._instances(frame, up)
             supports = Supports.of(frame, instances.masks, instances.surface, noise, up)
+        elif self.point is not None and frame.mask is None:
+            instances = self._instances(frame, up)
+            supports = Supports.none(frame, instances.masks)
         parting = before.parting
         pixels = self._pixels(frame, supports, instances, parting)
         partings: tuple[Parting, ...] = ()
@@ -365,7 +368,7 @@ class ObservedObject:
         Raises:
             ObservationError: the pose of a first frame is wrong, or its depth is a range.
         """
-        if supports is None:
+        if supports is None or not self.support:
             return None
         level = supports.under(pixels, stands=True)
         before = self.state

@@ -8,7 +8,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
-from nextview.sensing.frame import Frame
+from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.lean import Lean
 from nextview.sensing.mistakes import mistake_between, mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
@@ -30,11 +30,9 @@ FAR_DEPTH = 10.0
 FARTHEST_POINT_ASIDE = 3.0
 # largest distance of an object as a multiple of the farthest depth in the frame
 TOO_FAR = 2.5
-STILL = 1e-3
 CHANGED = 0.04
 CHANGED_SHARE = 0.03
-"""Tolerance of equal poses, for metres and rotation matrices; relative change of a changed pixel's
-depth; and share of changed pixels in a changed image."""
+"""Relative change of a changed pixel's depth, and share of changed pixels in a changed image."""
 TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
 """Factors by which depth is too large if 16-bit units of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are read
 as millimetres.
@@ -204,7 +202,7 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
         return 0.0
 
     height, width = frame.shape
-    column, row = frame.camera.project(in_camera[None])[0].astype(int).tolist()
+    column, row = frame.pinhole.project(in_camera[None])[0].astype(int).tolist()
     if not (0 <= column < width and 0 <= row < height):
         return 0.0
 
@@ -343,10 +341,7 @@ def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
     Returns:
         The warning, if any.
     """
-    if (
-        frame.shape != last.shape
-        or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL
-    ):
+    if frame.shape != last.shape or not one_stand(frame, last):
         return []
 
     now, then = (f.depth[::4, ::4] for f in (frame, last))

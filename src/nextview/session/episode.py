@@ -249,6 +249,14 @@ class Episodes:
         """
         self.keep(self._taken(evidence, directions, joint))
 
+    def __copy__(self) -> "Episodes":
+        """Return episodes that continue independently."""
+        other = object.__new__(Episodes)
+        vars(other).update(
+            vars(self), steps=list(self.steps), current=self.current.copy()
+        )
+        return other
+
     def keep(self, taken: Taken) -> None:
         """Commit a step of ``next_step``."""
         self._last = taken

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Protocol, get_args, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, get_args, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -604,16 +605,28 @@ class Session:
 
     # Views
 
-    def update(self, seen: Observation | Frame) -> View:
+    @overload
+    def update(self, seen: Observation | Frame) -> View: ...
+
+    @overload
+    def update(self, seen: Sequence[Frame]) -> tuple[View, ...]: ...
+
+    def update(
+        self, seen: Observation | Frame | Sequence[Frame]
+    ) -> View | tuple[View, ...]:
         """Process a view, taken from ``pose``, ``target`` or anywhere else.
 
-        If an error is raised, the session is unchanged and continues with the next view.
+        If an error is raised, the session is unchanged and continues with the next view. Of several
+        frames, those after the one that ends the session are not used.
 
         Args:
             seen: an observation in the object frame, or a frame of a depth camera in the world
-                frame. If a frame improves the estimate of the object's position, the earlier
-                ``views`` are recomputed in the new object frame, except for their choices and
-                warnings.
+                frame, or frames that several cameras took together. If a frame improves the
+                estimate of the object's position, the earlier ``views`` are recomputed in the new
+                object frame, except for their choices and warnings.
+
+        Returns:
+            The view; a tuple of those of the used frames, if there were several.
 
         Raises:
             SessionError: the episode has ended, or the session mixes frames and observations.
@@ -626,14 +639,37 @@ class Session:
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
-            with _blas().limit(limits=1):
-                view = (
-                    self._add_frame(seen)
-                    if isinstance(seen, Frame)
-                    else self._add_observation(seen)
-                )
-            for observer in self.observers:
-                observer(self)
+            if not isinstance(seen, Sequence):
+                return self._update(seen)
+
+            episodes = copy(self._episodes)
+            views = list(self.views)
+            object = self.object
+            state = None if object is None else object.state
+            found = []
+            try:
+                for one in seen:
+                    if not self.done:
+                        found.append(self._update(one))
+            except BaseException:
+                self._episodes = episodes
+                self.views = views
+                self.object = object
+                if object is not None and state is not None:
+                    object.state = state
+                raise
+        return tuple(found)
+
+    def _update(self, seen: Observation | Frame) -> View:
+        """Process one view."""
+        with _blas().limit(limits=1):
+            view = (
+                self._add_frame(seen)
+                if isinstance(seen, Frame)
+                else self._add_observation(seen)
+            )
+        for observer in self.observers:
+            observer(self)
         return view
 
     def _add_observation(self, seen: Observation) -> View:

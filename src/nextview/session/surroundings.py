@@ -143,7 +143,7 @@ class Surroundings:
         height, width = self.frame.shape
         ahead = seen_at[:, 2] > 1e-6
         z = np.where(ahead, seen_at[:, 2], 1)
-        at = self.frame.camera.project(np.column_stack([seen_at[:, :2], z]))
+        at = self.frame.pinhole.project(np.column_stack([seen_at[:, :2], z]))
         column, row = np.floor(at).T
         inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nextview.geometry.observation import Observation
 from nextview.recognition.poses import PoseCandidate, distinct
 from nextview.things.depth_view import DepthView, depth_view
-from nextview.things.registration import pose_covariances
+from nextview.things.registration import CameraStands, pose_covariances
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 from nextview.types import Index
@@ -92,7 +92,9 @@ def _camera_error(
     """
     if all(observation.exact for observation in observations):
         return 0.0
-    variances = CAMERA_DIRECTIONS * verifier.prior.displaced(views) ** 2
+    stands = CameraStands.of(views)
+    displaced = verifier.prior.displaced(views)[stands.first] * stands.counts
+    variances = CAMERA_DIRECTIONS * displaced**2
     return float(1000 * np.sqrt(variances.sum()) / len(views))
 
 

@@ -5,7 +5,8 @@ minimises two kinds of residuals: along the normal of the surface, where the ray
 depth was measured (point to plane, Chen and Medioni, "Object modelling by registration of multiple
 range images", 1992, with correspondences along the ray as in Blais and Levine 1995), and in the
 image plane, where the hypothesis exceeds the outline of the thing. Robust weights (Cauchy) have a
-scale that decreases from coarse to fine. A prior limits the position error of each camera.
+scale that decreases from coarse to fine. A prior limits the position error of each camera. Views
+from one place were taken by a camera that stands still, and share its error.
 """
 
 from collections.abc import Sequence
@@ -519,6 +520,53 @@ def align(
     return alignment
 
 
+SAME_PLACE = 1e-6  # tolerance of equal camera poses, metres: a rounding error
+
+
+@dataclass(frozen=True, eq=False)
+class CameraStands:
+    """Places from which V views were taken; views from one place share the error of their camera.
+
+    Attributes:
+        numbers: number of the place of each view, (V,).
+        first: first view from each place, (S,).
+    """
+
+    numbers: Index
+    first: Index
+
+    @classmethod
+    def of(cls, views: Sequence[DepthView]) -> "CameraStands":
+        """Return the places of some views."""
+        poses = np.array(
+            [np.append(view.camera_axes.ravel(), view.origin) for view in views]
+        )
+        apart = np.abs(poses[:, None] - poses).max(-1)
+        earliest = (apart < SAME_PLACE).argmax(1)
+        first, numbers = np.unique(earliest, return_inverse=True)
+        return cls(numbers, first)
+
+    @property
+    def several(self) -> bool:
+        """True if there are several: the error of a single camera equals a translation."""
+        return len(self.first) > 1
+
+    @property
+    def counts(self) -> Index:
+        """Number of views from each place, (S,)."""
+        return np.bincount(self.numbers)
+
+    def unknowns(self, number: int, before: int) -> slice:
+        """Return the unknowns of the camera error of a view.
+
+        Args:
+            number: of the view.
+            before: number of other unknowns, which come first.
+        """
+        start = before + 3 * int(self.numbers[number])
+        return slice(start, start + 3)
+
+
 def _step(
     caster: SurfaceCaster,
     alignment: Alignment,
@@ -541,7 +589,8 @@ def _step(
     moved = np.clip(change[:, 3:], -limit, limit)
     cameras = alignment.cameras
     if moved.shape[1] > 3:
-        cameras = cameras + moved[:, 3:].reshape(cameras.shape)
+        of_stands = moved[:, 3:].reshape(len(cameras), -1, 3)
+        cameras = cameras + of_stands[:, CameraStands.of(views).numbers]
     return replace(
         alignment,
         rotations=rotations_of(turn) @ alignment.rotations,
@@ -558,8 +607,8 @@ def _equations(
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
     """Matrices, (H, U, U), and right-hand sides, (H, U), of a step with U unknowns."""
-    errors_too = len(views) > 1  # the error of a single camera equals a translation
-    unknowns = POSE + 3 * len(views) if errors_too else POSE
+    stands = CameraStands.of(views)
+    unknowns = POSE + 3 * len(stands.first) if stands.several else POSE
     left = np.zeros((len(alignment), unknowns, unknowns))
     right = np.zeros((len(alignment), unknowns))
     displaced = prior.displaced(views)
@@ -574,9 +623,9 @@ def _equations(
         )
         left[:, :POSE, :POSE] += square
         right[:, :POSE] += towards
-        if errors_too:
+        if stands.several:
             # Within one view, a displacement by the camera error equals a translation of the thing.
-            own = slice(POSE + 3 * number, POSE + 3 * number + 3)
+            own = stands.unknowns(number, POSE)
             left[:, own, own] += square[:, PLACE, PLACE]
             left[:, :POSE, own] += square[:, :, PLACE]
             left[:, own, :POSE] += square[:, PLACE, :]
@@ -585,7 +634,8 @@ def _equations(
     weights, so_far = priors_of(
         caster,
         alignment,
-        displaced if errors_too else None,
+        stands if stands.several else None,
+        displaced,
         prior,
     )
     left += weights[:, :, None] * np.eye(unknowns)
@@ -639,7 +689,7 @@ def pose_covariances(
     """
     level = FINE[-1]
     displaced = prior.displaced(views)
-    weights, _ = priors_of(caster, alignment, None, prior)
+    weights, _ = priors_of(caster, alignment, None, displaced, prior)
     information = weights[:, :, None] * np.eye(POSE)
 
     for number, view in enumerate(views):
@@ -757,7 +807,8 @@ def normal_equations(
 def priors_of(
     caster: SurfaceCaster,
     alignment: Alignment,
-    displaced: Float | None,
+    stands: CameraStands | None,
+    displaced: Float,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
     """Weights of the priors of the unknowns, and present values of the unknowns.
@@ -765,14 +816,14 @@ def priors_of(
     Args:
         caster: all surfaces.
         alignment: H hypotheses.
-        displaced: standard deviation of the displacement in each view, (V,), metres; None if the
-            camera errors are no unknowns.
+        stands: places of the cameras; None if the camera errors are no unknowns.
+        displaced: standard deviation of the displacement in each view, (V,), metres.
         prior: prior of the unknowns.
 
     Returns:
         Weights and values, (H, unknowns) float64 each.
     """
-    cameras = 0 if displaced is None else 3 * len(displaced)
+    cameras = 0 if stands is None else 3 * len(stands.first)
     weights = np.zeros((len(alignment), POSE + cameras))
     so_far = np.zeros((len(alignment), POSE + cameras))
 
@@ -781,9 +832,10 @@ def priors_of(
     reach = prior.place * caster.radii[alignment.things].astype(np.float64)
     weights[:, PLACE] = 1 / reach[:, None] ** 2
     so_far[:, PLACE] = alignment.centres
-    if displaced is not None:
-        weights[:, POSE:] = np.repeat(1 / displaced**2, 3)
-        so_far[:, POSE:] = alignment.cameras.reshape(len(alignment), -1)
+    if stands is not None:
+        weights[:, POSE:] = np.repeat(1 / displaced[stands.first] ** 2, 3)
+        shared = alignment.cameras[:, stands.first]
+        so_far[:, POSE:] = shared.reshape(len(alignment), -1)
     return weights, so_far
 
 
@@ -806,7 +858,7 @@ def camera_cost(
     views: Sequence[DepthView],
     prior: RegistrationPrior = RegistrationPrior(),
 ) -> Float:
-    """Half the squared normalised camera errors.
+    """Half the squared normalised camera errors; views from one place share the cost.
 
     Args:
         alignment: the hypotheses.
@@ -817,4 +869,6 @@ def camera_cost(
         Costs, (H, V) float64.
     """
     squared = (alignment.cameras**2).sum(-1)
-    return np.asarray(0.5 * squared / prior.displaced(views) ** 2, np.float64)
+    stands = CameraStands.of(views)
+    shares = 1 / stands.counts[stands.numbers]
+    return np.asarray(0.5 * squared / prior.displaced(views) ** 2 * shares, np.float64)

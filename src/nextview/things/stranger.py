@@ -25,6 +25,7 @@ from nextview.things.registration import (
     TURN,
     TURN_LIMIT,
     Alignment,
+    CameraStands,
     Level,
     Pulls,
     RegistrationPrior,
@@ -220,13 +221,16 @@ def _step(
     moved = np.linalg.solve(left, right)
     turn = np.clip(moved[TURN], -TURN_LIMIT, TURN_LIMIT)
     limit = SHIFT_LIMIT * float(radii[0])
-    cameras = moved[UNKNOWNS:].reshape(-1, 3) if len(moved) > UNKNOWNS else 0
+    cameras = aligned.cameras
+    if len(moved) > UNKNOWNS:
+        numbers = CameraStands.of(comparison.views).numbers
+        cameras = cameras + moved[UNKNOWNS:].reshape(-1, 3)[numbers]
     grown = np.clip(moved[STRETCH], -STRETCH_STEP, STRETCH_STEP)
     aligned = replace(
         aligned,
         rotations=rotations_of(turn[None]) @ aligned.rotations,
         centres=aligned.centres + np.clip(moved[3:POSE], -limit, limit),
-        cameras=aligned.cameras + cameras,
+        cameras=cameras,
     )
     return Stretched(aligned, rival.factors * np.exp(grown))
 
@@ -244,7 +248,8 @@ def _equations(
     views = comparison.views
     aligned = rival.alignment
     displaced = comparison.prior.displaced(views)
-    of_cameras = 3 * len(views) if len(views) > 1 else 0
+    stands = CameraStands.of(views)
+    of_cameras = 3 * len(stands.first) if stands.several else 0
     left = np.zeros((UNKNOWNS + of_cameras, UNKNOWNS + of_cameras))
     right = np.zeros(len(left))
 
@@ -255,7 +260,7 @@ def _equations(
         # Within one view, a displacement by the camera error equals a translation of the thing.
         own = np.arange(UNKNOWNS)
         if of_cameras:
-            own = np.append(own, UNKNOWNS + 3 * number + np.arange(3))
+            own = np.append(own, np.r_[stands.unknowns(number, UNKNOWNS)])
         drawn = [pulls_of(view, rendered, centres, reach)]
         if outlines:
             drawn.append(pulls_of_outline(view, rendered, centres))
@@ -264,8 +269,13 @@ def _equations(
             left[np.ix_(own, own)] += square[: len(own), : len(own)]
             right[own] += towards[: len(own)]
 
-    errors = displaced if of_cameras else None
-    weights, so_far = priors_of(comparison.caster, aligned, errors, comparison.prior)
+    weights, so_far = priors_of(
+        comparison.caster,
+        aligned,
+        stands if of_cameras else None,
+        displaced,
+        comparison.prior,
+    )
     held = np.append(np.arange(POSE), np.arange(UNKNOWNS, len(left)))
     left[held, held] += weights[0]
     right[held] -= weights[0] * so_far[0]
