@@ -219,7 +219,7 @@ def _lines_around(body: Body, frame: Frame) -> tuple[Index, Index] | None:
     nearest = corners[:, 2].min()
     if nearest <= 0:
         return None
-    at = frame.camera.project(corners)
+    at = frame.pinhole.project(corners)
     low, high = at.min(0), at.max(0)
     wide = AROUND_DEVIATIONS * body.displaced * frame.intrinsics[0, 0] / nearest
     margin = max(wide, AROUND_OUTLINE * (high - low).max())

@@ -747,7 +747,7 @@ def _depth_behind(top: TableTop, points: Float) -> Float:
     inside = (points - pose[:3, 3]) @ pose[:3, :3]
     away = inside[:, 2]
     ahead = away > 0.01
-    at = frame.camera.project(
+    at = frame.pinhole.project(
         np.column_stack([inside[:, :2], np.where(ahead, away, 1.0)])
     )
     column, row = np.floor(np.clip(at, -1e6, 1e6)).astype(np.int64).T
