@@ -238,6 +238,7 @@ SMALL = {
 """What makes a command of the page quick."""
 
 
+@pytest.mark.long  # CI's job for the commands of all pages runs them
 def test_the_commands_for_your_own_dataset_run(
     furniture,
     there,

@@ -17,6 +17,7 @@ for package in ("material", "mkdocs_jupyter", "mkdocstrings_handlers"):
     pytest.importorskip(package, reason="the site needs pip install 'nextview[docs]'")
 pytest.importorskip("pandas", reason="a notebook needs pip install 'nextview[docs]'")
 
+pytestmark = pytest.mark.long  # `make docs` builds the site in CI as well
 ROOT = Path(__file__).parent.parent
 SOURCE = str(ROOT / "src")
 

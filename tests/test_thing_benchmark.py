@@ -195,6 +195,7 @@ def in_metres(knobs, settings, shared):
     return known, folder / "out"
 
 
+@pytest.mark.long  # two benchmarks
 def test_scans_in_millimetres_are_named_and_found_as_those_in_metres(
     knobs,
     in_metres,
@@ -404,6 +405,7 @@ def test_the_ceiling_goes_where_the_truth_is_named_then_where_it_is_believed_mos
     assert TruthCeiling(named).next_views(at, rng)[0] == 9
 
 
+@pytest.mark.long  # a whole benchmark
 def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
     knobs,
     knobs_memory,

@@ -222,6 +222,7 @@ def test_an_error_in_a_policy_keeps_its_traceback(seen):
     assert "choice.nothing " in "".join(traceback.format_exception(cause))
 
 
+@pytest.mark.long  # a whole benchmark
 def test_the_benchmark_of_tables_takes_a_policy_of_ones_own(household, scans, tmp_path):
     own = "rules_of_mine:lowest"
     settings = TableSettings(

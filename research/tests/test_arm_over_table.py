@@ -104,6 +104,7 @@ def test_it_takes_itself_out_of_the_picture(example, table):
     assert rest > every - 1.5 * with_links
 
 
+@pytest.mark.long  # an arm over a whole table
 def test_what_it_says_is_what_stands_there(example, scans, tmp_path, capsys):
     film = tmp_path / "film.gif"
     figure = tmp_path / "end.png"
