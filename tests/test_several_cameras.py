@@ -427,13 +427,16 @@ def test_frames_enter_together_or_not_at_all(pair):
         scene.update([left, lost])
     assert scene.frames == ()
 
-    never_done = nextview.load("ycb", threshold=1.0)  # after one frame
-    session = never_done.session(object=ObservedObject(point=(0, 0, 0.05)))
+    def begun():
+        system = nextview.load("ycb", threshold=1.0)
+        return system.session(object=ObservedObject(point=(0, 0, 0.05)))
+
+    session = begun()
     with pytest.raises(ObservationError):
         session.update([left, lost])
     assert session.views == []
     assert session.object.sightings == ()
-    alone = never_done.session(object=ObservedObject(point=(0, 0, 0.05)))
+    alone = begun()
     np.testing.assert_array_equal(
         session.update(left).belief,
         alone.update(left).belief,

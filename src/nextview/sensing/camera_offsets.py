@@ -17,7 +17,7 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from nextview.errors import ObservationError
 from nextview.sensing.agreement import LEAST_DEPTH, NOISE_TOLERANCE
@@ -89,7 +89,7 @@ class CameraOffset:
     def noticed(self) -> bool:
         """True if the error exceeds its uncertainty."""
         squared = self.motion @ np.linalg.solve(self.covariance, self.motion)
-        return bool(squared > chi2.isf(FALSE_ALARMS, MOTION))
+        return bool(squared > chdtri(MOTION, FALSE_ALARMS))
 
     @property
     def correction(self) -> Float:
