@@ -47,6 +47,7 @@ class SceneView:
         background_free: whether nothing is there where nothing was measured, as in renders; a
             sensor may miss what is black or shiny.
         step: every so many rows and columns of the frame were taken.
+        camera: name of the camera; "" for the one camera.
     """
 
     depth: Float32
@@ -55,6 +56,7 @@ class SceneView:
     intrinsics: Float
     background_free: bool = False
     step: int = 1
+    camera: str = ""
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:

@@ -181,4 +181,5 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
         pose,
         k,
         step=step,
+        camera=sighting.frame.camera,
     )

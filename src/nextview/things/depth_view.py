@@ -59,6 +59,7 @@ class DepthView:
         step: spacing of the rows and of the columns, (2,) float64, pixels of the image.
         pitch: angle between neighbouring pixels of the image, radians.
         whole: number of pixels of the image that show the thing.
+        camera: name of the camera; "" for the one camera.
     """
 
     origin: Float
@@ -75,6 +76,7 @@ class DepthView:
     step: Float
     pitch: float
     whole: int
+    camera: str = ""
 
     @property
     def thing_points(self) -> Float32:
@@ -120,6 +122,7 @@ class MetricImage:
         noise: noise of single pixels.
         ground: plane that supports the thing, if it is visible.
         hiding: pixels around the thing that show an occluder, (H, W) bool.
+        camera: name of the camera; "" for the one camera.
     """
 
     depth: Float32
@@ -129,6 +132,7 @@ class MetricImage:
     noise: Noise
     ground: Ground | None
     hiding: Mask
+    camera: str = ""
 
     @classmethod
     def of(
@@ -289,6 +293,7 @@ class MetricImage:
             step=np.array([_step(rows), _step(columns)]),
             pitch=float(1 / self.intrinsics[[0, 1], [0, 1]].mean()),
             whole=int(mask.sum()),
+            camera=self.camera,
         )
 
 
@@ -305,7 +310,8 @@ def _metric_image(observation: Observation, metres: float) -> MetricImage | None
     some_rows = depth[:: max(1, len(depth) // NOISE_ROWS)]
     noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
     nowhere = np.zeros(kind.shape, bool)
-    image = MetricImage(depth, kind, pose, intrinsics, noise, None, nowhere)
+    camera = "" if observation.scene is None else observation.scene.camera
+    image = MetricImage(depth, kind, pose, intrinsics, noise, None, nowhere, camera)
     image = replace(image, ground=image.find_ground())
     return replace(image, hiding=image.find_hiding())
 

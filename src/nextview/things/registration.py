@@ -6,7 +6,7 @@ depth was measured (point to plane, Chen and Medioni, "Object modelling by regis
 range images", 1992, with correspondences along the ray as in Blais and Levine 1995), and in the
 image plane, where the hypothesis exceeds the outline of the thing. Robust weights (Cauchy) have a
 scale that decreases from coarse to fine. A prior limits the position error of each camera. Views
-from one place were taken by a camera that stands still, and share its error.
+from one place of a camera with a name, which stands still, share its error.
 """
 
 from collections.abc import Sequence
@@ -525,7 +525,10 @@ SAME_PLACE = 1e-6  # tolerance of equal camera poses, metres: a rounding error
 
 @dataclass(frozen=True, eq=False)
 class CameraStands:
-    """Places from which V views were taken; views from one place share the error of their camera.
+    """Places from which V views were taken.
+
+    Views that a camera with a name took from one place share its error. A camera without a name may
+    be on an arm, which comes back to a place with another error.
 
     Attributes:
         numbers: number of the place of each view, (V,).
@@ -542,7 +545,10 @@ class CameraStands:
             [np.append(view.camera_axes.ravel(), view.origin) for view in views]
         )
         apart = np.abs(poses[:, None] - poses).max(-1)
-        earliest = (apart < SAME_PLACE).argmax(1)
+        names = np.array([view.camera for view in views])
+        named = (names[:, None] == names) & (names != "")
+        same = np.eye(len(views), dtype=bool) | (named & (apart < SAME_PLACE))
+        earliest = same.argmax(1)
         first, numbers = np.unique(earliest, return_inverse=True)
         return cls(numbers, first)
 
