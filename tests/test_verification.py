@@ -132,11 +132,12 @@ def aligned(
     mesh: Mesh,
     observations,
     yaws,
+    camera: str = "",
 ) -> tuple[SurfaceCaster, np.ndarray, np.ndarray]:
     """Poses found from some azimuths, and how likely the views are with each."""
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
-    coarse = [depth_view(each, 24) for each in observations]
-    fine = [depth_view(each, SIDE) for each in observations]
+    coarse = [replace(depth_view(each, 24), camera=camera) for each in observations]
+    fine = [replace(depth_view(each, SIDE), camera=camera) for each in observations]
     seen = np.mean([np.median(view.thing_points, axis=0) for view in coarse], axis=0)
     found = start(
         np.zeros(len(yaws), int),
@@ -219,7 +220,7 @@ def test_frames_of_a_standing_camera_share_its_error(frames):
     one, other, _ = views_of(mesh, 0.5)
     error = np.array([0.004, -0.003, 0.002])
     views = [displaced(one, error)] * frames + [other]
-    found, poses, _ = aligned(mesh, views, np.array([0.4]))
+    found, poses, _ = aligned(mesh, views, np.array([0.4]), "fixed")
     true = true_pose(mesh, 0.5)
     true[:3, 3] += error / 2
     assert off_by(poses[0], true, mesh.centre)[1] < 0.7
