@@ -47,6 +47,9 @@ DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
 MOST_LOOKS = 4  # views of one state of the bin
 MOST_FAILURES = 3  # grasps in a row that hold nothing, after which the arm gives up
+SAME_PLACE = (
+    0.02  # metres from a grasp that held nothing within which none is tried again
+)
 BEFORE_GRASP = 0.10  # metres of the straight way to a grasp
 LIFT = np.array([0, 0, 0.20])  # metres
 OVER_BOX = 0.26  # metres above the table at which the fingers open
@@ -144,13 +147,15 @@ class Picker:
         self.first_pose = look_at_origin(FIRST_ELEVATION, np.pi, DISTANCE)
         self.first_pose[:3, 3] += np.add(middle, [0, 0, 0.03])
         self.thinking = 0.0
+        self.looks = 0
+        self.begin = cell.seconds
         self.picks: list[Pick] = []
+        self.in_vain: list[np.ndarray] = []
         self._motions: dict[bytes, Motion] = {}
 
     def run(self) -> None:
         """Pick until the bin is empty, or nothing more can be done."""
-        failures = 0
-        while failures < MOST_FAILURES:
+        while len(self.in_vain) < MOST_FAILURES:
             begin = self.cell.seconds
             thought = self.thinking
             inside = set(self.still_inside)
@@ -167,7 +172,7 @@ class Picker:
                 self.thinking - thought,
             )
             self.picks.append(pick)
-            failures = 0 if out else failures + 1
+            self.in_vain = [] if out else [*self.in_vain, grasp.pose[:3, 3]]
             print(f"{len(self.picks)}: {pick}", flush=True)
 
     @property
@@ -191,6 +196,7 @@ class Picker:
         while pose is not None:
             self.move_camera(pose)
             frame = self.cell.look()
+            self.looks += 1
             begin = time.perf_counter()
             scene.update(frame)
             self._motions.clear()
@@ -224,7 +230,12 @@ class Picker:
         self.cell.follow(way)
 
     def can_grasp(self, pose: np.ndarray) -> bool:
-        """Whether the arm can grasp at a pose of the gripper, (4, 4), and bring the part away."""
+        """Whether the arm can grasp at a pose of the gripper, (4, 4), and bring the part away.
+
+        Where a grasp has just held nothing it is not tried again.
+        """
+        if any(np.linalg.norm(pose[:3, 3] - one) < SAME_PLACE for one in self.in_vain):
+            return False
         motion = self.plan(pose)
         if motion is not None:
             self._motions[pose.tobytes()] = motion
@@ -274,19 +285,24 @@ class Picker:
 
 
 def table(picker: Picker, poured: int) -> str:
-    """Results in words, a Markdown table."""
+    """Results as a Markdown table.
+
+    Views and seconds are those of all looks and grasps, in vain or not, for each grasp that
+    brought a part out; seconds of motion are simulated time.
+    """
     done = [pick for pick in picker.picks if pick.true]
     wrong = sum(pick.said not in pick.true for pick in done)
+    along = sum(len(pick.true) > 1 for pick in done)
     out = poured - len(picker.still_inside)
     count = max(len(done), 1)
-    views = sum(pick.views for pick in picker.picks) / count
-    seconds = sum(pick.seconds for pick in picker.picks) / count
+    views = picker.looks / count
+    seconds = (picker.cell.seconds - picker.begin) / count
     thinking = picker.thinking / count
     return "\n".join(
         [
-            "| parts out | wrong picks | grasps | views a pick | s of motion | s of thought |",
-            "|---|---|---|---|---|---|",
-            f"| {out} of {poured} | {wrong} | {len(picker.picks)} | {views:.2f} |"
+            "| parts out | wrong | two at once | grasps | views | s of motion | s of thought |",
+            "|---|---|---|---|---|---|---|",
+            f"| {out} of {poured} | {wrong} | {along} | {len(picker.picks)} | {views:.2f} |"
             f" {seconds:.1f} | {thinking:.1f} |",
         ]
     )
