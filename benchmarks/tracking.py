@@ -385,6 +385,10 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
         f"off while visible: {len(wrong)} of {len(seen)} frames,"
         f" {sum(not one['lost'] for one in wrong)} of them not told lost"
     )
+    kept = [one for one in seen if not one["lost"]]
+    for unit in ("mm", "degrees"):
+        share = np.mean([one[unit] <= 1 for one in kept])
+        said.append(f"of those not told lost: {100 * share:.0f} % within 1 {unit}")
     said.append(
         f"told lost while on the thing: {sum(one['lost'] and not _is_off(one) for one in every)}"
     )

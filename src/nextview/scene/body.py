@@ -103,11 +103,13 @@ class Body:
         """Start with a thing in a pose."""
         caster = caster_of(posed)
         surface = caster.surfaces[0]
+
         rotation = posed.pose[:3, :3]
         deviations = [
             np.radians(max(posed.degrees, LEAST_DEGREES)),
             max(posed.millimetres, LEAST_MILLIMETRES) / 1000,
         ]
+
         spins = [each.axis for each in posed.symmetry or () if each.order == 0]
         state = BodyState.at_rest(
             rotation,
@@ -116,6 +118,7 @@ class Body:
             model,
             np.reshape(np.array(spins, np.float64), (-1, 3)),
         )
+
         return cls(
             number, posed.thing, surface, caster, state, 0.0, Rest.at(state), state
         )

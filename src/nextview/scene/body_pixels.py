@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from nextview.scene.body import Body
 from nextview.scene.motion import BodyState
@@ -14,7 +13,13 @@ from nextview.scene.placing import DEPTH_RANGE, SEEN_THROUGH, log_density
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
+from nextview.things.depth_view import (
+    ELSEWHERE,
+    NOT_MEASURED,
+    THING,
+    DepthView,
+    outline,
+)
 from nextview.things.expected_images import LOWEST_COSINE
 from nextview.things.ground import Ground
 from nextview.things.registration import (
@@ -85,10 +90,12 @@ class BodyPixels:
         if lines is None:
             return None
         rows, columns = lines
+
         view = _view_of(frame, rows, columns, noise)
         points = view.origin.astype(np.float32) + view.rays * view.depth[:, None]
         without = np.full(len(points), np.log(0.5 / DEPTH_RANGE))
         seen = view.kind != NOT_MEASURED
+
         if ground is not None and seen.any():
             heights = ground.height(points)
             slope = np.abs(view.rays @ ground.normal).clip(LOWEST_COSINE)
@@ -101,6 +108,7 @@ class BodyPixels:
                 level=seen & (on > without),
             )
             without = np.logaddexp(without, on)
+
         for other in others:
             apart = np.linalg.norm(points - other.state.centre, axis=1)
             near = seen & (apart < other.surface.radius + other.displaced)
@@ -124,7 +132,7 @@ class BodyPixels:
         if seen.any():
             likely = body.log_density(self.points[seen], view.noise[seen])
             thing[seen] = likely > self.without[seen]
-        edge, towards = _outline(thing.reshape(view.shape), view.step)
+        edge, towards = outline(thing.reshape(view.shape), view.step)
         return replace(
             view,
             kind=np.where(thing, THING, view.kind),
@@ -219,10 +227,13 @@ def _lines_around(body: Body, frame: Frame) -> tuple[Index, Index] | None:
     nearest = corners[:, 2].min()
     if nearest <= 0:
         return None
+
     at = frame.pinhole.project(corners)
-    low, high = at.min(0), at.max(0)
+    low = at.min(0)
+    high = at.max(0)
     wide = AROUND_DEVIATIONS * body.displaced * frame.intrinsics[0, 0] / nearest
     margin = max(wide, AROUND_OUTLINE * (high - low).max())
+
     height, width = frame.shape
     first = np.clip(low - margin, 0, [width - 1, height - 1]).astype(int)
     last = np.clip(high + margin, 0, [width - 1, height - 1]).astype(int)
@@ -242,6 +253,7 @@ def _view_of(frame: Frame, rows: Index, columns: Index, noise: Noise) -> DepthVi
     rays = np.ones((len(rows), len(columns), 3), np.float32)
     rays[..., 0] = frame.rays[0][columns]
     rays[..., 1] = frame.rays[1][rows][:, None]
+
     return DepthView(
         origin=frame.camera_to_world[:3, 3],
         camera_axes=axes,
@@ -319,6 +331,7 @@ def _gain_of_edges(view: DepthView, explained: Mask, pixels: BodyPixels) -> floa
     inside = explained.reshape(view.shape)
     depth = view.depth.reshape(view.shape)
     noise = view.noise.reshape(view.shape)
+
     goes_on = 0
     ends = 0
     for axis in (0, 1):
@@ -332,28 +345,8 @@ def _gain_of_edges(view: DepthView, explained: Mask, pixels: BodyPixels) -> floa
             near += STEEPEST * view.step[axis] * view.pitch * depth[one][pairs]
             goes_on += int((np.abs(behind) < near).sum())
             ends += int((behind >= near).sum())
+
     return float(
         goes_on * np.log(TOUCHING_SHARE / SMOOTH_SHARE)
         + ends * np.log((1 - TOUCHING_SHARE) / (1 - SMOOTH_SHARE))
     )
-
-
-def _outline(mask: Mask, step: Float) -> tuple[Float32, Float32]:
-    """Signed distance of each pixel of a grid to an outline, and the direction to it.
-
-    Args:
-        mask: inside the outline, (R, C) bool.
-        step: of rows and columns, (2,), pixels of the image.
-
-    Returns:
-        Distances, (R, C) float32, pixels of the image, negative inside, infinity without an
-        outline; and directions, x and y, (R, C, 2) float32.
-    """
-    if not mask.any():
-        nowhere = np.zeros((*mask.shape, 2), np.float32)
-        return np.full(mask.shape, np.inf, np.float32), nowhere
-    outside, nearest = distance_transform_edt(~mask, step, return_indices=True)
-    within = distance_transform_edt(np.pad(mask, 1), step)[1:-1, 1:-1]
-    away = (nearest - np.indices(mask.shape)) * step[:, None, None]
-    towards = np.stack([away[1], away[0]], -1) / np.maximum(outside, 1e-6)[..., None]
-    return (outside - within).astype(np.float32), towards.astype(np.float32)

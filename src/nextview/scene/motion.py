@@ -193,12 +193,22 @@ class Rest:
 
     @classmethod
     def at(cls, state: BodyState, probability: float = 0.5) -> Rest:
-        """Return a body that rests where it is."""
+        """Return a body that rests where it is.
+
+        Args:
+            state: in which it would be if it moved.
+            probability: that it rests.
+        """
         still = replace(state, velocity=np.zeros(6))
         return cls(still, state.pose_covariance, probability)
 
     def after(self, seconds: float, model: MotionModel) -> Rest:
-        """Predict whether the body rests after some seconds."""
+        """Predict whether the body rests.
+
+        Args:
+            seconds: from now, at least 0.
+            model: of the motion.
+        """
         starts = 1 - np.exp(-model.starting * seconds)
         stops = 1 - np.exp(-model.stopping * seconds)
         probability = self.probability * (1 - starts) + (1 - self.probability) * stops

@@ -76,6 +76,7 @@ class Tracker:
         top = scene.tops[-1]
         self._noise = top.noise
         self._ground = top.plane if top.shows_ground else None
+
         bodies = {}
         for one in scene.objects:
             body = self._bodies.get(one.number)

@@ -254,7 +254,8 @@ class MetricImage:
         rows, columns = _window(mask, side, WINDOW_MARGIN)
         top = rows[0]
         left = columns[0]
-        edge, towards = _outline(mask[top : rows[-1] + 1, left : columns[-1] + 1])
+        every = mask[top : rows[-1] + 1, left : columns[-1] + 1]
+        edge, towards = outline(every, np.ones(2))
         in_window = np.ix_(rows - top, columns - left)
         in_image = np.ix_(rows, columns)
 
@@ -370,17 +371,26 @@ def _step(lines: Index) -> float:
     return float(lines[-1] - lines[0]) / max(1, len(lines) - 1)
 
 
-def _outline(mask: Mask) -> tuple[Float32, Float32]:
-    """Signed distance of each pixel to the outline, negative inside, and the direction to it."""
-    if mask.all():
-        return np.full(mask.shape, -np.inf, np.float32), np.zeros(
-            (*mask.shape, 2),
-            np.float32,
-        )
+def outline(mask: Mask, step: Float) -> tuple[Float32, Float32]:
+    """Signed distance of each pixel of a grid to the outline of a thing, and the direction to it.
 
-    outside, nearest = distance_transform_edt(~mask, return_indices=True)
-    within = distance_transform_edt(mask)
-    rows, columns = np.indices(mask.shape)
-    to_mask = np.stack([nearest[1] - columns, nearest[0] - rows], -1)
-    towards = to_mask / np.maximum(outside, 1)[..., None]
+    Where the thing is cut off by the edge of the grid, it has no outline.
+
+    Args:
+        mask: pixels that show the thing, (R, C) bool.
+        step: spacing of rows and columns, (2,), pixels of the image.
+
+    Returns:
+        Distances, (R, C) float32, pixels of the image, negative inside, infinite without an
+        outline; and directions, x and y, (R, C, 2) float32, unit vectors, zero inside.
+    """
+    if mask.all() or not mask.any():
+        distance = -np.inf if mask.all() else np.inf
+        nowhere = np.zeros((*mask.shape, 2), np.float32)
+        return np.full(mask.shape, distance, np.float32), nowhere
+
+    outside, nearest = distance_transform_edt(~mask, step, return_indices=True)
+    within = distance_transform_edt(mask, step)
+    down, aside = (nearest - np.indices(mask.shape)) * step[:, None, None]
+    towards = np.stack([aside, down], -1) / np.maximum(outside, 1)[..., None]
     return (outside - within).astype(np.float32), towards.astype(np.float32)
