@@ -7,19 +7,20 @@ error of 4 mm and 0.6 degrees in a random direction.
     python benchmarks/fixed_cameras.py --seeds 100 120 --moments 4
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import tyro
+from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
+from nextview.things.memory import taught_meshes
 from nextview.types import Float
 
 NAMES = ("cracker_box", "mug", "mustard_bottle", "tomato_soup_can", "power_drill")
@@ -28,23 +29,23 @@ MILLIMETRES = 4.0
 DEGREES = 0.6
 
 
-def main() -> None:
-    """Print what is told of exact poses, and of poses with an error."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", nargs=2, type=int, default=(100, 120))
-    parser.add_argument("--moments", type=int, default=4)
-    given = parser.parse_args()
-    seeds = range(*given.seeds)
-    meshes = meshes_of(NAMES)
+def main(seeds: tuple[int, int] = (100, 120), moments: int = 4) -> None:
+    """Print what is told of exact poses, and of poses with an error.
 
-    found = [told(meshes, seed, given.moments) for seed in seeds]
+    Args:
+        seeds: first seed of the rigs, and the one after the last.
+        moments: of each rig.
+    """
+    meshes = taught_meshes("ycb", NAMES)
+
+    found = [told(meshes, seed, moments) for seed in track(range(*seeds), "rigs")]
     exact, wrong = zip(*found, strict=True)
     off = np.array(
         [(one.millimetres - MILLIMETRES, one.degrees - DEGREES) for one in wrong]
     )
     worst = np.abs(off).max(0)
     within = (np.abs(off) < [1.0, 0.15]).all(1)
-    print(f"{len(found)} rigs, {given.moments} moments each")
+    print(f"{len(found)} rigs, {moments} moments each")
     print(f"exact poses: {sum(one.noticed for one in exact)} are reported")
     print(
         f"poses off by {MILLIMETRES:g} mm and {DEGREES:g} degrees:"
@@ -53,18 +54,6 @@ def main() -> None:
         f" {np.abs(off[:, 0]).mean():.2f} mm and {np.abs(off[:, 1]).mean():.3f} degrees, largest"
         f" {worst[0]:.2f} mm and {worst[1]:.3f} degrees"
     )
-
-
-def meshes_of(names: Sequence[str]) -> list[Mesh]:
-    """Surfaces of things of the bundled memory."""
-    card, memory = open_memory("ycb")
-    known = [thing.name for thing in card.memory.things]
-    found = []
-    for name in names:
-        surface = memory.surfaces.surface(known.index(name), name)
-        vertices = surface.vertices.astype(float)
-        found.append(make_mesh(vertices, surface.faces, name, "m"))
-    return found
 
 
 def told(
@@ -118,4 +107,4 @@ def direction(rng: np.random.Generator) -> Float:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

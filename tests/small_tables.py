@@ -4,24 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
+from nextview.things.memory import taught_meshes
 
 CENTRE = np.array([0, 0, 0.03])
 
 
 def meshes_of(names: Sequence[str]) -> dict[str, Mesh]:
     """Surfaces of the bundled memory, by name."""
-    card, memory = open_memory("ycb")
-    known = [thing.name for thing in card.memory.things]
-
-    def mesh(name):
-        surface = memory.surfaces.surface(known.index(name), name)
-        return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
-
-    return {name: mesh(name) for name in names}
+    return dict(zip(names, taught_meshes("ycb", names), strict=True))
 
 
 def camera_over(

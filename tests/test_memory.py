@@ -18,7 +18,7 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import find_models, read_card
-from nextview.things.memory import open_memory
+from nextview.things.memory import open_memory, taught_meshes
 from nextview.things.recogniser import open_recogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
@@ -605,3 +605,16 @@ def test_stored_surfaces_come_back_as_they_were(many):
             atol=np.ptp(points) / 65535,
         )
         np.testing.assert_array_equal(again.faces, surface.faces)
+
+
+def test_the_surfaces_of_things_are_meshes_in_metres(knobs_memory):
+    path = knobs_memory / "memory.json"
+    card, memory = open_memory(path)
+    name = card.memory.things[-1].name
+    surface = memory.surfaces.surface(len(card.memory.things) - 1, name)
+    (mesh,) = taught_meshes(path, [name])
+    assert mesh.name == name
+    extent = np.ptp(mesh.vertices, axis=0) * mesh.radius
+    np.testing.assert_allclose(extent, np.ptp(surface.vertices, axis=0), atol=1e-6)
+    with pytest.raises(ModelError, match="knows no mugg; did you mean 'mug'"):
+        taught_meshes("ycb", ["mugg"])

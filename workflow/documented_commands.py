@@ -168,22 +168,12 @@ FEWER = {  # what a page says of the published runs, and how many it is here
 TABLE_OF_THINGS = """
 import numpy as np
 
-from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
-
-card, memory = open_memory("ycb")
-names = [thing.name for thing in card.memory.things]
-
-
-def mesh_of(name):
-    surface = memory.surfaces.surface(names.index(name), name)
-    return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
-
+from nextview.things.memory import taught_meshes
 
 rng = np.random.default_rng(4)
-meshes = [mesh_of(name) for name in ("cracker_box", "mug", "banana")]
+meshes = taught_meshes("ycb", ("cracker_box", "mug", "banana"))
 table = TableCamera(SimulatedTable.draw(meshes, rng), SENSORS["stereo"], rng)
 """
 BEFORE = {  # what Python blocks of a page take for granted
@@ -240,22 +230,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
-
-card, memory = open_memory("ycb")
-names = [thing.name for thing in card.memory.things]
-
-
-def mesh_of(name):
-    surface = memory.surfaces.surface(names.index(name), name)
-    return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
-
+from nextview.things.memory import taught_meshes
 
 rng = np.random.default_rng(4)
-meshes = [mesh_of(name) for name in ("cracker_box", "mug", "mustard_bottle")]
+meshes = taught_meshes("ycb", ("cracker_box", "mug", "mustard_bottle"))
 upright = SimulatedTable.draw(meshes, rng, resting=lambda mesh: np.eye(3)[None])
 camera = TableCamera(upright, SENSORS["stereo"], rng)
 intrinsics = camera.sensor.intrinsics

@@ -26,11 +26,10 @@ from tf2_msgs.msg import TFMessage
 from nextview.captured.folders import read_capture
 from nextview.captured.messages import pose_of
 from nextview.errors import NextviewError, ObservationError
-from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
+from nextview.things.memory import taught_meshes
 from nextview.types import Float
 from nextview_ros.conversion import fill_transform
 
@@ -79,15 +78,8 @@ class TableFrames:
     """Frames of a simulated camera over a table."""
 
     def __init__(self) -> None:
-        card, memory = open_memory("ycb")
-        names = [thing.name for thing in card.memory.things]
-        meshes = []
-        for name in ON_TABLE:
-            surface = memory.surfaces.surface(names.index(name), name)
-            vertices = surface.vertices.astype(np.float64)
-            meshes.append(make_mesh(vertices, surface.faces, name, "m"))
         rng = np.random.default_rng(5)
-        table = SimulatedTable.draw(meshes, rng, gap=0.08)
+        table = SimulatedTable.draw(taught_meshes("ycb", ON_TABLE), rng, gap=0.08)
         self.camera = TableCamera(table, SENSORS["stereo"], rng)
 
     def first(self) -> Frame:

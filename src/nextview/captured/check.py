@@ -9,6 +9,7 @@ from nextview.captured.frames import Capture, CapturedFrame
 from nextview.captured.late_poses import Shift, find_shifts
 from nextview.errors import DatasetError, ObservationError
 from nextview.sensing.agreement import Agreement, SurfaceView, compare, surface_view
+from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
 from nextview.sensing.frame import Frame
 from nextview.sensing.mistakes import (
     LEAST_EXPLAINED,
@@ -31,6 +32,7 @@ TIMES_USUAL = 4.0
 CONTRADICTED_IN_ALL = 0.3
 FEWEST_TO_BLAME = 5  # least number of frames for single ones to be left out
 NAMED_FRAMES = 3  # frames named in a message; the others are counted
+COMPARED_MOMENTS = 6  # moments of several cameras that are registered: a second each
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
     "TUM RGB-D": "this layout, 5000 per metre",
@@ -388,3 +390,26 @@ def _frames_late(shift: Shift) -> str:
     if shift.frames > 0:
         return f"{many} late: each frame has the pose of an earlier one"
     return f"{many} early: each frame has the pose of a later one"
+
+
+def errors_of_cameras(capture: Capture) -> list[CameraOffset]:
+    """Estimate the errors of the poses of several cameras, from some evenly spread moments.
+
+    Args:
+        capture: of several cameras; its images are read.
+
+    Returns:
+        The error of each camera relative to the first one; a camera that sees too little of what
+        others see is left out.
+
+    Raises:
+        DatasetError: an image cannot be read.
+    """
+    moments = [frames for frames in capture.moments if len(frames) > 1]
+    few = np.linspace(0, len(moments) - 1, min(len(moments), COMPARED_MOMENTS))
+    return camera_offsets(
+        [
+            [captured.read(masked=False) for captured in moments[k]]
+            for k in np.unique(few.astype(int))
+        ]
+    )

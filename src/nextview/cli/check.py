@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-import numpy as np
-
-from nextview.captured.check import check_capture
+from nextview.captured.check import check_capture, errors_of_cameras
 from nextview.captured.depth_folder import camera_folders
 from nextview.captured.folders import is_capture, read_capture
 from nextview.captured.frames import Capture
@@ -13,9 +11,6 @@ from nextview.cli.progress import console, track_all
 from nextview.data import store as view_store
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
-from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
-
-COMPARED_MOMENTS = 6  # moments of several cameras that are registered: a second each
 
 
 def check(
@@ -63,7 +58,7 @@ def _check_frames(read: Capture) -> None:
     if len(cameras) < 2:
         return
 
-    offsets = _offsets(capture)
+    offsets = errors_of_cameras(capture)
     for offset in offsets:
         if offset.noticed:
             console.print(f"{offset}", style="yellow", soft_wrap=True)
@@ -83,18 +78,6 @@ def _check_frames(read: Capture) -> None:
                 style="yellow",
                 soft_wrap=True,
             )
-
-
-def _offsets(capture: Capture) -> list[CameraOffset]:
-    """Return the errors of the cameras of a capture, from some evenly spread moments."""
-    moments = [frames for frames in capture.moments if len(frames) > 1]
-    few = np.linspace(0, len(moments) - 1, min(len(moments), COMPARED_MOMENTS))
-    return camera_offsets(
-        [
-            [captured.read(masked=False) for captured in moments[k]]
-            for k in np.unique(few.astype(int))
-        ]
-    )
 
 
 def _check_store(store: Path, workers: Workers) -> None:

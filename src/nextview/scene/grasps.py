@@ -34,55 +34,40 @@ from nextview.sensing.tabletop import TableTop
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats, Index, Mask
 
-GRASP_CLEARANCE = (
-    0.003  # metres, error of a good pose and of a good hand-eye calibration
-)
+# metres, error of a good pose and of a good hand-eye calibration
+GRASP_CLEARANCE = 0.003
 FRICTION = 0.4  # coefficient of steel on dry rubber or plastic, the lower end of tables
 OBSTACLE_STEP = 0.003  # metres between the points that stand for obstacles of fingers
 PALM_STEP = 0.01  # metres between those of the palm
-STEEPEST_SURFACE = (
-    4.0  # of depth along the image; what is steeper mixes an edge and its background
-)
-FEWEST_CELL_PIXELS = (
-    3  # of a cell that faces the camera, whose mean has less noise than a pixel
-)
-LEAST_COVERED = (
-    0.25  # of a cell's side by pixels: a surface seen at 75 degrees; less is noise
-)
-OWN_SURFACE = (
-    0.004  # metres from a thing's scan within which measured points are its own
-)
+# of depth along the image; what is steeper mixes an edge and its background
+STEEPEST_SURFACE = 4.0
+# of a cell that faces the camera, whose mean has less noise than a pixel
+FEWEST_CELL_PIXELS = 3
+# of a cell's side by pixels: a surface seen at 75 degrees; less is noise
+LEAST_COVERED = 0.25
+# metres from a thing's scan within which measured points are its own
+OWN_SURFACE = 0.004
 OWN_PIXELS = 0.01  # the same for points in its mask, which noise has displaced
-FINGER_STEPS = (
-    3,
-    3,
-    9,
-)  # sample points of a finger across, along y, and along its length
-MOST_UNSEEN = (
-    0.25  # share of the fingers' space; less needs more views, more touches more
-)
+# sample points of a finger across, along y, and along its length
+FINGER_STEPS = (3, 3, 9)
+# share of the fingers' space; less needs more views, more touches more
+MOST_UNSEEN = 0.25
 APPROACH = 0.10  # metres of the straight way to a grasp
 COARSE_STEP = 16  # of so many points one is tested first
 
 GRASPED_POINTS = 1000  # of a thing, tested against the gripper
 CONTACT_POINTS = 300  # of a thing, on which a finger may press
-APPROACHES = (
-    16  # directions around the closing axis from which a pair of contacts is tried
-)
+# directions around the closing axis from which a pair of contacts is tried
+APPROACHES = 16
 TIP_DEPTHS = (0.002, 0.01)  # metres by which the fingertips reach beyond the contacts
-PAD_GRID = (
-    -0.4,
-    0.0,
-    0.4,
-)  # places on a finger, in its widths, that should touch the thing
+# places on a finger, in its widths, that should touch the thing
+PAD_GRID = (-0.4, 0.0, 0.4)
 PAD_TOUCH = 0.001  # metres within which they do
-ALIKE_PLACE = (
-    0.008  # metres; of grasps from the same side that are closer the best is kept
-)
+# metres; of grasps from the same side that are closer the best is kept
+ALIKE_PLACE = 0.008
 
-HALF_TURN = np.diag(
-    [-1.0, -1.0, 1.0, 1.0]
-)  # of the gripper, which exchanges the fingers
+# of the gripper, which exchanges the fingers
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -270,7 +255,8 @@ def propose_grasps(
     poses, widths = _around_contacts(*pairs)
     for step in (COARSE_STEP, 1):
         fits = ~_touches_itself(points[::step], poses, widths, gripper)
-        poses, widths = poses[fits], widths[fits]
+        poses = poses[fits]
+        widths = widths[fits]
     if not len(poses):
         return ()
 
@@ -288,13 +274,12 @@ def _surface_points(
     surface: Surface, count: int, rng: np.random.Generator
 ) -> tuple[Float, Float]:
     """Draw points on a surface, (N, 3), and the normals of their triangles, (N, 3)."""
-    corners = surface.vertices[surface.faces].astype(np.float64)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(across, axis=1)
-    face = rng.choice(len(areas), count, p=areas / areas.sum())
+    chosen = surface.faces[surface.triangles_by_area(count, rng)]
+    corners = surface.vertices[chosen].astype(np.float64)
     weights = rng.dirichlet(np.ones(3), count)
-    points = np.einsum("nk,nkd->nd", weights, corners[face])
-    return points, across[face] / areas[face, None]
+    points = np.einsum("nk,nkd->nd", weights, corners)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return points, across / np.linalg.norm(across, axis=1, keepdims=True)
 
 
 def _first_hits(
@@ -379,13 +364,16 @@ def _touches_itself(
 ) -> Mask:
     """Whether fingers or palm are in the thing before the fingers close, (G,) bool."""
     x, y, z = _in_gripper(points.astype(np.float32), poses.astype(np.float32))
-    half = widths[:, None] / 2
-    fingers = (np.abs(x) < gripper.finger_width / 2) & (z < 0)
-    fingers &= (y := np.abs(y)) > half + PAD_TOUCH
-    fingers &= y < half + GRASP_CLEARANCE + gripper.finger_thickness
-    palm = (np.abs(x) < gripper.palm[0] / 2) & (y < gripper.palm[1] / 2)
+    x = np.abs(x)
+    y = np.abs(y)
     behind = z < -gripper.finger_length
-    return np.asarray((fingers & ~behind | palm & behind).any(1))
+
+    half = widths[:, None] / 2
+    fingers = (x < gripper.finger_width / 2) & (z < 0) & ~behind
+    fingers &= y > half + PAD_TOUCH
+    fingers &= y < half + GRASP_CLEARANCE + gripper.finger_thickness
+    palm = (x < gripper.palm[0] / 2) & (y < gripper.palm[1] / 2) & behind
+    return np.asarray((fingers | palm).any(1))
 
 
 def _in_gripper(points: Float, poses: Float) -> tuple[Float, Float, Float]:
@@ -463,6 +451,7 @@ def free_grasps(
     """
     number(clearance, "the clearance", 0, 0.1)
     number(most_unseen, "the largest unseen share", 0, 1)
+
     known = {
         one.number: points for one in objects if (points := _known(one)) is not None
     }
@@ -475,6 +464,7 @@ def free_grasps(
     ]
     if not offering:
         return []
+
     measured = _Measured.of(tops, objects)
     found = []
     for one in offering:
@@ -546,7 +536,14 @@ def within_reach(
     reachable: Callable[[Float], bool],
     most: int | None,
 ) -> list[FreeGrasp]:
-    """Return the first grasps that an arm can reach, as they are or with the fingers exchanged."""
+    """Return the first grasps that an arm can reach, as they are or with the fingers exchanged.
+
+    Args:
+        found: free grasps, the best first.
+        reachable: function that returns True if the arm can bring the gripper to a pose,
+            gripper-to-world, (4, 4).
+        most: largest number of grasps; None for all.
+    """
     kept: list[FreeGrasp] = []
     for grasp in found:
         if most is not None and len(kept) >= most:
@@ -590,6 +587,7 @@ class _Measured:
             for one in objects:
                 if number_of_frame in one.pixels:
                     owner[one.pixels[number_of_frame]] = one.number
+
             shown = depth > 0
             nearest = ndimage.minimum_filter(np.where(shown, depth, np.inf), 3)
             pixel = depth / top.frame.intrinsics[0, 0]
@@ -604,6 +602,7 @@ class _Measured:
                 step * pixel[rows, columns],
                 owner[rows, columns],
             )
+
             past = np.zeros(len(cells), bool)
             for later in tops[number_of_frame + 1 :]:
                 past |= _depth_behind(later, cells) > 2 * OBSTACLE_STEP
@@ -621,7 +620,8 @@ class _Measured:
             number_of_object: of the object.
             own: points on its scan, (K, 3), metres.
         """
-        low, high = own.min(0) - OWN_PIXELS, own.max(0) + OWN_PIXELS
+        low = own.min(0) - OWN_PIXELS
+        high = own.max(0) + OWN_PIXELS
         near = ((self.points > low) & (self.points < high)).all(1)
         away, _ = cKDTree(own).query(self.points[near])
         mine = self.owner[near] == number_of_object
@@ -729,11 +729,13 @@ def _unseen(
         indexing="ij",
     )
     finger = np.stack([x, y, z], -1).reshape(-1, 3)
+
     both = np.concatenate([finger, finger])
     sides = np.repeat([1.0, -1.0], len(finger))
     own = np.broadcast_to(both, (len(poses), *both.shape)).copy()
     own[..., 1] += sides * (openings[:, None] + gripper.finger_thickness) / 2
     places = np.einsum("gpd,gkd->gpk", own, poses[:, :3, :3]) + poses[:, None, :3, 3]
+
     free = np.zeros(places.shape[:2], bool)
     for top in tops:
         free |= (_depth_behind(top, places.reshape(-1, 3)) > 0).reshape(free.shape)

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from nextview.checks import check_array
+from nextview.checks import check_array, did_you_mean, one_line
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
+from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import Observation
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, NetworkRecogniser
@@ -481,3 +482,33 @@ def joined(clean: Floats, sensed: Floats) -> Float32:
         Unit vectors, (..., F) float32.
     """
     return unit(np.asarray(clean, np.float32) + np.asarray(sensed, np.float32))
+
+
+def taught_meshes(model: str | Path, names: Sequence[str]) -> list[Mesh]:
+    """Return the stored surfaces of taught things as meshes, for example to simulate them.
+
+    Args:
+        model: name of a bundled memory, or the path of its card.
+        names: of things with surfaces.
+
+    Returns:
+        The meshes, in metres, in the order of the names.
+
+    Raises:
+        ModelError: see ``open_memory``; or a thing is not known, or has no surface.
+    """
+    card, memory = open_memory(model)
+    assert card.memory is not None
+    known = [thing.name for thing in card.memory.things]
+    meshes = []
+    for name in names:
+        if name not in known:
+            raise ModelError(
+                f"{card.card_path}: knows no {one_line(name)}{did_you_mean(name, known)}"
+            )
+        surface = memory.surfaces.surface(known.index(name), name)
+        if surface is None:
+            raise ModelError(f"{card.card_path}: {one_line(name)} has no surface")
+        vertices = surface.vertices.astype(np.float64)
+        meshes.append(make_mesh(vertices, surface.faces, name, "m"))
+    return meshes
