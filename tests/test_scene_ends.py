@@ -83,6 +83,23 @@ def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
     assert scene.done
 
 
+def test_what_no_view_that_is_left_shows_does_not_keep_a_scene_open(ycb):
+    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=5)
+    camera.sensor = SENSORS["stereo"]
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    here = view(20, elevation=25)
+    scene.update(camera.frame(here))
+    assert any("hidden" in one.why and one.in_sight for one in scene.open)
+    assert not scene.done
+
+    scene.reachable = lambda pose: False
+    assert scene.open
+    assert not any(one.in_sight for one in scene.open)
+    assert "no view is left" in repr(scene.open[0])
+    assert scene.target is None
+    assert scene.done
+
+
 def test_small_steps_side_by_side_are_not_empty(ycb):
     rows, columns = np.mgrid[:480, :640]
     higher = (rows // 12 + columns // 12) % 2 == 0
@@ -106,6 +123,7 @@ def test_a_region_is_empty_where_its_ground_is_seen(ycb, low, high, said):
     look = scene.update(from_above(np.full((480, 640), 0.8)))
     assert names(look) == [said]
     assert scene.done == (said == "empty")
+    assert scene.target is not None
 
 
 def test_the_report_says_what_is_empty_and_what_is_not(ycb, capsys):
@@ -157,7 +175,7 @@ def litter(count: int) -> TableCamera:
 def test_a_limited_number_of_objects_is_verified_per_frame(ycb, capsys):
     scene = nextview.Scene(ycb)
     look = scene.update(litter(100).frame(view(20)))
-    segments = scene.tops[0].segments()
+    segments = scene.tops[0].seen.segments()
     assert len(segments) > MOST_VERIFIED + 10
 
     verified = [mask for thing in scene.objects for mask in thing.pixels.values()]

@@ -8,7 +8,7 @@ from small_tables import camera_over, view
 
 import nextview
 from nextview.scene.judging import Judge
-from nextview.scene.next_view import TableGround
+from nextview.scene.next_view import TableGround, outline_of
 from nextview.scene.parting import (
     MOST_CUT,
     MOST_JOINED,
@@ -21,6 +21,7 @@ from nextview.scene.parting import (
 )
 from nextview.scene.tracks import Track
 from nextview.segmentation.instances import instances_of
+from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 
 UP = np.array([0, 0, 1.0])
@@ -28,7 +29,7 @@ UP = np.array([0, 0, 1.0])
 
 def top_of(frame):
     """What a frame shows on its surfaces by the bundled network."""
-    return TableTop.of(frame, instances_of(None, frame, UP), UP)
+    return TableTop.of(segmented_frame(frame, instances_of(None, frame, UP), UP), UP)
 
 
 def judged_by(ycb):
@@ -55,7 +56,7 @@ def two_sides(
     for number, angle in enumerate(degrees):
         top = top_of(camera.frame(view(angle)))
         benches.append(Bench(top, number, judged))
-        of_frame = [new_track(mask, benches[-1]) for mask in top.segments()]
+        of_frame = [new_track(mask, benches[-1]) for mask in top.seen.segments()]
         found.append(
             [
                 replace(one, number=10 * number + k)
@@ -84,7 +85,7 @@ def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(ycb, ycb_
 
 def test_a_frame_full_of_scraps_is_parted_otherwise_a_few_times_only(ycb_meshes):
     top = top_of(camera_over([ycb_meshes["cracker_box"]]).frame(view(20)))
-    (box,) = top.segments()
+    (box,) = top.seen.segments()
     rows = np.flatnonzero(box.any(1))
     strips = []
     for some in np.array_split(rows[2:-2], 20):
@@ -154,5 +155,6 @@ def test_an_occluded_thing_is_not_visible(ycb, ycb_meshes):
     away = (box - can)[:2] / np.linalg.norm((box - can)[:2])
     behind_the_box = np.append(box[:2] + 0.5 * away, 0.08)
     before_the_can = np.append(can[:2] - 0.5 * away, 0.08)
-    assert ground.share_visible(before_the_can, tracks["tomato_soup_can"]) == 1
-    assert ground.share_visible(behind_the_box, tracks["tomato_soup_can"]) < 0.5
+    points = outline_of(tracks["tomato_soup_can"])
+    assert ground.past_others(before_the_can, points).all()
+    assert ground.past_others(behind_the_box, points).mean() < 0.5

@@ -5,6 +5,7 @@ true heights of these.
 """
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,7 @@ from nextview.errors import ObservationError, UsageError
 from nextview.scene.scene import Scene
 from nextview.segmentation.instances import Segmentation, instances_of
 from nextview.sensing import Box, Frame, ObservedObject
-from nextview.sensing.facets import noise_of
-from nextview.sensing.levels import Supports
+from nextview.sensing.segmented_frame import segmented_frame
 from nextview.simulation.tables import poses_around
 from nextview.simulation.worlds import BACKGROUND, SURFACE, slab
 
@@ -37,7 +37,7 @@ def height_of(plane):
 def supports_of(camera, frame, up=UP):
     """What a frame of a labelled camera truly shows of surfaces."""
     truth = instances_of(camera.truth, frame)
-    return Supports.of(frame, truth.masks, truth.surface, noise_of(frame), up)
+    return segmented_frame(frame, truth, up)
 
 
 @pytest.fixture(scope="module")
@@ -156,8 +156,8 @@ def test_a_level_that_a_frame_does_not_show_still_carries(small_table):
     before = supports_of(camera, frame)
     truth = instances_of(camera.truth, frame)
     nothing = np.zeros(frame.shape, bool)
-    noise = noise_of(frame)
-    after = Supports.of(frame, truth.masks, nothing, noise, UP, before.levels)
+    without = replace(truth, surface=nothing)
+    after = segmented_frame(frame, without, UP, before.levels)
     assert not any(level.pixels.any() for level in after.levels)
     for level in after.carriers:
         assert height_of(level.plane) == pytest.approx(0.45, abs=0.01)

@@ -14,7 +14,6 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.novelty import ViewScore
 from nextview.recognition.protocol import (
     JointBelief,
     JudgesTogether,
@@ -22,9 +21,9 @@ from nextview.recognition.protocol import (
 )
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.pose_frame import PoseFrame
-from nextview.session.result import SUSPICIOUS, Recognition
+from nextview.session.result import Recognition
 from nextview.session.system import System
-from nextview.session.view import View, is_doubtful
+from nextview.session.view import View
 from nextview.types import Floats
 
 
@@ -83,14 +82,11 @@ class Judge:
         recogniser = system.models.recogniser
         seen = [one for one in thing.observations if one.seen]
         joint = None
-        views = self._views(thing)
         if seen and isinstance(recogniser, JudgesTogether):
             total = np.sum([self._log_evidence(one) for one in seen], axis=0)
             joint = recogniser.together(seen, total, len(seen))
-            views[-1] = replace(views[-1], belief=joint.belief, joint=joint)
-
         result = Recognition(
-            tuple(views),
+            tuple(self._views(thing, joint)),
             system.classes,
             False,
             system.sphere,
@@ -100,7 +96,8 @@ class Judge:
             impossible=classes_of_other_size(recogniser, thing.observations[-1].radius),
             poses_in=PoseFrame.of(thing),
         )
-        return replace(result, confident=self._confident(result, joint))
+        enough = result.seen and self._reached(result.views)
+        return replace(result, confident=enough and not result.refused)
 
     def _log_evidence(self, seen: Observation) -> Floats:
         """Return the network evidence of a view in a form that can be summed over views, (D,)."""
@@ -108,45 +105,38 @@ class Judge:
         azimuth = azimuth_of(direction_of(seen.pose)[None])
         return np.asarray(log_evidence_of(found.logits, found.azimuth_bins, azimuth)[0])
 
-    def _views(self, thing: ObservedObject) -> list[View]:
-        """Return the views of an object, each with its own belief and the belief so far."""
-        calibration = self.system.models.recogniser.calibration
-        sphere = self.system.sphere
-        classes = len(self.system.classes)
-        even = np.full(classes, 1 / classes)
-        total: Floats = np.zeros(())
+    def _views(self, thing: ObservedObject, joint: JointBelief | None) -> list[View]:
+        """Return the views of an object; the joint belief is that after the last one."""
+        system = self.system
+        total: Floats | None = None
         counted = 0
-        belief = even
         views = []
-
         for number, seen in enumerate(thing.observations):
-            alone = even
-            score: ViewScore | None = None
+            evidence = None
             if seen.seen:
+                evidence = self._said[seen]
                 own = self._log_evidence(seen)
-                total = total + own
+                total = own if total is None else total + own
                 counted += 1
-                alone = calibration.belief(own, 1, classes)
-                belief = calibration.belief(total, counted, classes)
-                novelty = self._said[seen].novelty
-                score = None if novelty is None else novelty[0]
-            direction = direction_of(seen.pose)
-            view = View(
-                sphere.nearest(direction)[0],
+            last = number == len(thing.observations) - 1
+            view = View.of(
                 seen,
-                alone=alone,
-                belief=belief,
-                maps={},
-                next_view=None,
-                travel=0.0,
-                arc=0.0,
-                direction=direction,
-                score=score,
-                warnings=thing.warnings_of_view(number),
+                evidence,
+                total,
+                counted,
+                system.sphere,
+                system.models.recogniser,
+                joint if last else None,
             )
-            views.append(view)
-
+            views.append(replace(view, warnings=thing.warnings_of_view(number)))
         return views
+
+    def _reached(self, views: Sequence[View]) -> bool:
+        """Return True if the belief is high enough."""
+        counted = np.cumsum([view.observation.seen for view in views])
+        beliefs = np.stack([view.belief for view in views])
+        along = self.system.stopping.reached_along(beliefs, np.maximum(counted, 1))
+        return bool(along[-1])
 
     @property
     def widest(self) -> float | None:
@@ -155,16 +145,3 @@ class Judge:
         if card is None or card.size is None:
             return None
         return 2 * float(card.size.largest)
-
-    def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
-        """Return True if the belief is high enough and the object fits its hypothesis."""
-        system = self.system
-        if not result.seen or result.unknown or (joint is not None and joint.doubt):
-            return False
-        if is_doubtful([view.warnings for view in result.views]):
-            return False
-        counted = np.cumsum([view.observation.seen for view in result.views])
-        beliefs = np.stack([view.belief for view in result.views])
-        if not system.stopping.reached_along(beliefs, np.maximum(counted, 1))[-1]:
-            return False
-        return result.novelty is None or result.novelty >= SUSPICIOUS * system.unknown

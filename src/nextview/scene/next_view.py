@@ -124,21 +124,18 @@ class TableGround:
         own = np.full(len(self.points), TABLE_CELL / 2)
         return self.clear(camera, self.points, (self.points @ self.axes.T)[:, 2], own)
 
-    def share_visible(self, camera: Float, track: Track) -> float:
-        """Return the share of the known surface of an object that would be visible past the others.
+    def past_others(self, camera: Float, points: Float) -> Mask:
+        """Return which points of one object would be visible past everything else, (N,) bool.
 
         Args:
             camera: position, (3,), world.
-            track: the object.
+            points: of the object, (N, 3), world, metres.
         """
-        points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
-        points = points[:: max(1, len(points) // SOME_POINTS)]
         middle = points.mean(0)
         aside = np.linalg.norm((points - middle) @ self.axes[:2].T, axis=1)
         # the object does not occlude itself, whatever the direction of the camera
         own = aside + aside.max() + TABLE_CELL
-        floor = np.full(len(points), self.floor)
-        return float(self.clear(camera, points, floor, own).mean())
+        return self.clear(camera, points, np.full(len(points), self.floor), own)
 
     def clear(self, camera: Float, points: Float, floor: Float, own: Float) -> Mask:
         """Return which points would be visible from a camera position, (N,) bool.
@@ -283,9 +280,16 @@ def object_value(
     told = None if track.settled else _information(system, track, views)
     if told is None:
         told = _from_another_side(track, tops, views)
+        points = outline_of(track)
         for row in np.flatnonzero(views.free):
-            told[row] *= ground.share_visible(views.poses[row, :3, 3], track)
+            told[row] *= ground.past_others(views.poses[row, :3, 3], points).mean()
     return told
+
+
+def outline_of(track: Track) -> Float:
+    """Sample the convex hulls of an object in all frames, (N, 3), world, metres."""
+    points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
+    return points[:: max(1, len(points) // SOME_POINTS)]
 
 
 def ground_value(

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nextview.scene.next_view import FEWEST_HIDDEN, TABLE_CELL, TableGround
+from nextview.scene.next_view import (
+    FEWEST_HIDDEN,
+    SOME_POINTS,
+    TABLE_CELL,
+    TableGround,
+    outline_of,
+)
 from nextview.scene.tracks import ENOUGH_VIEWS, Track
 from nextview.scene.unexplained import UnexplainedPatch
 from nextview.types import Float
@@ -19,15 +25,20 @@ class OpenPoint:
         number: of the object that is not settled; None for a part of the table.
         place: its middle, (3,), world, metres; None if it is not known.
         why: the reason, in words.
+        in_sight: whether a view that is left would show it.
     """
 
     number: int | None
     place: Float | None
     why: str
+    in_sight: bool = True
 
     def __repr__(self) -> str:
         """One line: ``3: its name is not confident, belief 0.731``."""
-        return self.why if self.number is None else f"{self.number}: {self.why}"
+        why = (
+            self.why if self.in_sight else f"{self.why}; no view is left that shows it"
+        )
+        return why if self.number is None else f"{self.number}: {why}"
 
 
 def open_points(
@@ -35,6 +46,7 @@ def open_points(
     patches: Sequence[UnexplainedPatch],
     ground: TableGround | None,
     ground_seen: bool,
+    cameras: Float,
 ) -> tuple[OpenPoint, ...]:
     """List what is not settled: objects, unexplained points, hidden ground.
 
@@ -43,27 +55,40 @@ def open_points(
         patches: parts of images that are neither ground nor an object.
         ground: top view of the table; None without an object.
         ground_seen: whether enough of the ground is visible to rule out further objects.
+        cameras: positions of the views that are left, (K, 3), world.
     """
-    found = [
-        OpenPoint(track.number, track.thing.object_frame.centre, _why(track))
-        for track in sorted(tracks, key=lambda track: track.number)
-        if not track.settled
-    ]
+    found = []
+    for track in sorted(tracks, key=lambda track: track.number):
+        if not track.settled:
+            place = track.thing.object_frame.centre
+            shown = _in_sight(ground, outline_of(track), cameras)
+            found.append(OpenPoint(track.number, place, _why(track), shown))
     for patch in patches:
         area = 1e4 * patch.area
         why = f"{area:.0f} square centimetres in view are neither ground nor an object"
-        found.append(OpenPoint(None, patch.points.mean(0), why))
+        few = patch.points[:: max(1, len(patch.points) // SOME_POINTS)]
+        shown = _in_sight(ground, few, cameras)
+        found.append(OpenPoint(None, patch.points.mean(0), why, shown))
     if ground is None:
         if not (patches or ground_seen):
-            found.append(OpenPoint(None, None, "too little of the ground is seen"))
+            why = "too little of the ground is seen"
+            found.append(OpenPoint(None, None, why, len(cameras) > 0))
         return tuple(found)
 
     hidden = ground.largest_hidden
     if len(hidden) >= FEWEST_HIDDEN:
         area = 1e4 * len(hidden) * TABLE_CELL**2
         why = f"{area:.0f} square centimetres of the ground are hidden in all frames"
-        found.append(OpenPoint(None, ground.points[hidden].mean(0), why))
+        shown = any(ground.visible(camera)[hidden].any() for camera in cameras)
+        found.append(OpenPoint(None, ground.points[hidden].mean(0), why, shown))
     return tuple(found)
+
+
+def _in_sight(ground: TableGround | None, points: Float, cameras: Float) -> bool:
+    """Return True if any of some points, (N, 3), would be visible from any camera, (K, 3)."""
+    if ground is None:
+        return len(cameras) > 0
+    return any(ground.past_others(camera, points).any() for camera in cameras)
 
 
 def _why(track: Track) -> str:

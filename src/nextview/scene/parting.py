@@ -477,7 +477,7 @@ def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     parts: dict[int, list[Mask]] = {}
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
-        found = [] if mask is None else bench.top.pieces_of(mask)
+        found = [] if mask is None else bench.top.seen.pieces_of(mask)
         if 1 < len(found) <= MOST_GROUP:
             parts[row] = found
     return _better(tracks, parts, bench)
@@ -504,7 +504,7 @@ def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
         if mask is None or rendered is None:
             continue
         around = ndimage.binary_dilation(rendered.around(mask.shape), iterations=2)
-        rests = bench.top.pieces_of(mask & ~around)
+        rests = bench.top.seen.pieces_of(mask & ~around)
         if rests:
             parts[row] = [mask & ~np.any(rests, axis=0), *rests]
     return _better(tracks, parts, bench)

@@ -27,7 +27,7 @@ from nextview.scene.grasps import (
     within_reach,
 )
 from nextview.scene.judging import Judge
-from nextview.scene.next_view import candidates
+from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
@@ -39,10 +39,12 @@ from nextview.scene.view_policies import (
     SceneChoice,
     ScenePolicy,
 )
-from nextview.segmentation.instances import Instances, Segmenter, instances_of
+from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
+from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.repeated import REPEATED
@@ -153,10 +155,13 @@ class Scene:
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
-        self.distance = (
-            None if distance is None else number(distance, "the distance", above=0)
-        )
-
+        self._views: Candidates | None = None
+        self._open: tuple[OpenPoint, ...] | None = None
+        self._targets: Float | None = None
+        self._target_rows: list[int] = []
+        self._failed: set[int] = set()
+        self._lock = RLock()
+        self.distance = distance
         self.reachable = reachable
         self.segmentation = segmentation
         self.system = models if isinstance(models, System) else load(models)
@@ -165,10 +170,6 @@ class Scene:
         self._judge = Judge(self.system, CORES)
         self._widest = self._judge.widest
         self._state = SceneState(region=region)
-        self._targets: Float | None = None
-        self._target_rows: list[int] = []
-        self._failed: set[int] = set()
-        self._lock = RLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the lock, so that a scene can be copied and pickled."""
@@ -203,12 +204,12 @@ class Scene:
 
         Further views help if the recognition of an object is uncertain, if many points in
         ``region`` or on the visible ground belong to no object, or if a large part of the ground is
-        occluded.
+        occluded; and if a view that is left would show it.
         """
-        state = self._state
-        if len(state.tops) >= self.system.stopping.max_views:
+        tops = self._state.tops
+        if len(tops) >= self.system.stopping.max_views:
             return True
-        return bool(state.tops) and not state.open
+        return bool(tops) and not any(point.in_sight for point in self.open)
 
     @property
     def open(self) -> tuple[OpenPoint, ...]:
@@ -216,7 +217,40 @@ class Scene:
 
         Empty before the first frame, and when further views would add little.
         """
-        return self._state.open
+        with self._lock:
+            if self._open is None:
+                views = self._candidates
+                left = np.zeros((0, 4, 4)) if views is None else views.poses[views.free]
+                self._open = self._state.open_points(left[:, :3, 3])
+            return self._open
+
+    @property
+    def distance(self) -> float | None:
+        """Distance of the camera from the centre of the scene in ``target``, metres.
+
+        None for that of the last frame. A change takes effect immediately.
+        """
+        return self._distance
+
+    @distance.setter
+    def distance(self, given: float | None) -> None:
+        self._distance = (
+            None if given is None else number(given, "the distance", above=0)
+        )
+        self._changed()
+
+    @property
+    def reachable(self) -> Callable[[Float], bool] | None:
+        """Whether the camera can reach a pose, camera-to-world, (4, 4); None for all poses.
+
+        It is asked once after each frame, for all candidates. A change takes effect immediately.
+        """
+        return self._reachable
+
+    @reachable.setter
+    def reachable(self, given: Callable[[Float], bool] | None) -> None:
+        self._reachable = given
+        self._changed()
 
     @property
     def target(self) -> Float | None:
@@ -224,8 +258,8 @@ class Scene:
 
         It maximises the expected information about uncertain objects and about the part of the
         table that is hidden in all frames, minus a small cost of travel; or it is the choice of
-        another ``policy``, which is asked once after each frame. None before the first frame, if
-        nothing was found, or if no view is left.
+        another ``policy``, which is asked once after each frame. Where nothing is found, views are
+        of the region or of the ground. None before the first frame, and if no view is left.
 
         Raises:
             PolicyError: a policy of your own failed.
@@ -250,21 +284,35 @@ class Scene:
 
     def _ranked(self) -> tuple[list[int], Float]:
         """Ask the policy; return the rows of the views, the best first, and their poses."""
-        around = self._state.around
-        if not len(around):
+        views = self._candidates
+        if views is None or not views.free.any():
             return [], np.zeros((0, 4, 4))
-
-        views = candidates(self.system, self._state.tops, around, self.distance)
-        free = views.free.copy()
-        free[list(self._failed)] = False
-        if self.reachable is not None:
-            free &= np.array([bool(self.reachable(pose)) for pose in views.poses])
-        if not free.any():
-            return [], np.zeros((0, 4, 4))
-
-        choice = SceneChoice(replace(views, free=free), self._state, self.system)
+        choice = SceneChoice(views, self._state, self.system)
         rows = self._policy.ranked(choice, self._rng)
         return rows, views.poses[rows]
+
+    @property
+    def _candidates(self) -> Candidates | None:
+        """Candidate views; those that failed or are out of reach are not free.
+
+        None before the first frame.
+        """
+        around = self._state.around
+        if self._views is None and len(around):
+            views = candidates(self.system, self._state.tops, around, self.distance)
+            free = views.free.copy()
+            free[list(self._failed)] = False
+            if self.reachable is not None:
+                rows = np.flatnonzero(free)
+                free[rows] = [bool(self.reachable(views.poses[row])) for row in rows]
+            self._views = replace(views, free=free)
+        return self._views
+
+    def _changed(self) -> None:
+        """Forget the candidate views, and what depends on them."""
+        self._views = None
+        self._targets = None
+        self._open = None
 
     def failed(self) -> None:
         """Report that the camera could not reach ``target``.
@@ -278,7 +326,7 @@ class Scene:
             if self.target is None:
                 raise SessionError("no view was asked for, so none has failed")
             self._failed.add(self._target_rows[0])
-            self._targets = None
+            self._changed()
 
     @overload
     def update(self, frame: Frame) -> Look: ...
@@ -311,6 +359,7 @@ class Scene:
                 return tuple([self._update(one) for one in frame])
             except BaseException:
                 self._state = before
+                self._changed()
                 raise
 
     def _update(self, frame: Frame) -> Look:
@@ -321,13 +370,12 @@ class Scene:
             return Look(False, warnings=(REPEATED,))
 
         before = self._state
-        instances = instances_of(self.segmentation, frame, self.up)
-        top = self._top_of(frame, instances, before.tops)
+        top = self._top_of(frame, before.tops)
         shown = top.plane if top.shows_ground else None
         top = replace(top, warnings=tuple(known.check(frame, shown)))
         state, look = self._after(before, top)
         self._state = state
-        self._targets = None
+        self._changed()
         return look
 
     def grasps(
@@ -419,21 +467,28 @@ class Scene:
             0.0 if box is None else box.radius,
         )
 
-    def _top_of(
-        self,
-        frame: Frame,
-        instances: Instances,
-        before: Sequence[TableTop],
-    ) -> TableTop:
-        """Find the support surfaces of a frame.
+    def _top_of(self, frame: Frame, before: Sequence[TableTop]) -> TableTop:
+        """Segment a frame, and find its surfaces and its ground.
 
         Raises:
-            ObservationError: there are none.
+            ObservationError: there is no ground.
         """
+        inside = frame.depth > 0 if frame.mask is None else frame.mask
+        if self.region is not None:
+            inside = inside & inside_box(frame, self.region)
+        instances = instances_of(self.segmentation, frame, self.up)
+        masks = tuple(mask & inside for mask in instances.masks)
         earlier = before[-1] if before else None
-        return TableTop.of(
-            frame, instances, self.up, earlier, self.region, self._widest
+        up = None if frame.pose is None else self.up
+        if up is None and earlier is not None:
+            up = earlier.plane.normal
+        seen = segmented_frame(
+            frame,
+            replace(instances, masks=masks),
+            up,
+            () if earlier is None else earlier.seen.levels,
         )
+        return TableTop.of(seen, self.up, earlier, inside, self._widest)
 
     def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
         """Return the scene after a frame; a frame that does not fit is left out.
@@ -444,7 +499,7 @@ class Scene:
         found, camera = changes(
             before.tracks,
             top,
-            top.segments(),
+            top.seen.segments(),
             before.tops,
             before.cameras,
         )
@@ -475,7 +530,7 @@ class Scene:
         there = [track for track, one in pairs if not one.contradicts]
         lost = [(track, one) for track, one in pairs if one.contradicts]
 
-        own, new = assign(top.segments(), there, top)
+        own, new = assign(top.seen.segments(), there, top)
         hidden = [track for row, track in enumerate(there) if row not in own]
         seen = {row: self._explained(there[row], own[row], top, number) for row in own}
         shown = [track for track in seen.values() if track is not None]

@@ -71,18 +71,30 @@ class SceneState:
         """True if enough of the ground is visible to rule out further objects."""
         return ground_seen(self.tops, self.region)
 
-    @cached_property
-    def open(self) -> tuple[OpenPoint, ...]:
-        """What is not settled; empty before the first frame."""
+    def open_points(self, cameras: Float) -> tuple[OpenPoint, ...]:
+        """Return what is not settled; empty before the first frame.
+
+        Args:
+            cameras: positions of the views that are left, (K, 3), world.
+        """
         if not self.tops:
             return ()
-        return open_points(self.tracks, self.unexplained, self.ground, self.ground_seen)
+        return open_points(
+            self.tracks, self.unexplained, self.ground, self.ground_seen, cameras
+        )
 
     @property
     def around(self) -> Float:
-        """Corners of all objects, or else of unexplained points, (N, 3), world, metres."""
+        """What views are taken of, (N, 3), world, metres; empty before the first frame.
+
+        Corners of all objects; or else of unexplained points, the region, or the ground.
+        """
         of_objects = [one.hull for each in self.tracks for one in each.thing.sightings]
         corners = of_objects or [patch.points for patch in self.unexplained]
+        if not corners and self.region is not None:
+            corners = [np.stack([self.region.low, self.region.high]) @ self.region.axes]
+        if not corners:
+            corners = [top.seen.surface_samples.points for top in self.tops[-1:]]
         return np.concatenate([np.zeros((0, 3)), *corners])
 
     @property
@@ -96,7 +108,7 @@ class SceneState:
                 ViewWarning("left unknown", f"{what}, the largest first", holds=False)
             )
 
-        left_out = len(self.tops[-1].carried_by_none) if self.tops else 0
+        left_out = len(self.tops[-1].seen.carried_by_none) if self.tops else 0
         if left_out:
             things = number_of(left_out, "thing")
             what = f"{things} in the last frame left out: no surface that is seen carries them"

@@ -119,10 +119,10 @@ def _patches(
         left &= inside_box(frame, region)
     else:
         left &= top.height > 0
-    left &= ~top.background
+    left &= ~top.seen.background
     if frame.mask is not None:
         left &= frame.mask
-    for mask in top.carried_by_none:
+    for mask in top.seen.carried_by_none:
         left &= ~mask
     for track in tracks:
         own = track.mask_in(number)

@@ -10,11 +10,11 @@ import numpy as np
 
 from nextview.errors import ObservationError
 from nextview.sensing.frame import Frame
-from nextview.sensing.levels import Supports
 from nextview.sensing.masks import SPHERE_MARGIN, inside_sphere, touching
 from nextview.sensing.object_frame import ObjectFrame
+from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Mask
 
 Parting = Literal["instance", "touching", "piece"]
 """Part of the segmentation that is one object: an instance, an instance with everything that
@@ -35,11 +35,10 @@ AIM_SPREAD = 0.08
 
 
 def choose_instance(
-    supports: Supports,
+    seen: SegmentedFrame,
     point: Float | None,
     known: ObjectFrame | None,
     parting: Parting = "instance",
-    pieces: Index | None = None,
 ) -> Mask:
     """Select the instance of a frame that is the object.
 
@@ -47,11 +46,10 @@ def choose_instance(
     the one at which the camera is aimed.
 
     Args:
-        supports: instances and support surfaces of the frame.
+        seen: the frame with its instances and surfaces.
         point: on the object, (3,), world, metres; None if not given.
         known: object frame from earlier frames; None in a first frame.
         parting: part of the segmentation that is one object.
-        pieces: of the segmentation, (H, W) int, 0 for none; None if there are none.
 
     Returns:
         Its mask, (H, W) bool.
@@ -59,33 +57,35 @@ def choose_instance(
     Raises:
         ObservationError: there is no such instance.
     """
-    chosen = _chosen(supports, point, known)
+    chosen = _chosen(seen, point, known)
     if parting == "touching":
-        return _with_neighbours(chosen, supports)
-    if parting == "piece" and pieces is not None:
+        return _with_neighbours(chosen, seen)
+    if parting == "piece" and (pieces := seen.pieces) is not None:
         numbers = np.unique(pieces[chosen & (pieces > 0)])
         masks = tuple(chosen & (pieces == number) for number in numbers)
-        carriers = (supports.under(chosen),) * len(masks)
-        parts = replace(supports, masks=masks, carriers=carriers)
+        carriers = (seen.under(chosen),) * len(masks)
+        parts = replace(seen, masks=masks, carriers=carriers)
         return _chosen(parts, point, known) if _of_size(parts) else chosen
     return chosen
 
 
-def _chosen(supports: Supports, point: Float | None, known: ObjectFrame | None) -> Mask:
+def _chosen(
+    seen: SegmentedFrame, point: Float | None, known: ObjectFrame | None
+) -> Mask:
     """Return the instance at the known place, at the point, or on the optical axis."""
     if known is not None:
-        return _seen_before(supports, known)
+        return _seen_before(seen, known)
     if point is not None:
-        return _at_point(supports, point)
-    return _aimed_at(supports)
+        return _at_point(seen, point)
+    return _aimed_at(seen)
 
 
-def _with_neighbours(chosen: Mask, supports: Supports) -> Mask:
+def _with_neighbours(chosen: Mask, seen: SegmentedFrame) -> Mask:
     """Return an instance with everything that touches it, directly or indirectly, (H, W) bool."""
     found = chosen
-    left = [mask for mask in supports.masks if not (mask & chosen).any()]
+    left = [mask for mask in seen.masks if not (mask & chosen).any()]
     while True:
-        beside = [touching(supports.frame, found, mask) for mask in left]
+        beside = [touching(seen.frame, found, mask) for mask in left]
         if not any(beside):
             return found
         for mask in compress(left, beside):
@@ -95,15 +95,15 @@ def _with_neighbours(chosen: Mask, supports: Supports) -> Mask:
         ]
 
 
-def _at_point(supports: Supports, point: Float) -> Mask:
+def _at_point(seen: SegmentedFrame, point: Float) -> Mask:
     """Return the instance nearest to a point, (3,), world, metres, on its surface or inside it."""
-    frame = supports.frame
+    frame = seen.frame
     away = float(np.linalg.norm(point - frame.camera_to_world[:3, 3]))
     if away < NEAREST_POINT:
         raise ObservationError(
             f"the object's point is {away:.2g} m from the camera: of the world?"
         )
-    shown = _of_size(supports)
+    shown = _of_size(seen)
     if not shown:
         raise ObservationError(NO_INSTANCE.format(where="at the point"))
     distances = [_distance(mask, frame, point) for mask in shown]
@@ -135,11 +135,11 @@ def _distance(mask: Mask, frame: Frame, point: Float) -> float:
     return 0.0 if 0 <= deep < size else nearest
 
 
-def _seen_before(supports: Supports, known: ObjectFrame) -> Mask:
+def _seen_before(seen: SegmentedFrame, known: ObjectFrame) -> Mask:
     """Return the instance that fills most of the known place and is mostly inside it."""
-    frame = supports.frame
+    frame = seen.frame
     inside = inside_sphere(frame, known.centre, SPHERE_MARGIN * known.radius)
-    shown = _of_size(supports)
+    shown = _of_size(seen)
     worth = [_overlap(mask & (frame.depth > 0), inside) for mask in shown]
     if not any(worth):
         raise ObservationError(NO_INSTANCE.format(where="of the object known so far"))
@@ -152,18 +152,18 @@ def _overlap(mask: Mask, inside: Mask) -> float:
     return there**2 / max(int(np.count_nonzero(mask)), 1)
 
 
-def _aimed_at(supports: Supports) -> Mask:
+def _aimed_at(seen: SegmentedFrame) -> Mask:
     """Return the largest instance near the optical axis, preferably on a support surface.
 
     Pixels are weighted by their distance from the axis.
     """
-    shown = _of_size(supports)
-    pairs = zip(supports.masks, supports.carriers, strict=True)
+    shown = _of_size(seen)
+    pairs = zip(seen.masks, seen.carriers, strict=True)
     carried = {id(mask) for mask, level in pairs if level is not None}
     shown = [mask for mask in shown if id(mask) in carried] or shown
     if not shown:
         raise ObservationError(NO_INSTANCE.format(where="before the camera"))
-    return max(shown, key=lambda mask: _weight(mask, supports.frame))
+    return max(shown, key=lambda mask: _weight(mask, seen.frame))
 
 
 def _weight(mask: Mask, frame: Frame) -> float:
@@ -174,11 +174,11 @@ def _weight(mask: Mask, frame: Frame) -> float:
     return float(len(rows) * np.exp(-((away / AIM_SPREAD) ** 2)))
 
 
-def _of_size(supports: Supports) -> list[Mask]:
+def _of_size(seen: SegmentedFrame) -> list[Mask]:
     """Return the instances with enough pixels."""
-    measured = supports.frame.depth > 0
+    measured = seen.frame.depth > 0
     return [
         mask
-        for mask in supports.masks
+        for mask in seen.masks
         if np.count_nonzero(mask & measured) >= FEWEST_OBJECT_PIXELS
     ]

@@ -17,7 +17,6 @@ from scipy.spatial import ConvexHull, QhullError
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.planes import (
-    LEAST_SUPPORT,
     POSE_SHIFT,
     POSE_TURN,
     TILT,
@@ -79,144 +78,58 @@ class SurfaceLevel:
         return np.asarray((outside <= OUTLINE_MARGIN).all(1))
 
 
-@dataclass(frozen=True, eq=False)
-class Supports:
-    """Support surfaces of a frame and the instances on them.
+def levels_of(
+    frame: Frame,
+    masks: Sequence[Mask],
+    surface: Mask,
+    noise: Noise,
+    up: Float | None,
+    earlier: Sequence[SurfaceLevel] = (),
+) -> list[SurfaceLevel]:
+    """Find the levels of a frame, by decreasing number of instance pixels that they carry.
 
-    Attributes:
-        frame: the frame.
-        masks: mask of each instance, (H, W) bool each.
+    Args:
+        frame: of a depth camera.
+        masks: of each instance, (H, W) bool each.
         surface: pixels of all surfaces, (H, W) bool.
-        levels: planes of the surfaces, by decreasing number of carried pixels.
-        carriers: the level that carries each instance, a surface or the top of another instance;
-            None if there is no visible one.
+        noise: of the frame.
+        up: direction against gravity, (3,), world; None for the normal of the plane that carries
+            most instance pixels.
+        earlier: levels of earlier frames; used if they are not visible in this one.
     """
+    levels = _found(frame, surface & (frame.depth > 0), noise, up)
+    if up is None:
+        levels = _parallel(levels, frame, masks)
+    none = np.zeros(frame.shape, bool)
+    hidden = [
+        replace(level, pixels=none)
+        for level in earlier
+        if not any(_same(level, other, frame) for other in levels)
+    ]
+    return _by_load([*levels, *hidden], frame, masks)
 
-    frame: Frame
-    masks: tuple[Mask, ...]
-    surface: Mask
-    levels: tuple[SurfaceLevel, ...]
-    carriers: tuple[SurfaceLevel | None, ...]
 
-    @classmethod
-    def of(
-        cls,
-        frame: Frame,
-        masks: Sequence[Mask],
-        surface: Mask,
-        noise: Noise,
-        up: Float | None,
-        earlier: Sequence[SurfaceLevel] = (),
-    ) -> Supports:
-        """Find the levels of a frame and the carrier of each instance.
+def carriers_of(
+    masks: Sequence[Mask],
+    frame: Frame,
+    levels: Sequence[SurfaceLevel],
+    noise: Noise,
+    up: Float | None,
+) -> list[SurfaceLevel | None]:
+    """Return the level that carries each instance: a surface, or the top of another instance.
 
-        Args:
-            frame: of a depth camera.
-            masks: mask of each instance, (H, W) bool each.
-            surface: pixels of all surfaces, (H, W) bool.
-            noise: of the frame.
-            up: direction against gravity, (3,), world; None for the normal of the plane that
-                carries most instance pixels.
-            earlier: levels of earlier frames; used if they are not visible in this one.
-        """
-        shown = surface & (frame.depth > 0)
-        levels = _found(frame, shown, noise, up)
-        if up is None:
-            levels = _parallel(levels, frame, masks)
-
-        none = np.zeros(frame.shape, bool)
-        hidden = [
-            replace(level, pixels=none)
-            for level in earlier
-            if not any(_same(level, other, frame) for other in levels)
-        ]
-        levels = _by_load([*levels, *hidden], frame, masks)
-        carriers = [carrier_of(mask, frame, levels) for mask in masks]
-        if levels and None in carriers:
-            upright = levels[0].plane.normal if up is None else up
-            carriers = _on_others(carriers, masks, frame, noise, upright)
-        return cls(frame, tuple(masks), surface, tuple(levels), tuple(carriers))
-
-    @classmethod
-    def none(cls, frame: Frame, masks: Sequence[Mask]) -> Supports:
-        """Return the instances of a frame without support surfaces, as of things that are held.
-
-        Args:
-            frame: of a depth camera.
-            masks: mask of each instance, (H, W) bool each.
-        """
-        surface = np.zeros(frame.shape, bool)
-        return cls(frame, tuple(masks), surface, (), (None,) * len(masks))
-
-    def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
-        """Return the level that carries most pixels of candidate objects.
-
-        Args:
-            among: search area in the frame, (H, W) bool.
-            widest: diameter of the largest candidate object, metres; None for any.
-
-        Returns:
-            The level; if none carries such an object, the level at which the camera is aimed. None
-            if no level is visible.
-        """
-        if not self.levels:
-            return None
-        load = np.zeros(len(self.levels))
-        for mask, level in zip(self.masks, self.carriers, strict=True):
-            pixels = mask & among & (self.frame.depth > 0)
-            if level is None or not pixels.any():
-                continue
-            size = np.linalg.norm(np.ptp(_points(pixels, self.frame), axis=0))
-            if widest is None or size <= widest:
-                load[self.levels.index(level)] += np.count_nonzero(pixels)
-        if load.any():
-            return self.levels[int(load.argmax())]
-        return min(self.levels, key=self._off_the_axis)
-
-    def under(self, mask: Mask, stands: bool = False) -> SurfaceLevel | None:
-        """Return the level that carries an object; None if there is no visible one.
-
-        Args:
-            mask: of the object, (H, W) bool.
-            stands: whether the object is known not to hang in the air.
-        """
-        level = carrier_of(mask, self.frame, self.levels, stands)
-        if level is not None or not self.masks:
-            return level
-        shared = [np.count_nonzero(mask & own) for own in self.masks]
-        row = int(np.argmax(shared))
-        return self.carriers[row] if shared[row] else None
-
-    def again(self, plane: Plane) -> SurfaceLevel | None:
-        """Return the level that corresponds to a plane of an earlier frame.
-
-        Args:
-            plane: in the earlier frame; both poses may have errors.
-
-        Returns:
-            The level; None if it is not visible.
-        """
-        found = None
-        least = np.inf
-        enough = LEAST_SUPPORT * np.count_nonzero(self.surface)
-        for level in self.levels:
-            if not np.count_nonzero(level.pixels) > enough:
-                continue
-            if level.plane.normal @ plane.normal < TILT:
-                continue
-            apart, reach = _apart(plane, level, self.frame)
-            if apart < min(reach, least):
-                found = level
-                least = apart
-        return found
-
-    def _off_the_axis(self, level: SurfaceLevel) -> float:
-        """Return the distance from the image centre to the nearest pixel of a level, pixels."""
-        rows, columns = np.nonzero(level.pixels)
-        if not len(rows):
-            return np.inf
-        column, row = self.frame.intrinsics[:2, 2]
-        return float(np.hypot(rows - row, columns - column).min())
+    Args:
+        masks: of each instance, (H, W) bool.
+        frame: of the masks.
+        levels: of the frame, see ``levels_of``.
+        noise: of the frame.
+        up: direction against gravity, (3,), world; None for the normal of the first level.
+    """
+    carriers = [carrier_of(mask, frame, levels) for mask in masks]
+    if not levels or None not in carriers:
+        return carriers
+    upright = levels[0].plane.normal if up is None else up
+    return _on_others(carriers, masks, frame, noise, upright)
 
 
 def carrier_of(
@@ -238,7 +151,7 @@ def carrier_of(
     """
     if not levels or not (mask & (frame.depth > 0)).any():
         return None
-    points = _points(mask, frame)
+    points = points_of(mask, frame)
     camera = frame.camera_to_world[:3, 3]
     away = float(np.median(np.linalg.norm(points - camera, axis=1)))
 
@@ -395,7 +308,7 @@ def _on_others(
     return found
 
 
-def _points(mask: Mask, frame: Frame) -> Float:
+def points_of(mask: Mask, frame: Frame) -> Float:
     """Sample points of a mask, (H, W) bool, as (N, 3), world, metres."""
     rows, columns = np.nonzero(mask & (frame.depth > 0))
     few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
@@ -445,11 +358,11 @@ def _parallel(
 
 def _same(earlier: SurfaceLevel, level: SurfaceLevel, frame: Frame) -> bool:
     """Return True if a level of an earlier frame is a level of this frame."""
-    apart, reach = _apart(earlier.plane, level, frame)
+    apart, reach = apart_from(earlier.plane, level, frame)
     return apart < reach
 
 
-def _apart(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, float]:
+def apart_from(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, float]:
     """Return the distance between an earlier plane and a level, and its largest pose error.
 
     Args:
@@ -460,7 +373,7 @@ def _apart(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, floa
     Returns:
         Both in metres.
     """
-    points = _points(level.pixels, frame)
+    points = points_of(level.pixels, frame)
     camera = frame.camera_to_world[:3, 3]
     away = float(np.median(np.linalg.norm(points - camera, axis=1)))
     apart = abs(float(np.median(plane.height(points))))

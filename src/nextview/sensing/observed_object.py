@@ -18,10 +18,8 @@ from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing import plausibility
 from nextview.sensing.choosing import Parting, choose_instance
 from nextview.sensing.displacement import displacement
-from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
-from nextview.sensing.levels import Supports
 from nextview.sensing.masks import (
     SPHERE_MARGIN,
     above_plane,
@@ -30,8 +28,13 @@ from nextview.sensing.masks import (
     inside_sphere,
 )
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.sensing.planes import Plane, find_again, sample
+from nextview.sensing.planes import Plane
 from nextview.sensing.resampling import observation_of
+from nextview.sensing.segmented_frame import (
+    SegmentedFrame,
+    segmented_frame,
+    without_surfaces,
+)
 from nextview.sensing.sighting import (
     FEWEST_OBJECT_PIXELS,
     Sighting,
@@ -211,27 +214,18 @@ class ObservedObject:
         known = self._known_frames
         known.refuse(frame)
 
-        noise = noise_of(frame)
         up = self._up(frame)
-        instances = None
-        supports = None
-        if self.support:
-            instances = self._instances(frame, up)
-            supports = Supports.of(frame, instances.masks, instances.surface, noise, up)
-        elif self.point is not None and frame.mask is None:
-            instances = self._instances(frame, up)
-            supports = Supports.none(frame, instances.masks)
+        segmented = self._segmented(frame, up)
         parting = before.parting
-        pixels = self._pixels(frame, supports, instances, parting)
+        pixels = self._pixels(segmented, parting)
         partings: tuple[Parting, ...] = ()
         if frame.mask is None and self.known is None:
             partings = tuple(
                 other
                 for other in get_args(Parting)
-                if other != parting
-                and _differ(pixels, self._pixels(frame, supports, instances, other))
+                if other != parting and _differ(pixels, self._pixels(segmented, other))
             )
-        plane = self._plane_under(pixels, frame, noise, supports, up)
+        plane = self._plane_under(pixels, segmented, up)
         if up is None and plane is None:
             raise ObservationError(
                 "no support plane is seen, so there is no telling where up is: give it, and the"
@@ -239,8 +233,8 @@ class ObservedObject:
             )
         warnings = known.check(frame, plane)
 
-        mask = self._without_plane(pixels, frame, plane, noise)
-        seen = sighting_of(frame, mask, plane, noise, self.denoise)
+        mask = self._without_plane(pixels, segmented, plane)
+        seen = sighting_of(frame, mask, plane, segmented.noise, self.denoise)
         displaced = None
         if before.sightings and self.known is None:
             displaced = displacement(seen, before.sightings)
@@ -320,28 +314,27 @@ class ObservedObject:
             return self.state.frame.axes[2]
         return None if frame.pose is None else self.up
 
-    def _instances(self, frame: Frame, up: Float | None) -> Instances:
-        """Return instances and surfaces of a frame; its mask, if any, is the only instance."""
+    def _segmented(self, frame: Frame, up: Float | None) -> SegmentedFrame:
+        """Segment a frame; its mask, if any, is the only instance."""
+        held = self.point is not None and frame.mask is None
+        if not self.support and not held:
+            return without_surfaces(frame)
         found = instances_of(self.segmentation, frame, up)
-        if frame.mask is None:
-            return found
-        outside = ~frame.mask
-        return Instances(
-            (frame.mask,), found.surface & outside, found.background & outside
-        )
+        if not self.support:
+            return without_surfaces(frame, found.masks)
+        if frame.mask is not None:
+            outside = ~frame.mask
+            surface = found.surface & outside
+            found = Instances((frame.mask,), surface, found.background & outside)
+        return segmented_frame(frame, found, up)
 
-    def _pixels(
-        self,
-        frame: Frame,
-        supports: Supports | None,
-        instances: Instances | None,
-        parting: Parting,
-    ) -> Mask:
+    def _pixels(self, seen: SegmentedFrame, parting: Parting) -> Mask:
         """Return the object's pixels: its mask, box, sphere or instance, (H, W) bool.
 
         Raises:
             ObservationError: there are none.
         """
+        frame = seen.frame
         if frame.mask is not None:
             return frame.mask
         if self.box is not None:
@@ -350,60 +343,49 @@ class ObservedObject:
             return inside_sphere(
                 frame, self.known.centre, SPHERE_MARGIN * self.known.radius
             )
-        if supports is None or instances is None:
+        if not self.support and self.point is None:
             raise ObservationError(NO_OUTLINE)
-        known = self.state.frame
-        return choose_instance(supports, self.point, known, parting, instances.pieces)
+        return choose_instance(seen, self.point, self.state.frame, parting)
 
     def _plane_under(
-        self,
-        pixels: Mask,
-        frame: Frame,
-        noise: Noise,
-        supports: Supports | None,
-        up: Float | None,
+        self, pixels: Mask, seen: SegmentedFrame, up: Float | None
     ) -> Plane | None:
-        """Return the support plane of the object; None if it is not visible.
+        """Return the support plane of the object, by earlier frames if this one does not show it.
+
+        Returns:
+            The plane; None if no frame shows it.
 
         Raises:
-            ObservationError: the pose of a first frame is wrong, or its depth is a range.
+            ObservationError: the pose is wrong, or the depth is a range.
         """
-        if supports is None or not self.support:
+        if not self.support:
             return None
-        level = supports.under(pixels, stands=True)
-        before = self.state
-        if not before.sightings:
-            shown = supports.surface & (frame.depth > 0)
-            plane = None if level is None else level.plane
-            refuse_mistakes(frame, sample(frame, shown, noise), plane, up)
-            return plane
+        level = seen.under(pixels, stands=True)
+        refuse_mistakes(seen, None if level is None else level.plane, up)
         if level is not None:
             return level.plane
-
-        earlier = [s.plane for s in before.sightings if s.plane is not None]
-        if not earlier or before.frame is None:
+        earlier = [one.plane for one in self.sightings if one.plane is not None]
+        if not earlier:
             return None
-        samples = sample(frame, (frame.depth > 0) & ~pixels, noise)
-        away = np.linalg.norm(samples.points - before.frame.centre, axis=1)
-        return find_again(earlier[0], samples, away < before.frame.radius)
+        level = seen.again(earlier[-1])
+        return earlier[-1] if level is None else level.plane
 
     def _without_plane(
-        self,
-        pixels: Mask,
-        frame: Frame,
-        plane: Plane | None,
-        noise: Noise,
+        self, pixels: Mask, seen: SegmentedFrame, plane: Plane | None
     ) -> Mask:
         """Return the object's pixels without those of its support, (H, W) bool.
 
         Raises:
             ObservationError: too little of it is visible.
         """
+        frame = seen.frame
         if frame.mask is not None and self.known is not None:
             return pixels  # the size does not depend on pixels at the edge
         if frame.mask is not None or self.known is None:
-            return inside_mask(frame, pixels, plane, noise)
-        mask = pixels if plane is None else pixels & above_plane(frame, plane, noise)
+            return inside_mask(frame, pixels, plane, seen.noise)
+        mask = pixels
+        if plane is not None:
+            mask = pixels & above_plane(frame, plane, seen.noise)
         if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             raise ObservationError(
                 "nothing is seen where the object should be: a wrong pose, or a wrong box?"

@@ -285,48 +285,6 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
     return plane
 
 
-def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
-    """Find the plane of an earlier frame in this frame, in spite of pose errors.
-
-    If the pose error is below the noise, least squares from the earlier plane is enough. With a
-    larger error only a strip of the surface is in reach, and the fitted plane cuts the surface,
-    with samples on both sides. In that case the plane is searched for within the range of pose
-    errors.
-
-    Args:
-        plane: of an earlier frame.
-        samples: of this frame.
-        other: samples that may belong to the object, (N,) bool, which are ignored.
-
-    Returns:
-        The plane in this frame; the least-squares fit if no other plane has more samples.
-    """
-    fit = refine_plane(plane, samples, loose=2)
-    if is_seen(fit, samples):
-        return fit
-
-    away = np.linalg.norm(samples.points - samples.camera, axis=1)
-    reach = POSE_SHIFT + np.sin(POSE_TURN) * away
-    around = samples.some((np.abs(plane.height(samples.points)) < reach) & ~other)
-    found = find_plane(around, np.random.default_rng(0), plane.normal)
-    if found is None or found.normal @ plane.normal < np.cos(POSE_TURN):
-        return fit
-    return found if found.holds(around).sum() > fit.holds(around).sum() else fit
-
-
-def is_seen(plane: Plane, samples: Samples) -> bool:
-    """Return True if more samples are on a plane than next to it, as for a real surface.
-
-    Args:
-        plane: the plane.
-        samples: of a frame.
-    """
-    away = np.abs(plane.height(samples.points)) / samples.tolerance
-    on = np.count_nonzero(away < 1)
-    beside = np.count_nonzero(away < TOLERANCES_ASIDE) - on
-    return bool(on > beside)
-
-
 def lies_better_as_range(
     frame: Frame,
     plane: Plane | None,

@@ -14,6 +14,7 @@ from nextview.sensing import planes
 from nextview.sensing.frame import Frame
 from nextview.sensing.mistakes import mistakes_in_poses
 from nextview.sensing.planes import TILT, Plane, Samples, find_plane, steep
+from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.types import Float
 
 # radians, difference of tilt within which two mistakes explain a plane equally well
@@ -25,22 +26,20 @@ PLACE_ALONE = ("inverse rotation", "inverse translation")
 
 
 def refuse_mistakes(
-    frame: Frame,
-    samples: Samples,
-    plane: Plane | None,
-    up: Float | None,
+    seen: SegmentedFrame, plane: Plane | None, up: Float | None
 ) -> None:
     """Reject a frame with a wrong pose, or with range instead of depth, by its surfaces.
 
     Args:
-        frame: the frame.
-        samples: of the surfaces in it.
+        seen: the frame with its surfaces.
         plane: the support plane; None if no surface is level.
         up: direction against gravity, (3,), world; None if it is not known.
 
     Raises:
         ObservationError: the pose is wrong, or the depth is measured along the rays.
     """
+    frame = seen.frame
+    samples = seen.surface_samples
     rng = np.random.default_rng(0)
     level = samples if up is None else samples.some(~steep(samples, up))
     if up is not None and _share(plane, level) < LARGE_SHARE:

@@ -1,4 +1,4 @@
-"""Segmented objects on the support surfaces of one frame."""
+"""The ground of one frame, and the segmented objects on it and on other surfaces."""
 
 from __future__ import annotations
 
@@ -9,25 +9,20 @@ import numpy as np
 from scipy import ndimage
 
 from nextview.errors import ObservationError
-from nextview.geometry.axes import upright_axes
-from nextview.segmentation.instances import Instances
-from nextview.sensing.facets import Noise, noise_of
+from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
-from nextview.sensing.levels import Supports
 from nextview.sensing.masks import (
     TOUCHING_GAP,
     TOUCHING_STEP,
     above_plane,
-    inside_box,
-    inside_mask,
     touching,
 )
-from nextview.sensing.object_frame import Box
-from nextview.sensing.planes import Plane, sample
+from nextview.sensing.planes import Plane
+from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
-from nextview.types import Float, Float32, Index, Mask
+from nextview.types import Float, Float32, Mask
 
 NO_SUPPORT = (
     "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse?"
@@ -50,78 +45,55 @@ NEAR_TABLE = 0.015
 
 @dataclass(frozen=True, eq=False)
 class TableTop:
-    """Support surfaces of one frame, and the objects on them.
+    """The ground of one frame, and the objects on it and on other surfaces.
 
     Attributes:
-        frame: the frame.
-        noise: of its depth.
+        seen: the frame with its instances and surfaces.
         plane: the level that carries most objects, in this frame or in an earlier one.
         up: direction against gravity, (3,), world.
         above: pixels of objects above their support, (H, W) bool.
-        background: pixels that are clearly neither an object nor a surface, (H, W) bool.
         height: of each pixel above its supporting plane, (H, W) float32, metres.
-        supports: the surfaces, and the instances on each.
-        pieces: of the segmentation, into which instances may be split, (H, W) int, 0 for none; None
-            if there are none.
         shows_ground: whether the plane is visible.
         warnings: about the frame.
     """
 
-    frame: Frame
-    noise: Noise
+    seen: SegmentedFrame
     plane: Plane
     up: Float
     above: Mask
-    background: Mask
     height: Float32
-    supports: Supports
-    pieces: Index | None = None
     shows_ground: bool = True
     warnings: tuple[ViewWarning, ...] = ()
 
     @classmethod
     def of(
         cls,
-        frame: Frame,
-        instances: Instances,
+        seen: SegmentedFrame,
         up: Float | None,
         earlier: TableTop | None = None,
-        region: Box | None = None,
+        among: Mask | None = None,
         widest: float | None = None,
     ) -> TableTop:
-        """Find the support surfaces of a frame, and the objects on them.
+        """Find the ground of a frame, and the objects above it.
 
         Args:
-            frame: of a depth camera; its mask, if any, limits the search.
-            instances: segmented objects of the frame.
+            seen: the frame with its instances and surfaces.
             up: direction against gravity, (3,), world; None for the normal of the plane.
-            earlier: surfaces of an earlier frame, whose plane and levels are found again.
-            region: upright box that limits the search.
+            earlier: that of an earlier frame, whose plane is found again.
+            among: search area, (H, W) bool; None for the whole frame.
             widest: diameter of the largest candidate object, metres; None for any.
 
         Raises:
             ObservationError: no surface is visible.
         """
-        noise = noise_of(frame)
-        inside = frame.depth > 0 if frame.mask is None else frame.mask
-        if region is not None:
-            inside = inside & inside_box(frame, region)
-        upright = None if up is None or frame.pose is None else upright_axes(up)[2]
-        supports = Supports.of(
-            frame,
-            tuple(mask & inside for mask in instances.masks),
-            instances.surface,
-            noise,
-            earlier.plane.normal if upright is None and earlier else upright,
-            () if earlier is None else earlier.supports.levels,
-        )
-
+        frame = seen.frame
         if earlier is None:
-            level = supports.ground(inside, widest)
+            inside = np.ones(frame.shape, bool) if among is None else among
+            level = seen.ground(inside, widest)
         else:
-            level = supports.again(earlier.plane)
-        shown = sample(frame, supports.surface & (frame.depth > 0), noise)
-        refuse_mistakes(frame, shown, None if level is None else level.plane, upright)
+            level = seen.again(earlier.plane)
+        upright = None if frame.pose is None else up
+        refuse_mistakes(seen, None if level is None else level.plane, upright)
         if level is not None:
             plane = level.plane
         elif earlier is not None:
@@ -129,35 +101,25 @@ class TableTop:
         else:
             raise ObservationError(NO_SUPPORT)
 
-        height, above = _heights(supports, plane, noise)
-        return cls(
-            frame,
-            noise,
-            plane,
-            plane.normal if upright is None else upright,
-            above,
-            instances.background,
-            height,
-            supports,
-            instances.pieces,
-            shows_ground=level is not None,
-        )
+        height, above = _heights(seen, plane)
+        upright = plane.normal if upright is None else upright
+        return cls(seen, plane, upright, above, height, level is not None)
 
     @property
-    def carried_by_none(self) -> tuple[Mask, ...]:
-        """Masks of the objects without a supporting surface, (H, W) bool each."""
-        pairs = zip(self.supports.masks, self.supports.carriers, strict=True)
-        return tuple(
-            mask
-            for mask, carrier in pairs
-            if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
-        )
+    def frame(self) -> Frame:
+        """The frame."""
+        return self.seen.frame
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of the depth of the frame."""
+        return self.seen.noise
 
     @property
     def other_surfaces(self) -> Mask:
         """Pixels of surfaces other than the plane, (H, W) bool."""
         found = np.zeros(self.frame.shape, bool)
-        for level in self.supports.levels:
+        for level in self.seen.levels:
             if level.plane is not self.plane:
                 found |= level.pixels
         return found
@@ -168,7 +130,7 @@ class TableTop:
         Args:
             mask: of the object, (H, W) bool.
         """
-        level = self.supports.under(mask)
+        level = self.seen.under(mask)
         return self.plane if level is None else level.plane
 
     def sighting(self, mask: Mask) -> Sighting:
@@ -180,41 +142,8 @@ class TableTop:
         Raises:
             ObservationError: too little of it is visible.
         """
-        seen = sighting_of(self.frame, mask, self.under(mask), self.noise)
-        return replace(seen, warnings=self.warnings)
-
-    def segments(self) -> list[Mask]:
-        """Return the masks of all supported objects, (H, W) bool, the largest first.
-
-        Background at their edges and pixels of their support are removed.
-        """
-        found = []
-        for mask, carrier in zip(
-            self.supports.masks, self.supports.carriers, strict=True
-        ):
-            if carrier is None or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
-                continue
-            own = inside_mask(self.frame, mask, carrier.plane, self.noise)
-            if np.count_nonzero(own) >= FEWEST_OBJECT_PIXELS:
-                found.append(own)
-        return sorted(found, key=lambda mask: -np.count_nonzero(mask))
-
-    def pieces_of(self, pixels: Mask) -> list[Mask]:
-        """Return the pieces into which a mask may be split, the largest first.
-
-        Args:
-            pixels: of objects, (H, W) bool.
-
-        Returns:
-            The mask of each piece, (H, W) bool.
-        """
-        if self.pieces is None:
-            return []
-        inside = np.where(pixels & (self.frame.depth > 0), self.pieces, 0)
-        sizes = np.bincount(inside.ravel())
-        sizes[0] = 0
-        numbers = np.flatnonzero(sizes >= FEWEST_OBJECT_PIXELS)
-        return [inside == number for number in numbers[np.argsort(-sizes[numbers])]]
+        sighting = sighting_of(self.frame, mask, self.under(mask), self.noise)
+        return replace(sighting, warnings=self.warnings)
 
     def is_thing(self, mask: Mask) -> bool:
         """Return True if a mask, (H, W) bool, is large and high enough to be an object."""
@@ -277,20 +206,16 @@ class TableTop:
         return touching(self.frame, one, other, gap, step)
 
 
-def _heights(
-    supports: Supports,
-    plane: Plane,
-    noise: Noise,
-) -> tuple[Float32, Mask]:
+def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:
     """Return the height of each pixel above its support, metres, and the pixels of objects."""
-    frame = supports.frame
+    frame = seen.frame
     height = frame.along(plane.normal, plane.offset)
-    for level in supports.levels:
+    for level in seen.levels:
         on = level.pixels
         height[on] = frame.along(level.plane.normal, level.plane.offset)[on]
 
     above = np.zeros(frame.shape, bool)
-    for mask, carrier in zip(supports.masks, supports.carriers, strict=True):
+    for mask, carrier in zip(seen.masks, seen.carriers, strict=True):
         if carrier is None or not mask.any():
             continue
         part = within(mask)
@@ -298,5 +223,5 @@ def _heights(
         under = carrier.plane
         raised = frame.along(under.normal, under.offset, part)
         height[part][own] = raised[own]
-        above[part] |= own & above_plane(frame, under, noise, part)
+        above[part] |= own & above_plane(frame, under, seen.noise, part)
     return height, above

@@ -21,7 +21,7 @@ from nextview.recognition.poses import (
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
-from nextview.session.view import View
+from nextview.session.view import View, is_doubtful
 from nextview.types import Float
 
 if TYPE_CHECKING:
@@ -113,6 +113,21 @@ class Recognition:
             return True
         # A thing that explains the depth has the right size, even if half of it is hidden.
         return self._explained is None and self.most_like in self.impossible
+
+    @property
+    def refused(self) -> bool:
+        """True if the answer must not be confident, whatever its belief.
+
+        It is unknown or suspiciously novel, in ``doubt``, or ruled out by warnings.
+        """
+        joint = self._joint
+        if self.unknown or (joint is not None and joint.doubt):
+            return True
+        if is_doubtful([view.warnings for view in self.views]):
+            return True
+        return (
+            self.novelty is not None and self.novelty < SUSPICIOUS * self.unknown_rate
+        )
 
     @property
     def none_of_them(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import lru_cache
@@ -35,7 +35,7 @@ from nextview.recognition.belief import Stopping, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
-from nextview.recognition.novelty import ViewScore, values_of
+from nextview.recognition.novelty import values_of
 from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import (
     JudgesTogether,
@@ -62,7 +62,7 @@ from nextview.session.reach import (
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
-from nextview.session.view import View, is_doubtful
+from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
 
@@ -808,34 +808,30 @@ class Session:
         episodes = self._replayed(evidence, directions) if changed else self._episodes
 
         reach = self._reach
-        doubtful = is_doubtful([*(view.warnings for view in self.views), warnings])
+
+        def viewed(step: Step) -> list[View]:
+            """Return all views, with a step for the last of them."""
+            anew = self._views([*episodes.steps, step], observations, [*changed, last])
+            views = list(self.views)
+            for k in changed:
+                views[k] = _seen_anew(views[k], anew[k])
+            return [*views, replace(anew[last], warnings=tuple(warnings))]
+
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
             constrain=lambda state: self._constrained(state, reach, object, here),
             hold=lambda step: (
-                doubtful
-                or _in_doubt(step)
-                or self._suspicious([*episodes.steps, step], observations)
+                self._recognition(viewed(step), object).refused
                 or self._pose_in_doubt(step)
             ),
         )
-
-        steps = [*episodes.steps, taken.step]
-        travel = self._travelled([int(step.views[0]) for step in steps], directions)
-        seen = {
-            k: self._view(steps[k], observations[k], directions[k], travel[k])
-            for k in (*changed, last)
-        }
-        views = list(self.views)
-        for k in changed:
-            views[k] = _seen_anew(views[k], seen[k])
+        *views, view = viewed(taken.step)
         asked_for = bool(self.views) or object is None or object.known is not None
         view = replace(
-            seen[last],
+            view,
             next_view=_next_of(taken.step),
             values=self._values(taken.step),
-            warnings=tuple(warnings),
             degrees_off=self._degrees_off(directions[last]) if asked_for else 0.0,
         )
 
@@ -887,89 +883,29 @@ class Session:
         view, there = self.sphere.nearest(towards)
         return self.sphere.directions[view] if there else towards
 
-    def _view(
-        self,
-        step: Step,
-        observation: Observation,
-        direction: Float,
-        travel: tuple[float, float],
-    ) -> View:
-        """Return the view of a step, without its choice of the next view."""
-        calibration = self._episodes.calibration
-        nearest, there = self.sphere.nearest(direction)
-        azimuth = (
-            self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
-        )
-        classes = len(self.models.classes)
-        evidence = step.evidence
-        bins = calibration.azimuth_bins(
-            step.total,
-            np.maximum(step.seen, 1),
-            classes,
-            azimuth,
-        )
-
-        return View(
-            int(step.views[0]),
-            observation,
-            alone=calibration.belief(
-                log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth),
-                1,
-                classes,
-            )[0],
-            belief=step.belief[0],
-            maps={name: values[0] for name, values in step.evidence.maps.items()},
-            next_view=None,
-            travel=travel[0],
-            arc=travel[1],
-            direction=direction,
-            azimuth_bins=None if bins is None else bins[0],
-            score=self._score(step, observation),
-            joint=step.joint[0] if step.joint else None,
-        )
-
-    def _score(self, step: Step, observation: Observation) -> ViewScore | None:
-        """Return the novelty score of a view; None without a score."""
-        score = self.models.recogniser.novelty
-        evidence = step.evidence
-        if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
-            return None
-        if (
-            score is not None and score.joint
-        ):  # by geometry: how badly known things explain all views
-            calibration = self.models.recogniser.calibration
-            classes = len(self.models.classes)
-            seen = np.maximum(step.seen, 1)
-            value = score.of_belief(
-                calibration.log_belief(step.total, seen, classes)[0],
-                int(seen[0]),
-            )
-            return ViewScore(observation, None, value)
-        return None if evidence.novelty is None else evidence.novelty[0]
-
-    def _suspicious(
+    def _views(
         self,
         steps: Sequence[Step],
         observations: Sequence[Observation],
-    ) -> bool:
-        """Return True if an object is too novel for a confident answer."""
-        if not self.unknown:
-            return False
-        joint = steps[-1].joint[0] if steps[-1].joint else None
-        if joint is not None and joint.p_value is not None:
-            return joint.p_value < SUSPICIOUS * self.unknown
-        score = self.models.recogniser.novelty
-        if score is None:
-            return False
-        found = [
-            self._score(step, seen)
-            for step, seen in zip(steps, observations, strict=True)
-        ]
-
-        return (
-            score.of_views(values_of([s for s in found if s is not None]))
-            < SUSPICIOUS * self.unknown
-        )
+        which: Iterable[int],
+    ) -> dict[int, View]:
+        """Return the views of some steps, without their choices of the next view."""
+        directions = [self._snapped(direction_of(seen.pose)) for seen in observations]
+        travel = self._travelled([int(step.views[0]) for step in steps], directions)
+        found = {}
+        for k in which:
+            step = steps[k]
+            view = View.of(
+                observations[k],
+                step.evidence,
+                step.total[0],
+                float(step.seen[0]),
+                self.sphere,
+                self.models.recogniser,
+                step.joint[0] if step.joint else None,
+            )
+            found[k] = replace(view, travel=travel[k][0], arc=travel[k][1])
+        return found
 
     def _travelled(
         self,
@@ -1049,22 +985,32 @@ class Session:
                 self.stopping.max_views,
                 len(self.sphere),
             )
-            radius = self.views[-1].observation.radius if self.views else None
-            result = Recognition(
-                tuple(self.views),
-                self.models.classes,
-                enough,
-                self.sphere,
-                self.stopping,
-                stranded=(stranded := self.done and not enough and not all_taken),
+            stranded = self.done and not enough and not all_taken
+            result = self._recognition(self.views, self.object)
+            return replace(
+                result,
+                confident=enough and not result.unknown,
+                stranded=stranded,
                 why_stranded=self._why_stranded() if stranded else "",
-                score=self.models.recogniser.novelty,
-                unknown_rate=self.unknown,
-                impossible=classes_of_other_size(self.models.recogniser, radius),
-                poses_in=PoseFrame.of(self.object),
             )
 
-            return replace(result, confident=enough and not result.unknown)
+    def _recognition(
+        self, views: Sequence[View], object: ObservedObject | None
+    ) -> Recognition:
+        """Return what some views of the object say, not confident yet."""
+        recogniser = self.models.recogniser
+        radius = views[-1].observation.radius if views else None
+        return Recognition(
+            tuple(views),
+            self.models.classes,
+            False,
+            self.sphere,
+            self.stopping,
+            score=recogniser.novelty,
+            unknown_rate=self.unknown,
+            impossible=classes_of_other_size(recogniser, radius),
+            poses_in=PoseFrame.of(object),
+        )
 
     def _why_stranded(self) -> str:
         """Describe why the remaining candidates were not taken."""
@@ -1075,12 +1021,6 @@ class Session:
             if k not in taken
         ]
         return in_words(left)
-
-
-def _in_doubt(step: Step) -> bool:
-    """Return True if the joint belief must not be acted on, whatever its value."""
-    joint = step.joint[0] if step.joint else None
-    return joint is not None and bool(joint.doubt)
 
 
 def _seen_anew(before: View, seen: View) -> View:

@@ -1,14 +1,23 @@
 """One view of a session, with its evidence and the choice of the next view."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import azimuth_of, elevation_of
+from nextview.geometry.viewsphere import (
+    Viewpoints,
+    azimuth_of,
+    direction_of,
+    elevation_of,
+)
+from nextview.recognition.belief import log_evidence_of
+from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import ViewScore, values_of
-from nextview.recognition.protocol import JointBelief
+from nextview.recognition.protocol import JointBelief, Recogniser
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Floats
 
@@ -62,6 +71,62 @@ class View:
     degrees_off: float = 0.0
     joint: JointBelief | None = field(default=None, repr=False)
 
+    @classmethod
+    def of(
+        cls,
+        observation: Observation,
+        evidence: Evidence | None,
+        total: Floats | None,
+        counted: float,
+        sphere: Viewpoints,
+        recogniser: Recogniser,
+        joint: JointBelief | None = None,
+    ) -> View:
+        """Return a view of an object, without travel, warnings and a choice of the next view.
+
+        Args:
+            observation: of the object.
+            evidence: of this view alone, one row; None if nothing is visible.
+            total: sum of the log-evidence up to this view, (D,), see ``belief.log_evidence_of``;
+                None before anything was visible.
+            counted: weighted number of views in the sum, see ``Calibration.weights``.
+            sphere: the candidate views.
+            recogniser: source of the evidence.
+            joint: joint belief from all views up to this one; None if views are judged separately.
+        """
+        calibration = recogniser.calibration
+        classes = len(recogniser.classes)
+        direction = direction_of(observation.pose)
+        nearest, there = sphere.nearest(direction)
+        direction = sphere.directions[nearest] if there else direction
+        azimuth = sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
+
+        alone = belief = np.full(classes, 1 / classes)
+        maps = {}
+        if evidence is not None:
+            own = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth)
+            alone = calibration.belief(own, 1, classes)[0]
+            maps = {name: values[0] for name, values in evidence.maps.items()}
+        bins = None
+        if total is not None:
+            views = np.array([max(counted, 1)])
+            belief = calibration.belief(total[None], views, classes)[0]
+            bins = calibration.azimuth_bins(total[None], views, classes, azimuth)
+        return cls(
+            nearest,
+            observation,
+            alone,
+            belief if joint is None else joint.belief,
+            maps,
+            next_view=None,
+            travel=0.0,
+            arc=0.0,
+            direction=direction,
+            azimuth_bins=None if bins is None else bins[0],
+            score=_score(observation, evidence, total, counted, recogniser),
+            joint=joint,
+        )
+
     @property
     def novelty(self) -> float | None:
         """Novelty score of this view, computed when it is first used; None without a score."""
@@ -73,6 +138,28 @@ class View:
         return float(np.degrees(elevation_of(self.direction))), float(
             np.degrees(azimuth_of(self.direction))
         )
+
+
+def _score(
+    observation: Observation,
+    evidence: Evidence | None,
+    total: Floats | None,
+    counted: float,
+    recogniser: Recogniser,
+) -> ViewScore | None:
+    """Return the novelty score of a view; None if nothing is visible or without such a score."""
+    score = recogniser.novelty
+    if score is None or evidence is None or total is None or not observation.seen:
+        return None
+    if evidence.seen is not None and not evidence.seen[0]:
+        return None
+    if not score.joint:
+        return None if evidence.novelty is None else evidence.novelty[0]
+    # by geometry: how badly known things explain all views
+    views = np.array([max(counted, 1)])
+    classes = len(recogniser.classes)
+    logs = recogniser.calibration.log_belief(total[None], views, classes)[0]
+    return ViewScore(observation, None, score.of_belief(logs, int(views[0])))
 
 
 def is_doubtful(warned: Sequence[Sequence[ViewWarning]]) -> bool:

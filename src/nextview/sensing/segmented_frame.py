@@ -1,0 +1,212 @@
+"""A frame with its segmented instances and the surfaces that carry them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nextview.segmentation.instances import Instances
+from nextview.sensing.facets import Noise, noise_of
+from nextview.sensing.frame import Frame
+from nextview.sensing.levels import (
+    SurfaceLevel,
+    apart_from,
+    carrier_of,
+    carriers_of,
+    levels_of,
+    points_of,
+)
+from nextview.sensing.masks import inside_mask
+from nextview.sensing.planes import LEAST_SUPPORT, TILT, Plane, Samples, sample
+from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
+from nextview.types import Float, Index, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedFrame:
+    """A frame with its segmented instances and the surfaces that carry them.
+
+    Attributes:
+        frame: the frame.
+        noise: of its depth.
+        masks: of each instance, (H, W) bool each.
+        surface: pixels of all surfaces, (H, W) bool.
+        background: pixels that are clearly neither an instance nor a surface, (H, W) bool.
+        pieces: of the segmentation, into which instances may be split, (H, W) int, 0 for none; None
+            if there are none.
+        levels: planes of the surfaces, by decreasing number of carried pixels.
+        carriers: the level that carries each instance, a surface or the top of another instance;
+            None if there is no visible one.
+    """
+
+    frame: Frame
+    noise: Noise
+    masks: tuple[Mask, ...]
+    surface: Mask
+    background: Mask
+    pieces: Index | None
+    levels: tuple[SurfaceLevel, ...]
+    carriers: tuple[SurfaceLevel | None, ...]
+
+    @property
+    def surface_samples(self) -> Samples:
+        """Samples of all surfaces."""
+        return sample(self.frame, self.surface & (self.frame.depth > 0), self.noise)
+
+    @property
+    def carried_by_none(self) -> tuple[Mask, ...]:
+        """Masks of the objects without a supporting surface, (H, W) bool each."""
+        pairs = zip(self.masks, self.carriers, strict=True)
+        return tuple(
+            mask
+            for mask, carrier in pairs
+            if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
+        )
+
+    def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
+        """Return the level that carries most pixels of candidate objects.
+
+        Args:
+            among: search area in the frame, (H, W) bool.
+            widest: diameter of the largest candidate object, metres; None for any.
+
+        Returns:
+            The level; if none carries such an object, the level at which the camera is aimed. None
+            if no level is visible.
+        """
+        if not self.levels:
+            return None
+        load = np.zeros(len(self.levels))
+        for mask, level in zip(self.masks, self.carriers, strict=True):
+            pixels = mask & among & (self.frame.depth > 0)
+            if level is None or not pixels.any():
+                continue
+            size = np.linalg.norm(np.ptp(points_of(pixels, self.frame), axis=0))
+            if widest is None or size <= widest:
+                load[self.levels.index(level)] += np.count_nonzero(pixels)
+        if load.any():
+            return self.levels[int(load.argmax())]
+        return min(self.levels, key=self._off_the_axis)
+
+    def under(self, mask: Mask, stands: bool = False) -> SurfaceLevel | None:
+        """Return the level that carries an object; None if there is no visible one.
+
+        Args:
+            mask: of the object, (H, W) bool.
+            stands: whether the object is known not to hang in the air.
+        """
+        level = carrier_of(mask, self.frame, self.levels, stands)
+        if level is not None or not self.masks:
+            return level
+        shared = [np.count_nonzero(mask & own) for own in self.masks]
+        row = int(np.argmax(shared))
+        return self.carriers[row] if shared[row] else None
+
+    def again(self, plane: Plane) -> SurfaceLevel | None:
+        """Return the level that corresponds to a plane of an earlier frame.
+
+        Args:
+            plane: in the earlier frame; both poses may have errors.
+
+        Returns:
+            The level; None if it is not visible.
+        """
+        found = None
+        least = np.inf
+        enough = LEAST_SUPPORT * np.count_nonzero(self.surface)
+        for level in self.levels:
+            if not np.count_nonzero(level.pixels) > enough:
+                continue
+            if level.plane.normal @ plane.normal < TILT:
+                continue
+            apart, reach = apart_from(plane, level, self.frame)
+            if apart < min(reach, least):
+                found = level
+                least = apart
+        return found
+
+    def segments(self) -> list[Mask]:
+        """Return the masks of all supported objects, (H, W) bool, the largest first.
+
+        Background at their edges and pixels of their support are removed.
+        """
+        found = []
+        for mask, carrier in zip(self.masks, self.carriers, strict=True):
+            if carrier is None or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
+                continue
+            own = inside_mask(self.frame, mask, carrier.plane, self.noise)
+            if np.count_nonzero(own) >= FEWEST_OBJECT_PIXELS:
+                found.append(own)
+        return sorted(found, key=lambda mask: -np.count_nonzero(mask))
+
+    def pieces_of(self, pixels: Mask) -> list[Mask]:
+        """Return the pieces into which a mask may be split, the largest first.
+
+        Args:
+            pixels: of objects, (H, W) bool.
+
+        Returns:
+            The mask of each piece, (H, W) bool.
+        """
+        if self.pieces is None:
+            return []
+        inside = np.where(pixels & (self.frame.depth > 0), self.pieces, 0)
+        sizes = np.bincount(inside.ravel())
+        sizes[0] = 0
+        numbers = np.flatnonzero(sizes >= FEWEST_OBJECT_PIXELS)
+        return [inside == number for number in numbers[np.argsort(-sizes[numbers])]]
+
+    def _off_the_axis(self, level: SurfaceLevel) -> float:
+        """Return the distance from the image centre to the nearest pixel of a level, pixels."""
+        rows, columns = np.nonzero(level.pixels)
+        if not len(rows):
+            return np.inf
+        column, row = self.frame.intrinsics[:2, 2]
+        return float(np.hypot(rows - row, columns - column).min())
+
+
+def segmented_frame(
+    frame: Frame,
+    instances: Instances,
+    up: Float | None,
+    earlier: Sequence[SurfaceLevel] = (),
+) -> SegmentedFrame:
+    """Find the surfaces of a frame, and the one that carries each instance.
+
+    Args:
+        frame: of a depth camera.
+        instances: of its segmentation.
+        up: direction against gravity, (3,), world; None for the normal of the plane that carries
+            most instance pixels.
+        earlier: levels of earlier frames; used if they are not visible in this one.
+    """
+    noise = noise_of(frame)
+    masks = instances.masks
+    levels = levels_of(frame, masks, instances.surface, noise, up, earlier)
+    carriers = carriers_of(masks, frame, levels, noise, up)
+    return SegmentedFrame(
+        frame,
+        noise,
+        masks,
+        instances.surface,
+        instances.background,
+        instances.pieces,
+        tuple(levels),
+        tuple(carriers),
+    )
+
+
+def without_surfaces(frame: Frame, masks: Sequence[Mask] = ()) -> SegmentedFrame:
+    """Return a frame whose instances stand on nothing, as things that are held.
+
+    Args:
+        frame: of a depth camera.
+        masks: of each instance, (H, W) bool each.
+    """
+    none = np.zeros(frame.shape, bool)
+    carriers = (None,) * len(masks)
+    return SegmentedFrame(
+        frame, noise_of(frame), tuple(masks), none, none, None, (), carriers
+    )
