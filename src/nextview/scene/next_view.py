@@ -187,7 +187,7 @@ def _raise_over(
 
 
 def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
-    """Return which points, (C, 3), are inside the image of a frame, and which are not occluded."""
+    """Return which points, (C, 3), have a depth in a frame, and which are not occluded."""
     pose = frame.camera_to_world
     in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = in_camera[:, 2] > 0.01
@@ -201,7 +201,8 @@ def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
         frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)],
         0,
     )
-    return inside, np.asarray(inside & (depth > away - HIDDEN_STEP))
+    measured = depth > 0
+    return measured, np.asarray(measured & (depth > away - HIDDEN_STEP))
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,17 +89,24 @@ def moved(
 
 
 def extruded(rings: Sequence[Float], height: float) -> Solid:
-    """Extrude an outline with holes from z = 0 upwards.
+    """Extrude an outline with holes from z = 0 upwards; the normals of all faces point outwards.
 
     Args:
-        rings: the outline, (N, 2), and its holes, (M, 2) each.
+        rings: the outline, (N, 2), and its holes, (M, 2) each, in any sense of rotation.
         height: metres.
     """
     from mapbox_earcut import triangulate_float64
 
+    # the solid is on the left of each ring
+    rings = [
+        ring if (_signed_area(ring) > 0) == (number == 0) else ring[::-1]
+        for number, ring in enumerate(rings)
+    ]
     flat = np.concatenate(rings)
     ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
     caps = triangulate_float64(flat, ends).reshape(-1, 3)
+    upwards = np.array([_signed_area(flat[cap]) > 0 for cap in caps])
+    caps = np.where(upwards[:, None], caps, caps[:, ::-1])
     count = len(flat)
     vertices = np.concatenate(
         [np.c_[flat, np.zeros(count)], np.c_[flat, np.full(count, height)]]
@@ -112,8 +119,14 @@ def extruded(rings: Sequence[Float], height: float) -> Solid:
         sides.append(np.c_[at, following, following + count])
         sides.append(np.c_[at, following + count, at + count])
         start = int(end)
-    faces = np.concatenate([caps, caps + count, *sides])
+    faces = np.concatenate([caps[:, ::-1], caps + count, *sides])
     return vertices, faces.astype(np.int32)
+
+
+def _signed_area(ring: Float) -> float:
+    """Return the area of a polygon, (N, 2), negative if its corners go clockwise."""
+    x, y = ring.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def ring_points(radius: float, sides: int, centre: Sequence[float] = (0, 0)) -> Float:

@@ -1,0 +1,223 @@
+"""When a scene says that it is done: what is left unknown, unseen or wrong at that moment.
+
+    python benchmarks/machine_parts.py PARTS            # generated parts, millimetres
+    nextview learn PARTS taught --unit mm
+    python -m benchmarks.ends PARTS OUT.jsonl --models taught --unit mm [--draws 20] [--seed 1]
+    python -m benchmarks.ends SCANS OUT.jsonl --place bin [--draws 1]
+
+The world is that of ``benchmarks/staged_things.py``, which shares no code with nextview: one thing
+alone on a table, as it falls, or in a bin with four others. A scene looks at it, first from a
+random view and then from its own targets, until it is done. It segments the frames by itself; for a
+bin, ``region`` is its inside. The poses of the camera are wrong by ``--arm-error``, along and about
+each axis. Targets are above 20 degrees.
+
+Printed is how many scenes were done before the largest number of views, and of these in how many
+the thing is named right, is unknown, has a wrong name, or belongs to no object; how many are done
+without any object; and the frames that it took. OUT.jsonl gets a line for each scene; those that it
+holds are not run again. MuJoCo draws with ``MUJOCO_GL=egl`` unless another is named.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
+
+import numpy as np
+import trimesh
+import tyro
+from rich.progress import track
+
+import nextview
+from benchmarks.staged_things import (
+    CAMERA_MATRIX,
+    ENOUGH_PIXELS,
+    IMAGE,
+    Bools,
+    Float,
+    as_told,
+    camera_at,
+    camera_distance,
+    looked,
+    scan_of,
+    staged,
+    true_pose,
+)
+from nextview.cli.exit_status import orderly_end
+from nextview.errors import UsageError
+from nextview.scene.scene import Scene
+from nextview.sensing import Box, Frame
+from research.extras import extras
+
+BIN_INSIDE = Box((-0.2, -0.15, -0.02), (0.2, 0.15, 0.25))
+LOWEST = np.sin(np.radians(20))  # of the directions of targets
+MOST_FRAMES = 8
+METRES = {"m": 1.0, "mm": 0.001}
+End = Literal["right", "unknown", "wrong", "no object"]
+
+
+def look_until_done(
+    scene: Scene,
+    world: tuple[Any, Any],
+    aim: Float,
+    distance: float,
+    arm_error: tuple[float, float],
+    rng: np.random.Generator,
+) -> list[Bools]:
+    """Show a world to a scene until it is done; the pixels of the thing in each frame."""
+    import mujoco
+
+    model, data = world
+    masks = []
+    pose = camera_at(aim, rng.uniform(0, 360), rng.uniform(35, 65), distance)
+    with mujoco.Renderer(model, *IMAGE) as renderer:
+        while True:
+            depth, mask = looked(renderer, model, data, pose, rng)
+            told = as_told(pose, arm_error, rng)
+            if scene.update(Frame(depth, CAMERA_MATRIX, told)).taken:
+                masks.append(mask)
+            target = scene.target
+            if scene.done or target is None:
+                return masks
+            pose = target
+
+
+def end_of(scene: Scene, masks: Sequence[Bools], name: str) -> End:
+    """What the object that shows most of the thing is called."""
+    shown = {
+        one.number: sum(
+            np.count_nonzero(pixels & masks[k]) for k, pixels in one.pixels.items()
+        )
+        for one in scene.objects
+    }
+    best = max(shown, key=lambda number: shown[number], default=None)
+    if best is None or shown[best] < ENOUGH_PIXELS / 4:
+        return "no object"
+    found = next(one for one in scene.objects if one.number == best)
+    if found.name == name:
+        return "right"
+    return "unknown" if found.pose is None else "wrong"
+
+
+def watched(
+    system: nextview.System,
+    folder: Path,
+    place: Literal["alone", "bin"],
+    name: str,
+    draw: int,
+    seed: int,
+    arm_error: tuple[float, float],
+) -> dict[str, Any]:
+    """Stage a thing and look until the scene is done: a line of the output."""
+    rng = np.random.default_rng([seed, draw, place == "bin", *name.encode()])
+    line: dict[str, Any] = {"place": place, "thing": name, "draw": draw, "seed": seed}
+    found = staged(place, str(folder), name, rng)
+    if found is None:
+        return {**line, "end": None}
+    world, _ = found
+    scan = scan_of(str(folder), name)
+    true = true_pose(world[1])
+    middle = true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3]
+    aim = np.array([0.0, 0, 0.04]) if place == "bin" else middle
+    distance = 0.6 if place == "bin" else camera_distance(scan)
+
+    scene = Scene(
+        system,
+        region=BIN_INSIDE if place == "bin" else None,
+        distance=distance,
+        reachable=lambda pose: bool(-pose[2, 2] > LOWEST),
+    )
+    masks = look_until_done(scene, world, aim, distance, arm_error, rng)
+    return {
+        **line,
+        "end": end_of(scene, masks, name),
+        "frames": len(masks),
+        "objects": len(scene.objects),
+        "settled": len(scene.frames) < MOST_FRAMES,
+        "open": [repr(one) for one in scene.open],
+        "pixels": [int(np.count_nonzero(mask)) for mask in masks],
+    }
+
+
+def summary(lines: Sequence[dict[str, Any]]) -> str:
+    """The table."""
+    shown = [line for line in lines if line["end"] is not None]
+    done = [line for line in shown if line["settled"]]
+    heads = ["scenes", "done before the last view", "named right", "unknown"]
+    heads += ["wrong name", "no object", "no object at all", "frames, mean"]
+    ends = [line["end"] for line in done]
+    cells = [len(shown), len(done), ends.count("right"), ends.count("unknown")]
+    cells += [ends.count("wrong"), ends.count("no object")]
+    cells.append(sum(line["objects"] == 0 for line in done))
+    frames = f"{np.mean([line['frames'] for line in shown]):.2f}" if shown else "-"
+    row = " | ".join([*map(str, cells), frames])
+    return f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|\n| {row} |"
+
+
+def main(
+    scans: tyro.conf.Positional[Path],
+    output: tyro.conf.Positional[Path],
+    place: Literal["alone", "bin"] = "alone",
+    draws: int = 20,
+    most: int = 0,
+    seed: int = 1,
+    models: str = "ycb",
+    unit: Literal["m", "mm"] = "m",
+    unknown: float = 0.02,
+    arm_error: tuple[float, float] = (3.0, 0.3),
+) -> None:
+    """Look at things until a scene is done, and count what is left unknown.
+
+    Args:
+        scans: folder of the scans, NAME.ply.
+        output: a line of JSON for each scene; those that it holds are not run again.
+        place: where the thing is.
+        draws: how often each thing is shown.
+        most: number of scenes, of things in a random order; 0 for all.
+        seed: of everything random.
+        models: memory that was taught with the scans.
+        unit: of the scans.
+        unknown: significance level of the test for unknown objects.
+        arm_error: standard deviations of the camera's poses along and about each axis, mm, degrees.
+
+    Raises:
+        UsageError: there are no scans.
+    """
+    with extras():
+        import mujoco  # noqa: F401  # staged_things needs it
+
+    names = sorted(path.stem for path in scans.glob("*.ply"))
+    if not names:
+        raise UsageError(f"{scans}: holds no scan, NAME.ply")
+    system = nextview.load(models, unknown=unknown, max_views=MOST_FRAMES)
+    wanted = [(name, draw) for draw in range(draws) for name in names]
+    order = np.random.default_rng(seed).permutation(len(wanted))
+    wanted = [wanted[k] for k in order][: most or None]
+    written = output.read_text().splitlines() if output.exists() else []
+    lines = [json.loads(line) for line in written]
+    lines = [one for one in lines if (one["seed"], one["place"]) == (seed, place)]
+    known = {(line["thing"], line["draw"]) for line in lines}
+
+    with TemporaryDirectory() as folder, output.open("a") as file:
+        for name in names:
+            scan = trimesh.load_mesh(scans / f"{name}.ply", process=False)
+            scan.apply_scale(METRES[unit])
+            scan.export(Path(folder) / f"{name}.ply")
+        for name, draw in track(wanted, description="Scenes"):
+            if (name, draw) in known:
+                continue
+            line = watched(system, Path(folder), place, name, draw, seed, arm_error)
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            lines.append(line)
+    print(summary([one for one in lines if (one["thing"], one["draw"]) in wanted]))
+
+
+if __name__ == "__main__":
+    with orderly_end("the scenes that were done are kept"):
+        tyro.cli(main)
