@@ -13,7 +13,8 @@ each axis. Targets are above 20 degrees.
 
 Printed is how many scenes were done before the largest number of views, and of these in how many
 the thing is named right, is unknown, has a wrong name, or belongs to no object; how many are done
-without any object; and the frames that it took. OUT.jsonl gets a line for each scene; those that it
+without any object; the frames that it took, and those that were refused, all of them false alarms:
+another one is taken from a random place. OUT.jsonl gets a line for each scene; those that it
 holds are not run again. MuJoCo draws with ``MUJOCO_GL=egl`` unless another is named.
 """
 
@@ -49,7 +50,7 @@ from benchmarks.staged_things import (
     true_pose,
 )
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import UsageError
+from nextview.errors import ObservationError, UsageError
 from nextview.scene.scene import Scene
 from nextview.sensing import Box, Frame
 from research.extras import extras
@@ -68,23 +69,41 @@ def look_until_done(
     distance: float,
     arm_error: tuple[float, float],
     rng: np.random.Generator,
-) -> list[Bools]:
-    """Show a world to a scene until it is done; the pixels of the thing in each frame."""
+) -> tuple[list[Bools], list[str]]:
+    """Show a world to a scene until it is done.
+
+    Returns:
+        Pixels of the thing in each frame that was used, and why others were refused.
+    """
     import mujoco
 
     model, data = world
-    masks = []
-    pose = camera_at(aim, rng.uniform(0, 360), rng.uniform(35, 65), distance)
+    masks: list[Bools] = []
+    refused: list[str] = []
+
+    def anywhere() -> Float:
+        return camera_at(aim, rng.uniform(0, 360), rng.uniform(35, 65), distance)
+
+    pose = anywhere()
     with mujoco.Renderer(model, *IMAGE) as renderer:
-        while True:
+        while len(refused) < MOST_FRAMES:
             depth, mask = looked(renderer, model, data, pose, rng)
-            told = as_told(pose, arm_error, rng)
-            if scene.update(Frame(depth, CAMERA_MATRIX, told)).taken:
+            frame = Frame(depth, CAMERA_MATRIX, as_told(pose, arm_error, rng))
+            try:
+                look = scene.update(frame)
+            except ObservationError as error:
+                refused.append(str(error))
+                pose = anywhere()
+                continue
+            if look.taken:
                 masks.append(mask)
+            else:
+                refused.append(str(look.warnings[0]))
             target = scene.target
             if scene.done or target is None:
-                return masks
-            pose = target
+                break
+            pose = target if look.taken else anywhere()
+    return masks, refused
 
 
 def end_of(scene: Scene, masks: Sequence[Bools], name: str) -> End:
@@ -132,13 +151,14 @@ def watched(
         distance=distance,
         reachable=lambda pose: bool(-pose[2, 2] > LOWEST),
     )
-    masks = look_until_done(scene, world, aim, distance, arm_error, rng)
+    masks, refused = look_until_done(scene, world, aim, distance, arm_error, rng)
     return {
         **line,
         "end": end_of(scene, masks, name),
         "frames": len(masks),
         "objects": len(scene.objects),
-        "settled": len(scene.frames) < MOST_FRAMES,
+        "settled": scene.done and len(scene.frames) < MOST_FRAMES,
+        "refused": refused,
         "open": [repr(one) for one in scene.open],
         "pixels": [int(np.count_nonzero(mask)) for mask in masks],
     }
@@ -149,13 +169,14 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     shown = [line for line in lines if line["end"] is not None]
     done = [line for line in shown if line["settled"]]
     heads = ["scenes", "done before the last view", "named right", "unknown"]
-    heads += ["wrong name", "no object", "no object at all", "frames, mean"]
+    heads += ["wrong name", "no object", "no object at all", "frames, mean", "refused"]
     ends = [line["end"] for line in done]
     cells = [len(shown), len(done), ends.count("right"), ends.count("unknown")]
     cells += [ends.count("wrong"), ends.count("no object")]
     cells.append(sum(line["objects"] == 0 for line in done))
     frames = f"{np.mean([line['frames'] for line in shown]):.2f}" if shown else "-"
-    row = " | ".join([*map(str, cells), frames])
+    refused = str(sum(len(line["refused"]) for line in shown))
+    row = " | ".join([*map(str, cells), frames, refused])
     return f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|\n| {row} |"
 
 

@@ -7,10 +7,10 @@ SCANS is a folder with scans of the things that the memory knows, in metres, by 
 them stand on each table, 0 to 8 cm apart; a camera 0.55 to 0.7 m away sees them through the model
 of a stereo sensor. After the first frame one of them, in turn a flat, a small and a large one, is
 moved along the table by 3 to 150 mm, in turn, or is removed; two frames follow. On the still tables
-nothing moves, and four frames follow. The camera stands on every other table, and elsewhere goes on
-by 25 to 70 degrees. The poses of half of the tables with moves, and of all still ones, have an
-arm's errors: 3 mm and 0.3 degrees a frame along and about each axis, and 0.3 degrees of the
-vertical.
+nothing moves, and four frames follow. The camera stands still on every other table, has a name there and
+one error of its pose; elsewhere it goes on by 25 to 70 degrees. The poses of half of the tables
+with moves, and of all still ones, have an arm's errors: 3 mm and 0.3 degrees along and about each
+axis, and 0.3 degrees of the vertical.
 
 With ``--masks true`` it is known which thing each pixel shows; with ``--masks network`` the bundled
 network finds the objects.
@@ -140,6 +140,7 @@ class Watched:
         self.scene = Scene(system, segmentation=truth)
         self.view = view
         self.standing = standing
+        self.stands_at: Float | None = None
         self.azimuth = view.uniform(0, 2 * np.pi)
         self.elevation = np.radians(view.uniform(35, 65))
         self.distance = float(view.uniform(0.55, 0.7))
@@ -153,8 +154,15 @@ class Watched:
         degrees."""
         around = np.array([self.azimuth])
         pose = poses_around(around, self.elevation, self.distance, CENTRE)[0]
-        look = self.scene.update(self.camera.frame(pose))
-        return look
+        if not self.standing:
+            return self.scene.update(self.camera.frame(pose))
+        frame = self.camera.frame(pose if self.stands_at is None else self.stands_at)
+        if self.stands_at is None:
+            # the error of its pose remains what it is
+            self.stands_at = self.camera.lean @ self.camera.true_pose
+            self.camera.sensor = replace(self.camera.sensor, turned=0.0, moved=0.0)
+        named = replace(frame, pose=pose, camera="fixed", pixel_centre=0.5)
+        return self.scene.update(named)
 
     def go_on(self) -> None:
         """Bring a camera that does not stand still to another place."""

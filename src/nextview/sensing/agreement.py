@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
+from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import find_plane, sample
@@ -46,16 +47,22 @@ class Sharpness:
     Attributes:
         columns: of the image in which points are looked up. A point agrees with any depth in its
             block of pixels and in the neighbouring blocks.
-        depth_tolerance: relative difference of depth, in addition to the noise of both frames.
+        deviations: largest difference of depth, in standard deviations of the error that two usual
+            camera poses cause, in addition to the noise of both frames.
     """
 
     columns: int
-    depth_tolerance: float
+    deviations: float
+
+    def tolerance(self, depth: Float) -> Float:
+        """Return the difference of depth, metres, of points at some depths, (N,), metres."""
+        of_pose = np.hypot(CAMERA_PLACE, CAMERA_AIM * depth)
+        return np.asarray(self.deviations * np.sqrt(2) * of_pose)
 
 
-ROUGH = Sharpness(160, 0.02)
-"""Tolerates usual calibration errors, 4 mm and half a degree; contradictions are gross errors."""
-SHARP = Sharpness(320, 0.006)
+ROUGH = Sharpness(160, 2.4)
+"""Tolerates usual errors of camera poses; contradictions are gross errors."""
+SHARP = Sharpness(320, 0.7)
 """Separates poses that differ by a few degrees.
 
 Correct but inexact poses also leave some contradictions.
@@ -101,7 +108,7 @@ class SurfaceView:
 
     def tolerance(self, sharpness: Sharpness) -> Float:
         """Largest depth difference with which another frame confirms each point, (N,), metres."""
-        return sharpness.depth_tolerance * self.points[:, 2] + self.noise
+        return sharpness.tolerance(self.points[:, 2]) + self.noise
 
     def some(self, which: Mask) -> "SurfaceView":
         """Return the frame with a subset of its points, (N,) bool."""

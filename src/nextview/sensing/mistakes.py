@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from nextview.sensing.agreement import (
-    ROUGH,
     Agreement,
     SurfaceView,
     compare,
@@ -39,7 +38,7 @@ WELL_EXPLAINED = 0.75
 # least confirmed share of two frames of a mostly static scene
 HALF_AGREES = 0.5
 # Cameras closer than this, relative to the depth, count as being in one place.
-ONE_PLACE = ROUGH.depth_tolerance
+ONE_PLACE = 0.02
 
 UNIT_NAMES = {
     1.0: "metres",
