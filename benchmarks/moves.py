@@ -7,10 +7,10 @@ SCANS is a folder with scans of the things that the memory knows, in metres, by 
 them stand on each table, 0 to 8 cm apart; a camera 0.55 to 0.7 m away sees them through the model
 of a stereo sensor. After the first frame one of them, in turn a flat, a small and a large one, is
 moved along the table by 3 to 150 mm, in turn, or is removed; two frames follow. On the still tables
-nothing moves, and four frames follow. The camera stands still on every other table, has a name there and
-one error of its pose; elsewhere it goes on by 25 to 70 degrees. The poses of half of the tables
-with moves, and of all still ones, have an arm's errors: 3 mm and 0.3 degrees along and about each
-axis, and 0.3 degrees of the vertical.
+nothing moves, and four frames follow. The camera stands still on every other table, has a name
+there and one error of its pose; elsewhere it goes on by 25 to 70 degrees. The poses of half of the
+tables with moves, and of all still ones, have an arm's errors: 3 mm and 0.3 degrees along and about
+each axis, and 0.3 degrees of the vertical.
 
 With ``--masks true`` it is known which thing each pixel shows; with ``--masks network`` the bundled
 network finds the objects.
