@@ -137,7 +137,8 @@ class _Object:
     Attributes:
         surface: at its known place.
         own: covariance of the error of its own pose, (6, 6).
-        known: errors of the cameras by which its pose was found.
+        known: errors of the cameras by which its pose was found; () if the camera of the frame
+            found it from the same place, so that its error is the same in both.
         up: direction against gravity, (3,).
         shift: to the segment that overlaps most with it, (3,), metres.
         fit: its likeliest motion if it may have moved.
@@ -152,6 +153,8 @@ class _Object:
 
     def expected(self, camera: CameraError) -> tuple[Float, Float]:
         """Motion of an object that stands, (6,), and its covariance, (6, 6)."""
+        if not self.known:
+            return np.zeros(6), self.own
         place = self.surface.centre
         matrix = camera.at(place)
         motion = matrix @ camera.motion
@@ -235,8 +238,9 @@ def changes(
     for row, track in enumerate(tracks):
         posed = track.posed
         if posed is not None and posed.vertices is not None:
-            own = _own_covariance(track, posed)
-            known = [cameras[number] for number in track.frames]
+            same = _in_one_place(track, top, tops)
+            own = _own_covariance(track, posed, same)
+            known = [] if same else [cameras[number] for number in track.frames]
             one = _object_at(posed, own, known, top, segments)
             if one is not None:
                 named[row] = one
@@ -296,6 +300,7 @@ def _object_at(
 
 def _still(objects: Sequence[_Object], expected: CameraError) -> CameraError:
     """Estimate the error of a camera's pose if all objects stand; its covariance is as before."""
+    objects = [one for one in objects if one.known]
     if not objects or not expected.covariance.any():
         return expected
     none = replace(expected, motion=np.zeros(6))
@@ -374,16 +379,24 @@ def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:
     return replace(one.surface.posed, pose=one.surface.pose(mean))
 
 
-def _own_covariance(track: Track, posed: PoseCandidate) -> Float:
+def _in_one_place(track: Track, top: TableTop, tops: Sequence[TableTop]) -> bool:
+    """Return True if a camera with a name took a frame and all views of an object in one place."""
+    if not top.frame.camera:
+        return False
+    return all(one_stand(tops[number].frame, top.frame) for number in track.frames)
+
+
+def _own_covariance(track: Track, posed: PoseCandidate, same: bool) -> Float:
     """Covariance of the error of the pose of an object, (6, 6): rotation vector and shift.
 
-    Other candidates, which may be other things, are a part of the error.
+    Other candidates, which may be other things, and errors of the scan are a part of it. In the
+    same view they err as before: what is left is noise.
     """
     assert track.result is not None
-    every = track.result.pose_candidates
+    every = [] if same else track.result.pose_candidates
     off = uncertainty_of([posed, *(one for one in every if one is not posed)])
     radius = track.thing.object_frame.radius
-    error = float(scan_errors(radius))
+    error = 0.0 if same else float(scan_errors(radius))
     turn = np.hypot(np.radians(off.degrees), error / radius)
     shift = np.hypot(off.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2, shift**2], 3) / 3)
@@ -431,6 +444,8 @@ def _camera_by(standing: Sequence[_Object], expected: CameraError) -> CameraErro
     information = np.linalg.inv(expected.covariance)
     pull = information @ expected.motion
     for one in standing:
+        if not one.known:
+            continue
         matrix = expected.at(one.surface.centre)
         offset, own = one.expected(none)
         told = _given(one.fit.information, own)
