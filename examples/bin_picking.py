@@ -66,7 +66,7 @@ class Pick:
         true: names of the parts that are out of the bin since then.
         views: frames that were taken for it.
         seconds: simulated time from the first of them to the end.
-        thinking: time of the computer for recognition and choice, seconds.
+        thinking: CPU time for recognition and choice, seconds.
     """
 
     said: str
@@ -197,19 +197,19 @@ class Picker:
             self.move_camera(pose)
             frame = self.cell.look()
             self.looks += 1
-            begin = time.perf_counter()
+            begin = time.process_time()
             scene.update(frame)
             self._motions.clear()
             free = scene.grasps(self.grasps, GRIPPER, self.can_grasp, most=1)
-            self.thinking += time.perf_counter() - begin
+            self.thinking += time.process_time() - begin
             self.looked(scene)
             if free:
                 return scene, free[0]
             if len(scene.frames) >= MOST_LOOKS or (scene.done and not scene.objects):
                 break
-            begin = time.perf_counter()
+            begin = time.process_time()
             pose = scene.target
-            self.thinking += time.perf_counter() - begin
+            self.thinking += time.process_time() - begin
         return scene, None
 
     def can_see_from(self, pose: np.ndarray) -> bool:
@@ -288,7 +288,7 @@ def table(picker: Picker, poured: int) -> str:
     """Results as a Markdown table.
 
     Views and seconds are those of all looks and grasps, in vain or not, for each grasp that
-    brought a part out; seconds of motion are simulated time.
+    brought a part out. Seconds of motion are simulated time, those of thought CPU time.
     """
     done = [pick for pick in picker.picks if pick.true]
     wrong = sum(pick.said not in pick.true for pick in done)
