@@ -45,6 +45,8 @@ NO_STRANGERS = (
 )
 DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
+# from lower, the nearest wall hides more than a quarter of the bottom
+LOWEST_ELEVATION = np.radians(50)
 MOST_LOOKS = 4  # views of one state of the bin
 MOST_FAILURES = 3  # grasps in a row that hold nothing, after which the arm gives up
 SAME_PLACE = (
@@ -144,8 +146,9 @@ class Picker:
         middle = np.array([*BIN, 0.0])
         top = np.array([0, 0, ROOM_ABOVE])
         self.region = Box(middle - half - [0, 0, 0.01], middle + half + top)
+        self.middle = np.add(middle, [0, 0, 0.03])
         self.first_pose = look_at_origin(FIRST_ELEVATION, np.pi, DISTANCE)
-        self.first_pose[:3, 3] += np.add(middle, [0, 0, 0.03])
+        self.first_pose[:3, 3] += self.middle
         self.thinking = 0.0
         self.looks = 0
         self.begin = cell.seconds
@@ -213,7 +216,10 @@ class Picker:
         return scene, None
 
     def can_see_from(self, pose: np.ndarray) -> bool:
-        """Whether the camera can be brought to a pose, (4, 4)."""
+        """Whether the camera sees over the walls from a pose, (4, 4), and can be brought there."""
+        away = pose[:3, 3] - self.middle
+        if away[2] < np.sin(LOWEST_ELEVATION) * np.linalg.norm(away):
+            return False
         planner = self.cell.planner
         joints = planner.joints_for(pose, "camera", self.cell.joints)
         return joints is not None and planner.way(self.cell.joints, joints) is not None
