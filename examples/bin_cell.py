@@ -34,6 +34,7 @@ BIN_INSIDE = np.array([0.32, 0.24, 0.07])  # its width, depth and height, metres
 BOX = np.array([0.25, -0.45])  # centre of the box into which parts are dropped
 BOX_INSIDE = np.array([0.30, 0.26, 0.12])
 WALL = 0.003  # thickness of bin and box, metres: bent sheet
+BELOW = 0.04  # metres of their bottoms in the table: falling parts would pass through a sheet
 FUNNEL = 0.35  # metres, height of the walls while parts are poured
 DENSITY = 2700.0  # of aluminium, kg/m^3
 FRICTION = 0.35  # of metal on metal and on plastic
@@ -106,7 +107,10 @@ def walls(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Centre and half sides, (3,) each, of the bottom and the four walls of a container."""
     x, y, height = *inside[:2] / 2, inside[2]
-    flat = [(0, 0, WALL / 2)], [(x + WALL, y + WALL, WALL / 2)]
+    flat = (
+        [(0, 0, (WALL - BELOW) / 2)],
+        [(x + WALL, y + WALL, (WALL + BELOW) / 2)],
+    )
     middle = (height + WALL) / 2
     for sign in (-1, 1):
         flat[0].append((sign * (x + WALL / 2), 0, middle))

@@ -45,6 +45,8 @@ NO_STRANGERS = (
 )
 DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
+# from lower, the nearest wall hides more than a quarter of the bottom
+LOWEST_ELEVATION = np.radians(50)
 MOST_LOOKS = 4  # views of one state of the bin
 MOST_FAILURES = 3  # grasps in a row that hold nothing, after which the arm gives up
 SAME_PLACE = (
@@ -66,7 +68,7 @@ class Pick:
         true: names of the parts that are out of the bin since then.
         views: frames that were taken for it.
         seconds: simulated time from the first of them to the end.
-        thinking: time of the computer for recognition and choice, seconds.
+        thinking: CPU time for recognition and choice, seconds.
     """
 
     said: str
@@ -144,8 +146,9 @@ class Picker:
         middle = np.array([*BIN, 0.0])
         top = np.array([0, 0, ROOM_ABOVE])
         self.region = Box(middle - half - [0, 0, 0.01], middle + half + top)
+        self.middle = np.add(middle, [0, 0, 0.03])
         self.first_pose = look_at_origin(FIRST_ELEVATION, np.pi, DISTANCE)
-        self.first_pose[:3, 3] += np.add(middle, [0, 0, 0.03])
+        self.first_pose[:3, 3] += self.middle
         self.thinking = 0.0
         self.looks = 0
         self.begin = cell.seconds
@@ -197,23 +200,26 @@ class Picker:
             self.move_camera(pose)
             frame = self.cell.look()
             self.looks += 1
-            begin = time.perf_counter()
+            begin = time.process_time()
             scene.update(frame)
             self._motions.clear()
             free = scene.grasps(self.grasps, GRIPPER, self.can_grasp, most=1)
-            self.thinking += time.perf_counter() - begin
+            self.thinking += time.process_time() - begin
             self.looked(scene)
             if free:
                 return scene, free[0]
             if len(scene.frames) >= MOST_LOOKS or (scene.done and not scene.objects):
                 break
-            begin = time.perf_counter()
+            begin = time.process_time()
             pose = scene.target
-            self.thinking += time.perf_counter() - begin
+            self.thinking += time.process_time() - begin
         return scene, None
 
     def can_see_from(self, pose: np.ndarray) -> bool:
-        """Whether the camera can be brought to a pose, (4, 4)."""
+        """Whether the camera sees over the walls from a pose, (4, 4), and can be brought there."""
+        away = pose[:3, 3] - self.middle
+        if away[2] < np.sin(LOWEST_ELEVATION) * np.linalg.norm(away):
+            return False
         planner = self.cell.planner
         joints = planner.joints_for(pose, "camera", self.cell.joints)
         return joints is not None and planner.way(self.cell.joints, joints) is not None
@@ -288,7 +294,7 @@ def table(picker: Picker, poured: int) -> str:
     """Results as a Markdown table.
 
     Views and seconds are those of all looks and grasps, in vain or not, for each grasp that
-    brought a part out; seconds of motion are simulated time.
+    brought a part out. Seconds of motion are simulated time, those of thought CPU time.
     """
     done = [pick for pick in picker.picks if pick.true]
     wrong = sum(pick.said not in pick.true for pick in done)

@@ -107,6 +107,41 @@ def test_a_frame_full_of_scraps_is_parted_otherwise_a_few_times_only(ycb_meshes)
     assert MOST_JOINED <= len(judged) <= MOST_JOINED + MOST_TRIMMED + 2 * MOST_CUT
 
 
+def test_parts_that_one_hypothesis_explains_are_tried_as_one_before_larger_ones(
+    ycb, ycb_meshes
+):
+    ((box,),), (bench,) = two_sides(
+        ycb, camera_over([ycb_meshes["cracker_box"]]), (20,)
+    )
+    mask = box.mask_in(0)
+    rows = np.flatnonzero(mask.any(1))[2:-2]
+    strips = []
+    for some in (*np.array_split(rows[8:], 18), rows[4:8], rows[:4]):
+        strip = np.zeros_like(mask)
+        strip[some] = mask[some]
+        strips.append(strip)
+    smallest = strips[-1] | strips[-2]
+    assert smallest.sum() < min(strip.sum() for strip in strips[:-2]) * 2
+
+    posed = SimpleNamespace(
+        answer=None, pose=None, pose_candidates=box.result.pose_candidates
+    )
+    unknown = SimpleNamespace(answer=None, pose=None, pose_candidates=())
+    judged = []
+
+    def judge(tracks):
+        judged.extend(tracks)
+        return [replace(track, result=unknown) for track in tracks]
+
+    bench = Bench(bench.top, 0, judge)
+    tracks = [
+        replace(new_track(strip, bench), result=unknown if k < 18 else posed)
+        for k, strip in enumerate(strips)
+    ]
+    part(tracks, bench, {})
+    assert any((one.mask_in(0) == smallest).all() for one in judged)
+
+
 def test_an_object_that_ended_takes_no_pixels(ycb, ycb_meshes):
     found, benches = two_sides(ycb, camera_over([ycb_meshes["tomato_soup_can"]]), (20,))
     ((can,),) = found

@@ -9,6 +9,7 @@ from test_verification import mesh_of, verifier_of
 
 from nextview.sensing import ObservedObject
 from nextview.simulation.worlds import BACKGROUND, slab
+from nextview.things.depth_view import MetricImage
 from nextview.things.stability import is_stable
 
 SIZE = (0.16, 0.06, 0.04)
@@ -64,3 +65,23 @@ def test_a_body_stands_where_its_centroid_lies_above_what_it_touches():
     assert not is_stable(on_an_edge.T)
     off_centre = bottom - (0.08, 0)  # its weight is far out on one side
     assert not is_stable(off_centre.T)
+
+
+def test_a_thing_reaches_below_the_top_of_what_hides_its_lower_part():
+    upright = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    at = np.array([-0.09, 0, SIZE[0] / 2])
+    vertices = (THING.vertices * THING.radius + THING.centre) @ upright.T + at
+    camera = LabelledCamera(
+        [FLOOR, ((vertices, THING.faces), 1), (BLOCK, BACKGROUND)],
+    )
+    known = ObservedObject()
+    frame = camera.frame(pose_at(40.0, 0.0, 0.5, at))
+    known.add(frame.with_mask(camera.owner == 1))
+    image = MetricImage.of(known.observations[0])
+    top = image.ground.height - image.floor.height
+    assert top == pytest.approx(0.08, abs=0.003)  # the ground beside it is the block's
+
+    found = verifier_of(THING)(known.observations)
+    np.testing.assert_allclose(found.poses[0, 2, :3], upright[2], atol=0.05)
+    assert found.below[0] == 0
+    assert found.stands[0]

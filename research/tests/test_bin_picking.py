@@ -28,6 +28,17 @@ def cell(examples):
     return examples["bin_cell"].Cell(known, ["hex_bolt", "bearing_block"], rng)
 
 
+def test_flat_parts_that_fall_on_each_other_do_not_sink_into_the_bottom(examples):
+    module = examples["bin_cell"]
+    known = examples["bin_parts"].bin_parts()
+    poured = ["flange", "bracket"] * 4
+    cell = module.Cell(known, poured, np.random.default_rng(4))
+    for row, name in enumerate(poured):
+        pose = cell.pose_of(row)
+        points = 0.001 * known[name].solid[0] @ pose[:3, :3].T + pose[:3, 3]
+        assert points[:, 2].min() > module.WALL - 0.001
+
+
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_part_is_gripped_by_friction_and_dropped_into_the_box(
     examples, cell, row, tmp_path

@@ -48,6 +48,8 @@ class SceneView:
             sensor may miss what is black or shiny.
         step: every so many rows and columns of the frame were taken.
         camera: name of the camera; "" for the one camera.
+        support: plane under the object, if it is known, (4,): upward normal, object frame, and
+            height of the origin above the plane, object radii.
     """
 
     depth: Float32
@@ -57,6 +59,7 @@ class SceneView:
     background_free: bool = False
     step: int = 1
     camera: str = ""
+    support: Float | None = None
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:

@@ -264,6 +264,7 @@ def _view_of(frame: Frame, rows: Index, columns: Index, noise: Noise) -> DepthVi
         edge=np.zeros(len(depth), np.float32),
         towards=np.zeros((len(depth), 2), np.float32),
         ground=None,
+        floor=None,
         level=np.zeros(len(depth), bool),
         shape=(len(rows), len(columns)),
         step=np.array(

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from scipy import ndimage
@@ -362,7 +362,8 @@ def _joined_once(
 ) -> list[Track]:
     """Join disjoint groups of objects, those with the largest gain first.
 
-    Groups whose objects are all in ``tried`` are skipped.
+    Groups whose objects are all in ``tried`` are skipped. Tried first are those whose objects are
+    most likely one.
     """
     old = {id(track) for track in tried}
     groups = [
@@ -372,7 +373,13 @@ def _joined_once(
     ]
     masks = [track.mask_in(bench.number) for track in tracks]
     pixels = [0 if mask is None else np.count_nonzero(mask) for mask in masks]
-    groups.sort(key=lambda group: -sum(pixels[row] for row in group))
+    shared = _shared(tracks, groups, bench)
+    groups.sort(
+        key=lambda group: (
+            -sum(shared[row, other] for row in group for other in group),
+            -sum(pixels[row] for row in group),
+        )
+    )
     unions = []
     for group in groups[:MOST_JOINED]:
         with suppress(ObservationError):
@@ -392,6 +399,30 @@ def _joined_once(
             taken |= set(group)
             found.append(union)
     return [track for row, track in enumerate(tracks) if row not in taken] + found
+
+
+def _shared(
+    tracks: Sequence[Track],
+    groups: Sequence[Sequence[int]],
+    bench: Bench,
+) -> Index:
+    """Return how many pixels of each object the likeliest hypothesis of each other one explains.
+
+    Args:
+        tracks: N objects.
+        groups: rows of objects that may be one; others are not compared.
+        bench: the frame.
+
+    Returns:
+        Pixels, (N, N): row of the hypothesis, column of the object; 0 on the diagonal.
+    """
+    found = np.zeros((len(tracks), len(tracks)), np.int64)
+    for row, other in {pair for group in groups for pair in permutations(group, 2)}:
+        rendered = bench.render_likeliest(tracks[row])
+        mask = tracks[other].mask_in(bench.number)
+        if rendered is not None and mask is not None:
+            found[row, other] = np.count_nonzero(mask[rendered.part] & rendered.agrees)
+    return found
 
 
 def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:

@@ -47,7 +47,7 @@ def observation_of(
         pinhole(SIZE, CAMERA_DISTANCE),
         object_frame.radius if life_size else None,
         _resampled(sighting.frame.image, sighting.facets, facet),
-        _scene(sighting, pose, object_frame.radius),
+        _scene(sighting, pose, object_frame),
         colour=_resampled(sighting.frame.colour, sighting.facets, facet),
     )
 
@@ -160,8 +160,14 @@ def _resampled(
     return shown
 
 
-def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
+def _scene(sighting: Sighting, pose: Float, object_frame: ObjectFrame) -> SceneView:
     """Return the whole frame in the object frame and object radii."""
+    radius = object_frame.radius
+    plane = sighting.plane
+    support = None
+    if plane is not None:
+        height = float(plane.height(object_frame.centre)) / radius
+        support = np.append(object_frame.axes @ plane.normal, height)
     k = sighting.frame.intrinsics.copy()
     step = max(
         1,
@@ -182,4 +188,5 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
         k,
         step=step,
         camera=sighting.frame.camera,
+        support=support,
     )

@@ -12,7 +12,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.facets import Noise, estimate_noise
 from nextview.sensing.masks import PLANE_NOISE, PLANE_SHARE
-from nextview.things.ground import Ground, find_ground
+from nextview.things.ground import Ground, find_ground, floor_under
 from nextview.types import Float, Float32, Index, Mask
 
 NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
@@ -52,7 +52,8 @@ class DepthView:
             negative inside.
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
             unit vectors; zero inside the outline.
-        ground: plane that supports the thing, if it is visible.
+        ground: level plane under the thing, if it is visible; it may be the top of other things.
+        floor: plane below which nothing can be, if the ground is visible: see ``floor_under``.
         level: pixels on the ground within its noise, (P,) bool. They may show the thing or the
             ground, whatever their segmentation.
         shape: rows and columns of the grid; P is their product.
@@ -71,6 +72,7 @@ class DepthView:
     edge: Float32
     towards: Float32
     ground: Ground | None
+    floor: Ground | None
     level: Mask
     shape: tuple[int, int]
     step: Float
@@ -120,7 +122,8 @@ class MetricImage:
         pose: camera-to-object, (4, 4), metres.
         intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
         noise: noise of single pixels.
-        ground: plane that supports the thing, if it is visible.
+        ground: level plane under the thing, if it is visible; it may be the top of other things.
+        floor: plane below which nothing can be, if the ground is visible.
         hiding: pixels around the thing that show an occluder, (H, W) bool.
         camera: name of the camera; "" for the one camera.
     """
@@ -131,6 +134,7 @@ class MetricImage:
     intrinsics: Float
     noise: Noise
     ground: Ground | None
+    floor: Ground | None
     hiding: Mask
     camera: str = ""
 
@@ -173,10 +177,11 @@ class MetricImage:
         """
         pose = self.pose.copy()
         pose[:3] = rotation @ pose[:3]
-        ground = self.ground
-        if ground is not None:
-            ground = replace(ground, normal=rotation @ ground.normal)
-        return replace(self, pose=pose, ground=ground)
+        ground, floor = (
+            None if one is None else replace(one, normal=rotation @ one.normal)
+            for one in (self.ground, self.floor)
+        )
+        return replace(self, pose=pose, ground=ground, floor=floor)
 
     def find_ground(self) -> Ground | None:
         """Find the plane that supports the thing; None if none is visible."""
@@ -289,6 +294,7 @@ class MetricImage:
             edge=edge[in_window].ravel(),
             towards=towards[in_window].reshape(-1, 2),
             ground=self.ground,
+            floor=self.floor,
             level=level,
             shape=(len(rows), len(columns)),
             step=np.array([_step(rows), _step(columns)]),
@@ -312,8 +318,14 @@ def _metric_image(observation: Observation, metres: float) -> MetricImage | None
     noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
     nowhere = np.zeros(kind.shape, bool)
     camera = "" if observation.scene is None else observation.scene.camera
-    image = MetricImage(depth, kind, pose, intrinsics, noise, None, nowhere, camera)
-    image = replace(image, ground=image.find_ground())
+    image = MetricImage(
+        depth, kind, pose, intrinsics, noise, None, None, nowhere, camera
+    )
+    ground = image.find_ground()
+    if ground is not None:
+        known = None if observation.scene is None else observation.scene.support
+        support = None if known is None else known * (1, 1, 1, metres)
+        image = replace(image, ground=ground, floor=floor_under(ground, support))
     return replace(image, hiding=image.find_hiding())
 
 

@@ -1,7 +1,7 @@
 """The support plane of a thing, fitted to the depth beside it in one view."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,11 @@ class Ground:
     normal: Float
     offset: float
     noise: float
+
+    @property
+    def height(self) -> float:
+        """Height of the plane at the origin of the object frame, metres; negative below it."""
+        return -self.offset / float(self.normal[2])
 
     def heights(self, points: Floats) -> Floats:
         """Heights of points above the plane.
@@ -106,6 +111,23 @@ def find_ground(
     if normal[2] < LEAST_VERTICAL or bottom < -layer:
         return None
     return ground
+
+
+def floor_under(ground: Ground, support: Float | None) -> Ground:
+    """Return the plane below which nothing can be.
+
+    It is the ground, unless that is the top of other things: a thing beside them reaches below
+    their tops, but not below what carries them all.
+
+    Args:
+        ground: highest level plane under the visible part of the thing.
+        support: the plane that supports the thing by the segmentation of the whole frame, (4,):
+            normal and height of the origin, metres; None if it is not known.
+    """
+    if support is None:
+        return ground
+    lower = replace(ground, normal=support[:3], offset=float(support[3]))
+    return lower if ground.height - lower.height > THINNEST_LAYER else ground
 
 
 def _noise(

@@ -281,13 +281,14 @@ class Rendered:
         Returns:
             Mask, (H, P) bool.
         """
-        if view.ground is None:
+        floor = view.floor
+        if floor is None:
             return np.zeros(self.depth.shape, bool)
         shows = np.isfinite(self.depth)
-        away = view.rays @ view.ground.normal.astype(np.float32)
-        height = np.float32(view.ground.normal @ view.origin + view.ground.offset)
+        away = view.rays @ floor.normal.astype(np.float32)
+        height = np.float32(floor.normal @ view.origin + floor.offset)
         heights = height + away * np.where(shows, self.depth, 0)
-        deep = np.hypot(SUNK, view.ground.noise * self.depth.clip(0, 100) ** 2)
+        deep = np.hypot(SUNK, floor.noise * self.depth.clip(0, 100) ** 2)
         return shows & (heights < -deep - self.errors[:, None])
 
     @property

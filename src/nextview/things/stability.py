@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nextview.things.depth_view import ELSEWHERE, HIDING, HIDING_NOISE, DepthView
+from nextview.things.ground import Ground
 from nextview.things.registration import SUNK, Alignment, Rendered, scan_errors
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
@@ -63,7 +64,7 @@ def standing(
     """Measure how far hypotheses penetrate the ground, and which of them stand on it.
 
     If views disagree on the ground, the lowest plane counts: the others show the top of something
-    beside the thing.
+    beside the thing. A thing may stand on the ground that is seen beside it, or on the floor.
 
     Args:
         caster: all surfaces.
@@ -76,16 +77,16 @@ def standing(
     """
     below = np.zeros(len(alignment))
     depth = np.zeros(len(alignment))
-    grounds = [view for view in views if view.ground is not None]
-    if not grounds:
+    planes = lowest_planes(views)
+    if not planes:
         return Stability(below, depth, np.ones(len(alignment), bool))
 
-    lowest = min(grounds, key=ground_height)
-    assert lowest.ground is not None
-    noise = lowest.ground.noise * float(lowest.origin @ lowest.origin)
+    floor = planes[0]
+    away = min(float(v.origin @ v.origin) for v in views if v.floor is floor)
+    noise = floor.noise * away
     stands = np.zeros(len(alignment), bool)
     ups = alignment.rotations[:, 2]
-    above = alignment.centres[:, 2] - ground_height(lowest)
+    above = alignment.centres[:, 2] - floor.height
     for thing in np.unique(alignment.things):
         surface = caster.surfaces[thing]
         slack = float(np.linalg.norm([SUNK, noise, tilt * surface.radius]))
@@ -97,7 +98,10 @@ def standing(
             heights = (surface.vertices - surface.centre) @ ups[row] + above[row]
             below[row] = surface.vertex_shares[heights < -allowed].sum()
             depth[row] = -heights.min()
-        for at in np.flatnonzero(bottom < allowed):
+        rises = np.array([plane.height - floor.height for plane in planes])
+        touches = bottom < allowed
+        touches |= (np.abs(bottom[:, None] - rises) < allowed).any(1)
+        for at in np.flatnonzero(touches):
             low = surface.hull[corners[at] < bottom[at] + allowed] - surface.centroid
             stands[rows[at]] = is_stable(alignment.rotations[rows[at]] @ low.T)
     return Stability(below, depth, stands)
@@ -244,14 +248,19 @@ def is_stable(touching: Float) -> bool:
     return bool(gaps.max() <= np.pi + LARGEST_OVERHANG)
 
 
-def ground_height(view: DepthView) -> float:
-    """Height of the ground below the origin of the object frame.
+def lowest_planes(views: Sequence[DepthView]) -> list[Ground]:
+    """Return the lowest floor of some views, and the lowest ground if that is another plane.
 
     Args:
-        view: a view with a ground.
+        views: the views, with or without a ground.
 
     Returns:
-        Height, metres; negative if the ground lies below the origin.
+        The floor first; empty if no view shows the ground.
     """
-    assert view.ground is not None
-    return -view.ground.offset / float(view.ground.normal[2])
+    floors = [view.floor for view in views if view.floor is not None]
+    grounds = [view.ground for view in views if view.ground is not None]
+    if not floors:
+        return []
+    floor = min(floors, key=lambda plane: plane.height)
+    ground = min(grounds, key=lambda plane: plane.height)
+    return [floor] if floor.height >= ground.height else [floor, ground]

@@ -37,7 +37,7 @@ from nextview.things.registration import (
     rotations_of,
     scan_errors,
 )
-from nextview.things.stability import ground_height
+from nextview.things.stability import lowest_planes
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.weighing import EvidenceWeights
@@ -130,7 +130,7 @@ class Stretched:
         return Rendered(depth, across.astype(np.float32), radii)
 
     def bottom(self, comparison: Comparison) -> tuple[float, Float] | None:
-        """Height of its lowest point above the ground, and its derivatives by the unknowns.
+        """Height of its lowest point above the nearest ground, and its derivatives by the unknowns.
 
         Args:
             comparison: the views and surfaces.
@@ -138,10 +138,8 @@ class Stretched:
         Returns:
             Height, metres, and derivatives, (UNKNOWNS,); None if no view shows the ground.
         """
-        grounds = [
-            ground_height(one) for one in comparison.views if one.ground is not None
-        ]
-        if not grounds:
+        planes = lowest_planes(comparison.views)
+        if not planes:
             return None
         aligned = self.alignment
         surface = comparison.caster.surfaces[aligned.things[0]]
@@ -152,7 +150,8 @@ class Stretched:
         change = np.zeros(UNKNOWNS)
         change[POSE - 1] = 1
         change[STRETCH] = points[lowest] * up
-        above = float(heights[lowest] + aligned.centres[0, 2] - min(grounds))
+        bottom = float(heights[lowest] + aligned.centres[0, 2])
+        above = min((bottom - plane.height for plane in planes), key=abs)
         return above, change
 
 

@@ -557,14 +557,16 @@ def _levelled(
 ) -> tuple[list[MetricImage], Float]:
     """Images that show the thing, rotated so that the ground is level, and that rotation."""
     images = images_of(observations)
-    grounds = [image.ground for image in images if image.ground is not None]
-    level = levelling(grounds)
+    floors = [image.floor for image in images if image.floor is not None]
+    level = levelling(floors)
     return [image.turned(level) for image in images], level
 
 
 def _held(observations: Sequence[Observation]) -> tuple[list[MetricImage], Float]:
     """Images that show the thing, without a ground, and the identity rotation."""
-    images = [replace(image, ground=None) for image in images_of(observations)]
+    images = [
+        replace(image, ground=None, floor=None) for image in images_of(observations)
+    ]
     return images, np.eye(3)
 
 
