@@ -121,3 +121,28 @@ def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes):
         middle = np.append(true.vertices.mean(0), 1)
         assert np.linalg.norm((belt @ one.pose - true.pose) @ middle) < 0.003
     assert {one.name for one in scene.objects} == set(NAMES)
+
+
+@pytest.mark.parametrize("metres", [0.01, 0.05])
+def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, metres):
+    camera = camera_over(list(meshes.values()), seed=8)
+    camera.sensor = SENSORS["stereo"]
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+    start = camera.table
+    belt = np.eye(4)
+    for number in range(4):
+        belt[0, 3] = number * metres
+        things = [replace(one, pose=belt @ one.pose) for one in start.things]
+        camera.change(SimulatedTable(tuple(things)))
+        frame = camera.frame(view(20))
+        look = scene.update(replace(frame, camera="belt", pixel_centre=0.5))
+        assert look.taken
+        assert look.gone == ()
+        if number:
+            assert len(look.moved) == len(NAMES)
+            assert look.appeared == ()
+    for one in scene.objects:
+        true = next(thing for thing in camera.table.things if thing.name == one.name)
+        middle = np.append(true.vertices.mean(0), 1)
+        assert np.linalg.norm((one.pose - true.pose) @ middle) < 0.003
+    assert {one.name for one in scene.objects} == set(NAMES)

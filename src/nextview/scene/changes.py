@@ -1,7 +1,8 @@
 """What a frame says of each known object: it stands where it stood, stands elsewhere, or is gone.
 
 Each of the three hypotheses gives the pixels around an object a likelihood (``placing``). They are
-weighed by their priors: few objects move between two frames. An object that stands is displaced
+weighed by their priors: few objects move between two frames, but where some have moved, such as on
+a belt, the others may have moved alike. An object that stands is displaced
 only by the error of the camera's pose, which is the same for all objects of a frame, and by that of
 its own pose. The surface of an object is the scan of its name or, as names may be wrong, the part
 that was seen last.
@@ -105,12 +106,12 @@ class Change:
     Attributes:
         stands: log-likelihood that it stands where it stood; 0 if it is not visible.
         elsewhere: log-likelihood that it stands elsewhere nearby.
-        pose: of its scan in the world if it stands elsewhere, (4, 4), metres; None if unknown.
+        there: its surface where it is if it stands elsewhere; None if the frame cannot show it.
     """
 
     stands: float = 0.0
     elsewhere: float = 0.0
-    pose: Float | None = field(default=None, repr=False)
+    there: PoseCandidate | None = field(default=None, repr=False)
 
     @property
     def contradicts(self) -> bool:
@@ -128,6 +129,19 @@ class Change:
     def found(self) -> bool:
         """Return True if the object is seen elsewhere, rather than not at all."""
         return self.contradicts and self.elsewhere > 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """The other objects that moved, such as those on a belt: the next one may have moved alike.
+
+    Attributes:
+        ways: shift of each as a motion, (6,), metres, and its covariance, (6, 6).
+        share: of all objects in the frame.
+    """
+
+    ways: tuple[tuple[Float, Float], ...] = ()
+    share: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,14 +212,39 @@ class _Object:
         near = fitted(self.surface, mean, mean, covariance)
         return near.evidence(mean, covariance)
 
-    def elsewhere(self, camera: CameraError) -> float:
-        """Log-likelihood that it moved, by any distance along the ground."""
+    def elsewhere(self, camera: CameraError, others: _Moved) -> float:
+        """Log-likelihood that it moved, by any distance along the ground or as others did."""
         mean, covariance = self.expected(camera)
         each = [
             self.fit.evidence(mean, self.moved(covariance, scale))
             for scale in MOVE_SCALES
         ]
-        return float(np.logaddexp.reduce(each) - np.log(len(each)))
+        alone = np.logaddexp.reduce(each) - np.log(len(each))
+        if not others.ways or self.fit.gain < SURPRISE:
+            return float(alone)
+        along = [
+            self.fit.evidence(mean + shift, covariance + error)
+            for shift, error in others.ways
+        ]
+        carried = np.logaddexp.reduce(along) - np.log(len(along))
+        return float(np.logaddexp(alone, carried + np.log(others.share / MOVE_PRIOR)))
+
+    @property
+    def there(self) -> PoseCandidate:
+        """The surface after its likeliest motion."""
+        posed = self.surface.posed
+        return replace(posed, pose=self.surface.pose(self.fit.motion))
+
+    def way(self, camera: CameraError) -> tuple[Float, Float]:
+        """Shift by which it moved, as a motion, (6,), metres, and its covariance, (6, 6)."""
+        mean, covariance = self.expected(camera)
+        moved = self.moved(covariance, MOVE_SCALES[-1])
+        shift = np.zeros(6)
+        shift[3:] = (self.fit.motion - mean)[3:]
+        error = np.zeros((6, 6))
+        seen = np.linalg.solve(np.eye(6) + moved @ self.fit.information, moved)
+        error[3:, 3:] = (seen + covariance)[3:, 3:]
+        return shift, error
 
     def deviation(self, camera: CameraError) -> float:
         """Nats by which its likeliest motion differs from that of an object that stands."""
@@ -234,39 +273,34 @@ def changes(
         The change of each object, and the error of the pose of the new frame.
     """
     expected = CameraError.before(top.frame, tops, cameras)
-    named = {}
-    for row, track in enumerate(tracks):
-        posed = track.posed
-        if posed is not None and posed.vertices is not None:
-            same = _in_one_place(track, top, tops)
-            own = _own_covariance(track, posed, same)
-            known = [] if same else [cameras[number] for number in track.frames]
-            one = _object_at(posed, own, known, top, segments)
-            if one is not None:
-                named[row] = one
+    named = _searched(_known(tracks, top, segments, tops, cameras), expected, top)
+    standing, camera = _agreeing(named, expected)
 
-    # if none of them moved
-    still = _still(list(named.values()), expected)
-    places = {row: _displaced(one, still) for row, one in named.items()}
-    for row, one in named.items():
-        others = [place for other, place in places.items() if other != row]
-        beside = replace(one, surface=one.surface.beside(others, top))
-        mean, _ = one.expected(still)
-        starts = [mean]
-        if one.shift.any():
-            starts.append(mean + np.append(np.zeros(3), one.shift))
-        named[row] = beside.looked_for(expected, starts)
-    rows, camera = _agreeing(named, expected)
+    by_others = {}  # the camera's error, without the object itself
+    alone = {}
+    for row, track in enumerate(tracks):
+        rest = [named[other] for other in standing if other != row]
+        by_others[row] = _camera_by(rest, expected)
+        if row in named:
+            alone[row] = _of_name(named[row], by_others[row], _Moved(), track, tops)
+    ways = {
+        row: named[row].way(by_others[row])
+        for row, change in alone.items()
+        if change.found
+    }
 
     found = []
     for row, track in enumerate(tracks):
-        rest = [named[other] for other in rows if other != row]
-        without = _camera_by(rest, expected)
-        change = Change()
-        if row in named:
-            change = _of_name(named[row], without, track, tops)
+        along = tuple(way for other, way in ways.items() if other != row)
+        moved = _Moved(along, len(along) / max(len(named), 1))
+        change = alone.get(row, Change())
+        if row in named and along:
+            change = _of_name(named[row], by_others[row], moved, track, tops)
         if row not in named or change.contradicts:
-            change = _whatever_it_is(change, row in named, without, track, top, cameras)
+            seen = _last_seen(track, top, segments, tops, cameras)
+            change = _whatever_it_is(
+                change, named.get(row), seen, by_others[row], moved, track.confident
+            )
         found.append(change)
     return found, camera
 
@@ -281,6 +315,46 @@ def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
     against = sum(one.contradicts for one in found)
     confirmed = sum(one.confirms for one in found)
     return (against >= 2 and against >= confirmed) or (confirmed >= 2 and camera.far)
+
+
+def _known(
+    tracks: Sequence[Track],
+    top: TableTop,
+    segments: Sequence[Mask],
+    tops: Sequence[TableTop],
+    cameras: Sequence[CameraError],
+) -> dict[int, _Object]:
+    """Return the objects with a known geometry that a frame may show, by row."""
+    found = {}
+    for row, track in enumerate(tracks):
+        posed = track.posed
+        if posed is None or posed.vertices is None:
+            continue
+        same = _in_one_place(track.frames, top, tops)
+        own = _own_covariance(track, posed, same)
+        known = [] if same else [cameras[number] for number in track.frames]
+        one = _object_at(posed, own, known, top, segments)
+        if one is not None:
+            found[row] = one
+    return found
+
+
+def _searched(
+    named: dict[int, _Object], expected: CameraError, top: TableTop
+) -> dict[int, _Object]:
+    """Find the likeliest motion of each object, beside the others where they stand."""
+    still = _still(list(named.values()), expected)
+    places = {row: _displaced(one, still) for row, one in named.items()}
+    found = {}
+    for row, one in named.items():
+        others = [place for other, place in places.items() if other != row]
+        beside = replace(one, surface=one.surface.beside(others, top))
+        mean, _ = one.expected(still)
+        starts = [mean]
+        if one.shift.any():
+            starts.append(mean + np.append(np.zeros(3), one.shift))
+        found[row] = beside.looked_for(expected, starts)
+    return found
 
 
 def _object_at(
@@ -317,6 +391,7 @@ def _still(objects: Sequence[_Object], expected: CameraError) -> CameraError:
 def _of_name(
     one: _Object,
     camera: CameraError,
+    moved: _Moved,
     track: Track,
     tops: Sequence[TableTop],
 ) -> Change:
@@ -324,8 +399,8 @@ def _of_name(
     mean, covariance = one.expected(camera)
     # the likeliest of all motions is often small enough for an object that stands
     stands = max(one.standing(camera), one.fit.evidence(mean, covariance))
-    elsewhere = one.elsewhere(camera)
-    change = Change(stands, elsewhere, one.surface.pose(one.fit.motion))
+    elsewhere = one.elsewhere(camera, moved)
+    change = Change(stands, elsewhere, one.there)
     if not change.found:
         return change
     # it may have stood there all the time, in a pose that the earlier frames show less well
@@ -335,42 +410,61 @@ def _of_name(
     return replace(change, stands=float(np.logaddexp(stands, always)))
 
 
-def _whatever_it_is(
-    change: Change,
-    named: bool,
-    camera: CameraError,
+def _last_seen(
     track: Track,
     top: TableTop,
+    segments: Sequence[Mask],
+    tops: Sequence[TableTop],
     cameras: Sequence[CameraError],
-) -> Change:
-    """Consider that an object has no name or a wrong one: what was seen of it last may stand.
-
-    Args:
-        change: by its name.
-        named: whether it has a name.
-        camera: error of the frame's pose, by the other objects.
-        track: the object.
-        top: support surfaces of the frame.
-        cameras: errors of the poses of the earlier frames.
-    """
+) -> _Object | None:
+    """Return the part of an object that was seen last; None if the frame cannot show it."""
     posed = seen_surface(track.thing.sightings[-1])
     if posed is None:
-        return Change()
-
-    known = [cameras[track.frames[-1]]]
+        return None
+    last = track.frames[-1]
+    known = [] if _in_one_place([last], top, tops) else [cameras[last]]
     radius = track.thing.object_frame.radius
     error = float(scan_errors(radius))
     own = np.diag(np.repeat([(error / radius) ** 2, error**2], 3) / 3)
-    one = _object_at(posed, own, known, top)
-    if one is None:
-        return Change()
+    return _object_at(posed, own, known, top, segments)
 
-    stands = one.standing(camera)
-    if not named:
-        return Change(stands)
-    wrong = WRONG_NAMES if track.confident else WRONG_DOUBTFUL
-    either = np.logaddexp(np.log(1 - wrong) + change.stands, np.log(wrong) + stands)
-    return replace(change, stands=float(either))
+
+def _whatever_it_is(
+    change: Change,
+    named: _Object | None,
+    seen: _Object | None,
+    camera: CameraError,
+    moved: _Moved,
+    confident: bool,
+) -> Change:
+    """Consider that an object has no name or a wrong one: what was seen of it last stands or moved.
+
+    Args:
+        change: by its name.
+        named: the object by its name; None without one.
+        seen: the part of it that was seen last; None if the frame cannot show it.
+        camera: error of the frame's pose, by the other objects.
+        moved: the other objects that moved.
+        confident: whether its name is.
+    """
+    if seen is None:
+        return Change()
+    mean, _ = seen.expected(camera)
+    ways = [np.zeros(3), seen.shift]
+    if named is not None:
+        ways.append((named.fit.motion - named.expected(camera)[0])[3:])
+    starts = [mean + np.append(np.zeros(3), way) for way in ways]
+    seen = seen.looked_for(camera, starts)
+    unnamed = Change(seen.standing(camera), seen.elsewhere(camera, moved), seen.there)
+    if named is None:
+        return unnamed
+    wrong = WRONG_NAMES if confident else WRONG_DOUBTFUL
+    weights = np.log([1 - wrong, wrong])
+    stands, elsewhere = np.logaddexp(
+        weights[0] + [change.stands, change.elsewhere],
+        weights[1] + [unnamed.stands, unnamed.elsewhere],
+    )
+    return replace(change, stands=float(stands), elsewhere=float(elsewhere))
 
 
 def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:
@@ -379,11 +473,13 @@ def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:
     return replace(one.surface.posed, pose=one.surface.pose(mean))
 
 
-def _in_one_place(track: Track, top: TableTop, tops: Sequence[TableTop]) -> bool:
-    """Return True if a camera with a name took a frame and all views of an object in one place."""
+def _in_one_place(
+    frames: Sequence[int], top: TableTop, tops: Sequence[TableTop]
+) -> bool:
+    """Return True if a camera with a name took a frame, and earlier ones, from one place."""
     if not top.frame.camera:
         return False
-    return all(one_stand(tops[number].frame, top.frame) for number in track.frames)
+    return all(one_stand(tops[number].frame, top.frame) for number in frames)
 
 
 def _own_covariance(track: Track, posed: PoseCandidate, same: bool) -> Float:

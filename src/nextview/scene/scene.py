@@ -664,10 +664,9 @@ def _found_again(
     new = {row: track for row, track in enumerate(tracks) if track.number < 0}
     found: dict[int, Track] = {}
     for old, change in lost:
-        if not change.found or change.pose is None or old.posed is None:
+        if not change.found:
             continue
-        there = replace(old.posed, pose=change.pose)
-        rendered = render_track(old, top, -1, there)
+        rendered = render_track(old, top, -1, change.there)
         for row in new.keys() - found.keys():
             mask = new[row].thing.sightings[-1].mask
             explained = 0 if rendered is None else rendered.fit(mask)[0]
