@@ -1,7 +1,7 @@
 """What two parts of the recogniser's belief are worth: views fused with them and without.
 
-    python benchmarks/ablations.py agreement VALIDATION.npz TEST.npz [--store STORE]
-    python benchmarks/ablations.py size PREDICTIONS.npz
+    python -m benchmarks.ablations agreement VALIDATION.npz TEST.npz [--store STORE]
+    python -m benchmarks.ablations size PREDICTIONS.npz
 
 Prints Markdown. Views are fused in a random order and all its rotations, the same with and without.
 In brackets: class means, and 95 % bootstrap intervals over objects.

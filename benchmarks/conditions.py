@@ -1,7 +1,7 @@
 """Recognise test objects under every condition: sensors, noise, holes, wrong object frames,
 pictures that lack a part.
 
-    python benchmarks/conditions.py DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
+    python -m benchmarks.conditions DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
         [--figure out.png]
 
 "clean" is a render without a sensor. The next conditions are renders with one error each, of the

@@ -1,6 +1,6 @@
 """Draw the table of ``nextview demo``, and record it as a depth camera on a wrist sees it.
 
-    python benchmarks/demo_table.py YCB OUT [--seed 0]
+    python -m benchmarks.demo_table YCB OUT [--seed 0]
 
 YCB holds the scans of the bundled memory "ycb", in metres, by their names. Seven of them, no two of
 a kind, lie on a table in a room as they fell, at true size; between them stands a toy of 14 cm that

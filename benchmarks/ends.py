@@ -1,6 +1,6 @@
 """When a scene says that it is done: what is left unknown, unseen or wrong at that moment.
 
-    python benchmarks/machine_parts.py PARTS            # generated parts, millimetres
+    python -m benchmarks.machine_parts PARTS            # generated parts, millimetres
     nextview learn PARTS taught --unit mm
     python -m benchmarks.ends PARTS OUT.jsonl --models taught --unit mm [--draws 20] [--seed 1]
     python -m benchmarks.ends SCANS OUT.jsonl --place bin [--draws 1]

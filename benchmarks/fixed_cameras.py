@@ -4,7 +4,7 @@ Four YCB things stand on a table at random, anew at each moment. Two cameras of 
 ``stereo`` sensor, 60 to 110 degrees apart, see them. The pose of the second one is exact, or has an
 error of 4 mm and 0.6 degrees in a random direction.
 
-    python benchmarks/fixed_cameras.py --seeds 100 120 --moments 4
+    python -m benchmarks.fixed_cameras --seeds 100 120 --moments 4
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """How long the bundled networks take for one view, and how near that is to what the cores can
 multiply.
 
-    python benchmarks/latency.py [--threads 2] [--models NAME-or-card ...]
+    python -m benchmarks.latency [--threads 2] [--models NAME-or-card ...]
 
 For each network: milliseconds a view (median and the 95th percentile over single views, ONNX
 Runtime), multiplications and additions of its convolutions and matrix products, and their rate as a

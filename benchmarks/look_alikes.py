@@ -1,6 +1,6 @@
 """Pairs of things that differ in one place only, made by rule from scans and models.
 
-    python benchmarks/look_alikes.py YCB OUT [--models ModelNet10] [--pairs 40] [--seed 0]
+    python -m benchmarks.look_alikes YCB OUT [--models ModelNet10] [--pairs 40] [--seed 0]
         [--pictures pairs.png]
 
 Each pair is one body with and without a change, or with two changes that differ, and the change is

@@ -1,8 +1,8 @@
 """Poses of machine parts that are nearly symmetric: how often a confident one is wrong.
 
-    python benchmarks/machine_parts.py PARTS            # writes the parts as meshes, millimetres
+    python -m benchmarks.machine_parts PARTS            # writes the parts as meshes, millimetres
     nextview learn PARTS taught --unit mm
-    python benchmarks/machine_parts.py PARTS --models taught [--draws 20]
+    python -m benchmarks.machine_parts PARTS --models taught [--draws 20]
 
 The parts are flanges with bolt holes, a gear with a keyway, L brackets of 20 mm, a die, a hex nut,
 a hex bolt and a shaft with a flat, all exact. Each is shown as it falls (on any face of the convex

@@ -1,9 +1,9 @@
 """A thousand things made by rule from scans: how long a frame takes among them, and how often it
 is right.
 
-    python benchmarks/many_things.py make YCB THINGS [--count 1000] [--seed 0]
+    python -m benchmarks.many_things make YCB THINGS [--count 1000] [--seed 0]
     nextview learn THINGS MEMORY --unit m --upright
-    python benchmarks/many_things.py measure THINGS MEMORY [--frames 100] [--seed 1]
+    python -m benchmarks.many_things measure THINGS MEMORY [--frames 100] [--seed 1]
         [--save FOLDER]
 
 ``make`` writes a PLY file a thing, metres. The first ones are the scans of the folder YCB

@@ -1,6 +1,6 @@
 """Moves and removals that a scene notices, and its false alarms, on simulated tables.
 
-    python benchmarks/moves.py SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
+    python -m benchmarks.moves SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
         [--masks true network]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Six of

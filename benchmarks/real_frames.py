@@ -1,7 +1,7 @@
 """Real frames of things on a table, one view each: things that were taught, or none of which was.
 
-    python benchmarks/real_frames.py taught FOLDER SCANS [--models ycb] [--network CARD]
-    python benchmarks/real_frames.py untaught FOLDER [--models ycb] [--show] [--network CARD]
+    python -m benchmarks.real_frames taught FOLDER SCANS [--models ycb] [--network CARD]
+    python -m benchmarks.real_frames untaught FOLDER [--models ycb] [--show] [--network CARD]
 
 No camera pose is known: up is the normal of the table. Nothing is drawn at random. ``--network``
 is the card of a network of ``nextview train segmentation`` in place of the bundled one.

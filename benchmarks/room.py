@@ -2,10 +2,10 @@
 good and a poor camera.
 
     nextview scenes ModelNet10 rooms --room --split train --scenes 60
-    python benchmarks/room.py rooms ModelNet10 out [--mistakes page]
+    python -m benchmarks.room rooms ModelNet10 out [--mistakes page]
 
     nextview scenes YCB tables --room --unit m --scenes 40
-    python benchmarks/room.py tables YCB out-ycb --models ycb --by point mask
+    python -m benchmarks.room tables YCB out-ycb --models ycb --by point mask
 
 Each room is looked at from its first view on, with all defaults, until the session is done. By
 "pose" nothing is said but where the camera is and that it is aimed at the object. The point lies
@@ -35,11 +35,11 @@ import numpy as np
 import tyro
 from msgspec import Struct
 from numpy.typing import NDArray
-from room_pictures import Picture, write_page
 from scipy.ndimage import binary_dilation
 from scipy.stats import binomtest
 
 import nextview
+from benchmarks.room_pictures import Picture, write_page
 from nextview import System
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track

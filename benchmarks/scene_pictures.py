@@ -1,6 +1,6 @@
 """Draw a contact sheet of scenes: one object at three levels, seen from some of the 40 views.
 
-    python benchmarks/scene_pictures.py ModelNet10 docs/images/scenes.png [--target chair_0917
+    python -m benchmarks.scene_pictures ModelNet10 docs/images/scenes.png [--target chair_0917
         --seed 0]
 
 The target is orange, what stands around it grey, the table light. Above each picture is the share

@@ -1,11 +1,11 @@
 """Choose and judge policies in scenes: objects among others, half hidden.
 
-    python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0
+    python -m benchmarks.scenes choose learning.npz [--policies random-all visibility@0
         visible-gain@0]
     python -m research.plan scenes.zarr volumetric  # the store that scenes.npz was predicted from
-    python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...]
+    python -m benchmarks.scenes judge scenes.npz ... --ours visible-gain [--policies ...]
         [--figure scenes_travel.png]
-    python benchmarks/scenes.py calibration scenes.npz ... --alone single-objects.npz ...
+    python -m benchmarks.scenes calibration scenes.npz ... --alone single-objects.npz ...
 
 ``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in
 the truth and accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level

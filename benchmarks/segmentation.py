@@ -1,7 +1,7 @@
 """Which pixels are one thing: the segmentation against the truth, on real and simulated frames.
 
-    python benchmarks/segmentation.py real FOLDER [--network CARD] [--figure OUT.png]
-    python benchmarks/segmentation.py {table,bin,shelf,floor,belt} SCANS [--frames 40] [--seed 0]
+    python -m benchmarks.segmentation real FOLDER [--network CARD] [--figure OUT.png]
+    python -m benchmarks.segmentation {table,bin,shelf,floor,belt} SCANS [--frames 40] [--seed 0]
 
 ``real``: FOLDER holds a folder a frame: depth.png (uint16, millimetres), K.json (fx, fy, cx, cy,
 the middle of the first pixel at 0) and labels.png (0: none, 1: table, else the tens digit is the

@@ -1,7 +1,7 @@
 """How long one update of a session takes, from a 640 x 480 frame on, and whether memory stays flat
 over many.
 
-    python benchmarks/session_latency.py [--updates 200] [--threads 2] [--cpu] [--threshold 1]
+    python -m benchmarks.session_latency [--updates 200] [--threads 2] [--cpu] [--threshold 1]
 
 A chair on a table, noise 1 mm, 3 % holes, from random places around it; sessions of up to five
 frames, one after the other, that never reach the threshold by default. The time of an update is

@@ -1,9 +1,9 @@
 """What whole episodes say of simple shapes that nobody taught: ball, box, rod, can, cone, capsule,
 ring, slab.
 
-    python benchmarks/simple_shapes.py                         # 3, 6, 12 cm; the YCB objects
-    python benchmarks/simple_shapes.py --shapes ball box rod can --radii 0.025 0.05 0.1 0.15
-    python benchmarks/simple_shapes.py --models modelnet10 --radii 0.3 0.6    # furniture sizes
+    python -m benchmarks.simple_shapes                         # 3, 6, 12 cm; the YCB objects
+    python -m benchmarks.simple_shapes --shapes ball box rod can --radii 0.025 0.05 0.1 0.15
+    python -m benchmarks.simple_shapes --models modelnet10 --radii 0.3 0.6    # furniture sizes
 
 Each shape stands upright, turned at random, and is looked at through a sensor with all defaults,
 its size known. A shape is marked (*) if the smallest box around it is, within a tenth along each

@@ -1,10 +1,10 @@
 """Whole episodes with all defaults: how often objects are named, named right, and called unknown.
 
-    python benchmarks/strangers.py data/ModelNet10 --split test --draws 3 [--sensor wrist]
+    python -m benchmarks.strangers data/ModelNet10 --split test --draws 3 [--sensor wrist]
         [--aligned]
-    python benchmarks/strangers.py data/PSB --objects 300 --every-second
-    python benchmarks/strangers.py YCB --unit m [--models mine]
-    python benchmarks/strangers.py data/ModelNet10 --split test --objects 60 --around heavy
+    python -m benchmarks.strangers data/PSB --objects 300 --every-second
+    python -m benchmarks.strangers YCB --unit m [--models mine]
+    python -m benchmarks.strangers data/ModelNet10 --split test --objects 60 --around heavy
 
 Each object is turned about the vertical by a random angle, as real objects are, unless
 ``--aligned`` leaves it as its file has it. An episode begins at a random view. With ``--around``

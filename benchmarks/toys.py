@@ -1,7 +1,7 @@
 """Things of 20 cm from models that have no scale, to teach and to recognise.
 
-    python benchmarks/toys.py PSB princeton --every-second --each 5
-    python benchmarks/toys.py ModelNet10 chairs --classes chair --each 50 --split test
+    python -m benchmarks.toys PSB princeton --every-second --each 5
+    python -m benchmarks.toys ModelNet10 chairs --classes chair --each 50 --split test
 
 Each model is scaled to a diameter of 20 cm, placed on the plane z = 0 and written as PLY in metres
 under the name of its file. Models are taken in the order of their names. Those that cannot be read,

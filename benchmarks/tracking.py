@@ -1,6 +1,6 @@
 """Accuracy, losses and speed of the tracker on simulated trajectories of things in a gripper.
 
-    python benchmarks/tracking.py SCANS OUT.jsonl [--trajectories 10] [--seed 0]
+    python -m benchmarks.tracking SCANS OUT.jsonl [--trajectories 10] [--seed 0]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Four of
 them stand on a table, and a scene names them from three views. One whose pose it finds is then

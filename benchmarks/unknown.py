@@ -2,7 +2,7 @@
 
     nextview render data/ModelNet10 views.zarr
     nextview render data/PSB unseen.zarr
-    python benchmarks/unknown.py views.zarr unseen.zarr [--split test]
+    python -m benchmarks.unknown views.zarr unseen.zarr [--split test]
 
 The classes of the second store must not be among the recogniser's. Prints, after one, two, three
 and five random views, the area under the ROC curve of the novelty score, the share of known objects

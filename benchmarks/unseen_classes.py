@@ -2,7 +2,7 @@
 research question).
 
     nextview render data/PSB unseen.zarr
-    python benchmarks/unseen_classes.py unseen.zarr [--model lem-modelnet10]
+    python -m benchmarks.unseen_classes unseen.zarr [--model lem-modelnet10]
 
 The store's classes are up to you. Prints the scores beside those of the mean map of these very
 objects, over all views.

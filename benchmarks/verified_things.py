@@ -1,6 +1,6 @@
 """Taught things recognised by outline and size, and verified by their geometry, at true size.
 
-    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3]
+    python -m benchmarks.verified_things SCANS [--models ycb] [--draws 0 1] [--every 3]
         [--poses thrown] [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what

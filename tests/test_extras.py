@@ -209,8 +209,12 @@ for script in scripts:
             sys.argv = [script, *options.split()]
             sys.path.insert(0, os.path.dirname(script))
             status = 0
+            package, _, name = script.removesuffix(".py").partition("/")
             try:
-                runpy.run_path(script, run_name="__main__")
+                if package in ("benchmarks", "research"):
+                    runpy.run_module(f"{package}.{name}", None, "__main__", True)
+                else:
+                    runpy.run_path(script, run_name="__main__")
             except SystemExit as ended:
                 status = ended.code or 0
             except BaseException:
