@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
 import nextview
+from benchmarks.shared import wilson
 from nextview import Camera, Mesh, System, load_mesh
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -334,9 +334,7 @@ def main(settings: Settings) -> None:
                 f"{shown.mean():.2f}",
             ]
             for share in (single, right):
-                low, high = binomtest(int(share.sum()), len(share)).proportion_ci(
-                    method="wilson"
-                )
+                low, high = wilson(int(share.sum()), len(share))
                 cells.append(f"{share.mean():.3f} ({low:.3f}-{high:.3f})")
             cells += [
                 f"{views.mean():.2f}",

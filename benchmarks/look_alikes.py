@@ -36,15 +36,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import tyro
-from numpy.typing import NDArray
 
 from nextview.errors import MeshError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import pinhole
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import ViewSphere
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 SMALLEST_DIAMETER = 0.06  # metres, of a body
 SMALLEST_EXTENT = 0.04  # metres, of a body in each direction

@@ -34,12 +34,11 @@ from zlib import crc32
 import numpy as np
 import tyro
 from msgspec import Struct
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.stats import binomtest
 
 import nextview
 from benchmarks.room_pictures import Picture, write_page
+from benchmarks.shared import wilson
 from nextview import System
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -51,8 +50,8 @@ from nextview.session.session import Session
 from nextview.simulation.room import Room, RoomCamera, build_room
 from nextview.simulation.room_layout import RoomLayout
 from nextview.simulation.sensor import Sensor, sensor_named
+from nextview.types import Mask
 
-Mask = NDArray[np.bool_]
 By = Literal["pose", "point", "mask"]
 
 POINT_OFF = 0.02  # standard deviation of the point, as a part of the camera's distance
@@ -331,7 +330,7 @@ def table(
         for way in by:
             some = [o for o in found if (o.sensor, o.by) == (sensor, way)]
             right = sum(o.right for o in some)
-            low, high = binomtest(right, len(some)).proportion_ci(method="wilson")
+            low, high = wilson(right, len(some))
             shares = (
                 [o.unknown for o in some],
                 [o.confident and not o.right for o in some],

@@ -41,10 +41,10 @@ import numpy as np
 import trimesh
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.shared import progress, scans_of
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError, UsageError
 from nextview.files import command, read_record, write_record
@@ -61,8 +61,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified
 from nextview.things.weighing import EvidenceWeights
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 Poses = Literal["scanned", "thrown", "stood"]
@@ -231,14 +230,7 @@ class Taught:
                 f"{models}: does not know the geometry of all its things; teach it with --unit"
             )
         names = list(known.names)
-        files = {path.stem: path for path in scans.iterdir() if path.is_file()}
-        missing = [name for name in names if name not in files]
-        if missing:
-            raise UsageError(
-                f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
-            )
-
-        meshes = [load_mesh(files[name], unit="m") for name in names]
+        meshes = [load_mesh(path, unit="m") for path in scans_of(scans, names)]
         whole = [
             Surface.from_mesh(mesh, name)
             for mesh, name in zip(meshes, names, strict=True)
@@ -651,7 +643,7 @@ def main(
             continue
 
         here: list[Outcome] = []
-        for thing in track(everything[draw % every :: every], f"draw {draw}"):
+        for thing in progress(everything[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
             here += [judged(things, taught, some, episode, k) for k in counts]
