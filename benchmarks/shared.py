@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +23,7 @@ from nextview.sensing import Frame
 from nextview.types import Float
 from research.extras import extras
 
+SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
 Item = TypeVar("Item")
 Asked = TypeVar("Asked", bound=tuple)
 
@@ -162,9 +165,20 @@ def progress(
     Args:
         items: that work is done with.
         what: is worked on.
-        total: number of items; needed where they have no length.
+        total: number of items; None to take all of them first, and count.
     """
-    return iter(track(items, what, total, console=console))
+    if total is None:
+        items = list(items)
+        total = len(items)
+    if console.is_terminal:
+        yield from track(items, what, total, console=console)
+        return
+    said = time.monotonic()
+    for number, item in enumerate(items, 1):
+        yield item
+        if time.monotonic() - said > SECONDS_BETWEEN_LINES:
+            print(f"{what}: {number} of {total}", file=sys.stderr, flush=True)
+            said = time.monotonic()
 
 
 def wilson(count: int, total: int) -> tuple[float, float]:
