@@ -252,11 +252,9 @@ def test_the_help_of_every_script_shows_in_the_base_installation(base):
 
 def test_a_script_without_its_extra_prints_installation_advice(base):
     needing = {
-        "benchmarks/ablations.py": "nextview[train]",
         "benchmarks/scenes.py": "nextview[benchmark]",
         "research/example_maps.py": "nextview[benchmark]",
         "research/film.py": "./research[film]",
-        "research/growth.py": "nextview[large]",
         "research/measure_study.py": "nextview[benchmark]",
         "research/point_pairs.py": "./research[ppf]",
         "research/thing_features.py": "nextview[train]",

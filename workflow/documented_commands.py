@@ -92,7 +92,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|growth|point_pairs)|(verified|many)_things": (
+    r"research\.(film|point_pairs)|verified_things|made_things stretched": (
         "needs the YCB scans, and minutes"
     ),
     r"benchmarks\.frozen|nextview-bench": (
@@ -105,7 +105,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
-    r"benchmarks\.(render|replay|latency|session_latency)": "measures time, on a quiet machine",
+    r"benchmarks\.(render|replay|latency)": "measures time, on a quiet machine",
     r"research/tests": "they are in make test",
     r"benchmarks\.scenes judge": (
         "needs 200 scenes of each level; tests/test_scene_policies.py judges few"
@@ -125,10 +125,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
     r"nextview (benchmark|evaluate|report|leaderboard) ": "nextview[benchmark]",
-    r"benchmarks\.(ablations|views)|research\.(measure_study|example_maps)": (
+    r"benchmarks\.views|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
-    r"benchmarks\.ablations": "nextview[train]",
     r"--record|viewers\.(scene_)?recording": "nextview[record]",
     r"--explorer|viewers\.scene_page": "nextview[explore]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
