@@ -38,7 +38,7 @@ from scipy.ndimage import binary_dilation
 
 import nextview
 from benchmarks.room_pictures import Picture, write_page
-from benchmarks.shared import wilson
+from benchmarks.shared import markdown, wilson
 from nextview import System
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -311,8 +311,8 @@ def table(
     found: Sequence[Outcome],
     sensors: Sequence[str],
     by: Sequence[By],
-) -> Iterator[str]:
-    """The results as lines of a table."""
+) -> str:
+    """The results as a table."""
     columns = (
         "camera, by",
         "episodes",
@@ -324,8 +324,7 @@ def table(
         "radius within 15 %",
         "views",
     )
-    yield f"| {' | '.join(columns)} |"
-    yield "|---" * len(columns) + "|"
+    rows = []
     for sensor in sensors:
         for way in by:
             some = [o for o in found if (o.sensor, o.by) == (sensor, way)]
@@ -340,11 +339,9 @@ def table(
             )
             cells = [f"{np.mean(share):.3f}" for share in shares]
             views = np.mean([o.views for o in some])
-            first = (
-                f"{sensor}, {way} | {len(some)} | {right / len(some):.3f} "
-                f"({low:.2f}-{high:.2f})"
-            )
-            yield f"| {first} | {' | '.join(cells)} | {views:.2f} |"
+            named = f"{right / len(some):.3f} ({low:.2f}-{high:.2f})"
+            rows.append((f"{sensor}, {way}", len(some), named, *cells, f"{views:.2f}"))
+    return markdown(columns, rows)
 
 
 def causes(found: Sequence[Outcome]) -> Iterator[str]:
@@ -442,7 +439,7 @@ def main(
 
         track(run(), len(jobs), "recognising")
     found = [read_record(job.out, Outcome, "an episode", DatasetError) for job in jobs]
-    print(*table(found, sensors, by), "", *causes(found), sep="\n")
+    print(table(found, sensors, by), "", *causes(found), sep="\n")
     if mistakes is not None:
         write_page(mistakes, pictures(jobs), CAUSES)
 

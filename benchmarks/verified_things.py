@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from benchmarks.shared import progress, scans_of
+from benchmarks.shared import markdown, progress, scans_of
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError, UsageError
 from nextview.files import command, read_record, write_record
@@ -500,8 +500,8 @@ def table(
     outcomes: Sequence[Outcome],
     views: Sequence[int],
     held: bool,
-) -> Iterator[str]:
-    """The results as lines of a table.
+) -> str:
+    """The results as a table.
 
     Args:
         outcomes: of all draws.
@@ -510,11 +510,11 @@ def table(
     """
     left_out = OF_STANDING_THINGS if held else OF_HELD_THINGS
     kept = [number for number, name in enumerate(COLUMNS) if name not in left_out]
-    yield f"| {' | '.join(COLUMNS[number] for number in kept)} |"
-    yield "|---" * len(kept) + "|"
-    for k in views:
-        cells = row([outcome for outcome in outcomes if outcome.views == k], k)
-        yield f"| {' | '.join(cells[number] for number in kept)} |"
+    rows = (row([one for one in outcomes if one.views == k], k) for k in views)
+    return markdown(
+        [COLUMNS[number] for number in kept],
+        [[cells[number] for number in kept] for cells in rows],
+    )
 
 
 def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
@@ -567,10 +567,9 @@ def unknown_table(
     outcomes: Sequence[Outcome],
     known: NDArray[np.int64],
     views: Sequence[int],
-) -> Iterator[str]:
+) -> str:
     """How many of the things that were not taught, and of those that were, are called unknown."""
-    yield "| views | strangers unknown | known unknown | strangers named with confidence |"
-    yield "|---|---|---|---|"
+    rows = []
     for k in views:
         some = [o for o in outcomes if o.views == k and o.p_value is not None]
         strangers = [o for o in some if o.thing not in known]
@@ -580,7 +579,14 @@ def unknown_table(
         sure = np.mean(
             [not unknown(o) and o.confidence >= CONFIDENT for o in strangers]
         )
-        yield f"| {k} | {refused:.3f} | {wrongly:.3f} | {sure:.3f} |"
+        rows.append((k, f"{refused:.3f}", f"{wrongly:.3f}", f"{sure:.3f}"))
+    columns = (
+        "views",
+        "strangers unknown",
+        "known unknown",
+        "strangers named with confidence",
+    )
+    return markdown(columns, rows)
 
 
 def unknown(outcome: Outcome) -> bool:
@@ -654,13 +660,13 @@ def main(
     together = [outcome for draw in outcomes for outcome in draw]
     if known == "all":
         print(
-            *table(together, views, any_orientation),
+            table(together, views, any_orientation),
             "",
             *mistakes(taught, together, views),
             sep="\n",
         )
     else:
-        print(*unknown_table(together, some, views), sep="\n")
+        print(unknown_table(together, some, views))
     print(
         f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB"
     )
