@@ -62,7 +62,7 @@ reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next view
 $(THINGS)/look_alikes/pairs.csv: | .venv-test/installed
 	rm -rf $(THINGS)/look_alikes
 	mkdir -p $(THINGS)
-	$(PYTHON_TEST) benchmarks/look_alikes.py $(YCB) $(THINGS)/look_alikes --models $(DATA) --pairs 50 --seed 60
+	$(PYTHON_TEST) -m benchmarks.made_things look-alikes $(YCB) $(THINGS)/look_alikes --models $(DATA) --pairs 50 --seed 60
 
 $(THINGS)/alike/memory.json: $(THINGS)/look_alikes/pairs.csv
 	$(NEXTVIEW) learn $(THINGS)/look_alikes $(THINGS)/alike --unit m

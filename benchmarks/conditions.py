@@ -1,7 +1,7 @@
 """Recognise test objects under every condition: sensors, noise, holes, wrong object frames,
 pictures that lack a part.
 
-    python benchmarks/conditions.py DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
+    python -m benchmarks.conditions DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
         [--figure out.png]
 
 "clean" is a render without a sensor. The next conditions are renders with one error each, of the
@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
 import nextview
+from benchmarks.shared import wilson
 from nextview import Camera, Mesh, System, load_mesh
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -334,9 +334,7 @@ def main(settings: Settings) -> None:
                 f"{shown.mean():.2f}",
             ]
             for share in (single, right):
-                low, high = binomtest(int(share.sum()), len(share)).proportion_ci(
-                    method="wilson"
-                )
+                low, high = wilson(int(share.sum()), len(share))
                 cells.append(f"{share.mean():.3f} ({low:.3f}-{high:.3f})")
             cells += [
                 f"{views.mean():.2f}",

@@ -1,6 +1,6 @@
 """Draw the table of ``nextview demo``, and record it as a depth camera on a wrist sees it.
 
-    python benchmarks/demo_table.py YCB OUT [--seed 0]
+    python -m benchmarks.demo_table YCB OUT [--seed 0]
 
 YCB holds the scans of the bundled memory "ycb", in metres, by their names. Seven of them, no two of
 a kind, lie on a table in a room as they fell, at true size; between them stands a toy of 14 cm that
@@ -29,14 +29,14 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.shared import mesh_of, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 from nextview.errors import UsageError
 from nextview.files import new_folder
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.sensing.frame import Frame
@@ -48,8 +48,7 @@ from nextview.simulation.tables import (
     TableCamera,
     poses_around,
 )
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 TAUGHT_THINGS = 7
 SMALLEST = 0.05  # metres across: of a smaller thing too little is seen
@@ -129,7 +128,7 @@ def draw_table(scans: Sequence[Path], rng: np.random.Generator) -> SimulatedTabl
     """
     meshes: list[Mesh] = []
     for path in one_of_a_kind(scans, rng):
-        mesh = replace(load_mesh(path, unit="m"), name=path.stem)
+        mesh = mesh_of(path)
         if 2 * mesh.radius >= SMALLEST and len(meshes) < TAUGHT_THINGS:
             meshes.append(mesh)
     name = str(rng.choice(sorted(SAMPLE_MESHES)))
@@ -208,10 +207,7 @@ def main(
         seed: that is tried first.
         overwrite: replace files in the folder.
     """
-    files = sorted(path for path in scans.iterdir() if path.suffix == ".ply")
-    if not files:
-        raise UsageError(f"{scans}: holds no scans (.ply)")
-    found = record(files, seed)
+    found = record(list(scans_in(scans, (".ply",)).values()), seed)
     with new_folder(out, overwrite, last="intrinsics.json") as folder:
         write(found, folder)
     print(f"{out}: seed {found.seed}: {', '.join(found.truth)}")

@@ -1,6 +1,6 @@
 """When a scene says that it is done: what is left unknown, unseen or wrong at that moment.
 
-    python benchmarks/machine_parts.py PARTS            # generated parts, millimetres
+    python -m benchmarks.machine_parts PARTS            # generated parts, millimetres
     nextview learn PARTS taught --unit mm
     python -m benchmarks.ends PARTS OUT.jsonl --models taught --unit mm [--draws 20] [--seed 1]
     python -m benchmarks.ends SCANS OUT.jsonl --place bin [--draws 1]
@@ -20,21 +20,18 @@ holds are not run again. MuJoCo draws with ``MUJOCO_GL=egl`` unless another is n
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
-
 import numpy as np
 import trimesh
 import tyro
-from rich.progress import track
 
 import nextview
+from benchmarks.shared import names_to_stage, results
 from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
@@ -50,15 +47,15 @@ from benchmarks.staged_things import (
     true_pose,
 )
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import ObservationError
 from nextview.scene.scene import Scene
 from nextview.sensing import Box, Frame
-from research.extras import extras
 
 BIN_INSIDE = Box((-0.2, -0.15, -0.02), (0.2, 0.15, 0.25))
 LOWEST = np.sin(np.radians(20))  # of the directions of targets
 MOST_FRAMES = 8
 METRES = {"m": 1.0, "mm": 0.001}
+FIELDS = ("place", "thing", "draw", "seed")  # by which a line of the results is known
 End = Literal["right", "unknown", "wrong", "no object"]
 
 
@@ -126,18 +123,25 @@ def end_of(scene: Scene, masks: Sequence[Bools], name: str) -> End:
 def watched(
     system: nextview.System,
     folder: Path,
-    place: Literal["alone", "bin"],
-    name: str,
-    draw: int,
-    seed: int,
     arm_error: tuple[float, float],
+    asked: tuple[Literal["alone", "bin"], str, int, int],
 ) -> dict[str, Any]:
-    """Stage a thing and look until the scene is done: a line of the output."""
+    """Stage a thing and look until the scene is done.
+
+    Args:
+        system: that knows the things.
+        folder: of the scans, in metres.
+        arm_error: standard deviations of the camera's poses along and about each axis, mm, degrees.
+        asked: values of ``FIELDS``.
+
+    Returns:
+        What is written of it; only that it has no end if the thing does not stay there.
+    """
+    place, name, draw, seed = asked
     rng = np.random.default_rng([seed, draw, place == "bin", *name.encode()])
-    line: dict[str, Any] = {"place": place, "thing": name, "draw": draw, "seed": seed}
     found = staged(place, str(folder), name, rng)
     if found is None:
-        return {**line, "end": None}
+        return {"end": None}
     world, _ = found
     scan = scan_of(str(folder), name)
     true = true_pose(world[1])
@@ -153,7 +157,6 @@ def watched(
     )
     masks, refused = look_until_done(scene, world, aim, distance, arm_error, rng)
     return {
-        **line,
         "end": end_of(scene, masks, name),
         "frames": len(masks),
         "objects": len(scene.objects),
@@ -209,34 +212,18 @@ def main(
     Raises:
         UsageError: there are no scans.
     """
-    with extras():
-        import mujoco  # noqa: F401  # staged_things needs it
-
-    names = sorted(path.stem for path in scans.glob("*.ply"))
-    if not names:
-        raise UsageError(f"{scans}: holds no scan, NAME.ply")
+    names = names_to_stage(scans)
     system = nextview.load(models, unknown=unknown, max_views=MOST_FRAMES)
-    wanted = [(name, draw) for draw in range(draws) for name in names]
-    order = np.random.default_rng(seed).permutation(len(wanted))
-    wanted = [wanted[k] for k in order][: most or None]
-    written = output.read_text().splitlines() if output.exists() else []
-    lines = [json.loads(line) for line in written]
-    lines = [one for one in lines if (one["seed"], one["place"]) == (seed, place)]
-    known = {(line["thing"], line["draw"]) for line in lines}
-
-    with TemporaryDirectory() as folder, output.open("a") as file:
+    asked = [(place, name, draw, seed) for draw in range(draws) for name in names]
+    order = np.random.default_rng(seed).permutation(len(asked))
+    asked = [asked[k] for k in order][: most or None]
+    with TemporaryDirectory() as folder:
         for name in names:
             scan = trimesh.load_mesh(scans / f"{name}.ply", process=False)
             scan.apply_scale(METRES[unit])
             scan.export(Path(folder) / f"{name}.ply")
-        for name, draw in track(wanted, description="Scenes"):
-            if (name, draw) in known:
-                continue
-            line = watched(system, Path(folder), place, name, draw, seed, arm_error)
-            file.write(json.dumps(line) + "\n")
-            file.flush()
-            lines.append(line)
-    print(summary([one for one in lines if (one["thing"], one["draw"]) in wanted]))
+        run = partial(watched, system, Path(folder), arm_error)
+        print(summary(results(output, FIELDS, asked, run, "scenes")))
 
 
 if __name__ == "__main__":

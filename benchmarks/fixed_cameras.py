@@ -4,7 +4,7 @@ Four YCB things stand on a table at random, anew at each moment. Two cameras of 
 ``stereo`` sensor, 60 to 110 degrees apart, see them. The pose of the second one is exact, or has an
 error of 4 mm and 0.6 degrees in a random direction.
 
-    python benchmarks/fixed_cameras.py --seeds 100 120 --moments 4
+    python -m benchmarks.fixed_cameras --seeds 100 120 --moments 4
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 import tyro
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from benchmarks.shared import progress
 from nextview.geometry.mesh import Mesh
 from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
 from nextview.sensing.frame import Frame
@@ -38,7 +38,7 @@ def main(seeds: tuple[int, int] = (100, 120), moments: int = 4) -> None:
     """
     meshes = taught_meshes("ycb", NAMES)
 
-    found = [told(meshes, seed, moments) for seed in track(range(*seeds), "rigs")]
+    found = [told(meshes, seed, moments) for seed in progress(range(*seeds), "rigs")]
     exact, wrong = zip(*found, strict=True)
     off = np.array(
         [(one.millimetres - MILLIMETRES, one.degrees - DEGREES) for one in wrong]

@@ -25,13 +25,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
-
 import msgspec
 import numpy as np
 import tyro
 from PIL import Image
 
+from benchmarks.shared import names_to_stage
 from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
@@ -63,7 +62,6 @@ from nextview.benchmark.frozen import (
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.files import only_one, read_record, sha256_of, write_record
-from research.extras import extras
 
 FROZEN_PLACES: tuple[Place, ...] = (
     "alone",
@@ -278,12 +276,7 @@ def main(
         out: folder of the archive; its name is the archive's, such as nextview-bench-1.0.
         how: what it depends on.
     """
-    with extras():
-        import mujoco  # noqa: F401  # staged_things needs it
-
-    names = sorted(path.stem for path in scans.glob("*.ply"))
-    if not names:
-        raise UsageError(f"{scans}: holds no scan, NAME.ply")
+    names = names_to_stage(scans)
     if not 1 <= how.draws <= len(how.places):
         raise UsageError("each thing is shown in one place or more, and in each once")
     if (out / MANIFEST).exists():

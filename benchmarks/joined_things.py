@@ -1,6 +1,6 @@
 """One table of several runs of ``nextview benchmark things``, with one correction of all tests.
 
-    python benchmarks/joined_things.py heavy half clear pairs
+    python -m benchmarks.joined_things heavy half clear pairs
 
 Each argument is the folder of a run. Its name is that of the set in the table. Every test of every
 run, of all things and of the confusable half, counts in Holm's correction. A p-value in the table

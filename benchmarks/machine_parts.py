@@ -1,8 +1,8 @@
 """Poses of machine parts that are nearly symmetric: how often a confident one is wrong.
 
-    python benchmarks/machine_parts.py PARTS            # writes the parts as meshes, millimetres
+    python -m benchmarks.machine_parts PARTS            # writes the parts as meshes, millimetres
     nextview learn PARTS taught --unit mm
-    python benchmarks/machine_parts.py PARTS --models taught [--draws 20]
+    python -m benchmarks.machine_parts PARTS --models taught [--draws 20]
 
 The parts are flanges with bolt holes, a gear with a keyway, L brackets of 20 mm, a die, a hex nut,
 a hex bolt and a shaft with a flat, all exact. Each is shown as it falls (on any face of the convex
@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import tyro
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import nextview
+from benchmarks.shared import markdown, progress
 from nextview.cli.exit_status import orderly_end
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.resting import rotated, stable_poses
@@ -35,11 +35,19 @@ from nextview.session.result import Recognition
 from nextview.session.system import System
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.solids import Solid, extruded, joined, moved, ring_points
+from nextview.types import Float
 
-Float = NDArray[np.float64]
 SPHERE = ViewSphere((18.0, 36.0, 54.0, 72.0), 8)
 WRONG = 20.0  # degrees by which a confident orientation is wrong
 X, Y, Z = np.eye(3).tolist()
+COLUMNS = (
+    "part",
+    "symmetries",
+    "named right",
+    "confident",
+    "off: median, worst",
+    "wrong",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +193,9 @@ def main(
 
     system = nextview.load(models, max_views=1, viewpoints="40")
     about = {thing.name: thing for thing in system.models.recogniser.card.memory.things}
-    print(
-        "| part | symmetries | named right | confident | off: median, worst | wrong |"
-    )
-    print("|---|---|---|---|---|---|")
+    rows = []
     sure_of_all = wrong_of_all = 0
-    for thing, (name, part) in enumerate(known.items()):
+    for thing, (name, part) in enumerate(progress(known.items(), "parts", len(known))):
         turns = turns_of(part)
         right = []
         sure = []
@@ -218,8 +223,8 @@ def main(
         wrong_of_all += wrong
         found = in_words(about[name].symmetries)
         errors = f"{np.median(sure):.1f}, {max(sure):.1f}" if sure else "-"
-        counts = f"{len(right)} of {draws} | {len(sure)}"
-        print(f"| {name} | {found} | {counts} | {errors} | {wrong} |", flush=True)
+        rows.append((name, found, f"{len(right)} of {draws}", len(sure), errors, wrong))
+    print(markdown(COLUMNS, rows))
     share = wrong_of_all / max(sure_of_all, 1)
     print(f"{wrong_of_all} of {sure_of_all} confident poses are wrong: {share:.3f}")
 

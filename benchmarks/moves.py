@@ -1,6 +1,6 @@
 """Moves and removals that a scene notices, and its false alarms, on simulated tables.
 
-    python benchmarks/moves.py SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
+    python -m benchmarks.moves SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
         [--masks true network]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Six of
@@ -27,29 +27,29 @@ stopped goes on.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 
 import nextview
+from benchmarks.shared import mesh_of, results, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.scene.objects import SceneObject
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.frame import Frame
 from nextview.simulation.scene import footprint, separation
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.types import Float
 
-Float = NDArray[np.float64]
 Masks = Literal["true", "network"]
 
 MILLIMETRES = (3, 5, 8, 12, 20, 30, 50, 80, 100, 150, None)  # None: taken away
@@ -65,6 +65,7 @@ FRAMES_MOVED = 2  # after a move
 FRAMES_STILL = 4
 GHOST = 0.02  # metres that a confident pose is off where nothing of the name stands
 CENTRE = np.array([0, 0, 0.03])
+FIELDS = ("seed", "masks", "kind", "table")  # by which a line of the results is known
 
 
 def kind_of(mesh: Mesh) -> int:
@@ -276,24 +277,21 @@ def watch_still(watched: Watched) -> dict[str, Any]:
 def watch(
     system: nextview.System,
     meshes: Sequence[Mesh],
-    seed: tuple[int, int],
-    kind: str,
-    masks: Masks,
+    asked: tuple[int, Masks, str, int],
 ) -> dict[str, Any]:
     """Look at one table.
 
     Args:
         system: that knows the things.
         meshes: scans of the things, in metres.
-        seed: of all draws; the second number is that of the table.
-        kind: "moved" or "still".
-        masks: what tells the things.
+        asked: values of ``FIELDS``: the seed of all draws, what tells the things, "moved" or
+            "still", and the number of the table.
 
     Returns:
         What is written of it.
     """
-    number = seed[1]
-    rng = np.random.default_rng([*seed, kind == "still"])
+    seed, masks, kind, number = asked
+    rng = np.random.default_rng([seed, number, kind == "still"])
     by = MILLIMETRES[number // 3 % len(MILLIMETRES)] if kind == "moved" else None
     table, row, after = draw(meshes, number, by, rng)
     sensor = SENSORS["stereo"]
@@ -366,30 +364,13 @@ def main(
     Raises:
         UsageError: there are no scans, or no table with room for a move is found.
     """
-    lines = (
-        [json.loads(line) for line in out.read_text().splitlines()]
-        if out.exists()
-        else []
-    )
-    paths = sorted(path for path in scans.iterdir() if path.is_file())
-    if not paths:
-        raise UsageError(f"{scans}: holds no mesh")
-    meshes = [replace(load_mesh(path, unit="m"), name=path.stem) for path in paths]
+    meshes = [mesh_of(path) for path in scans_in(scans).values()]
     system = nextview.load(models, max_views=20)
-    wanted = [("moved", number) for number in range(tables)]
-    wanted += [("still", number) for number in range(still)]
-    lines = [one for one in lines if one["seed"] == seed and one["masks"] == masks]
-    done = {(line["kind"], line["table"]) for line in lines}
-    with out.open("a") as written:
-        for kind, number in track(wanted, description="Tables"):
-            if (kind, number) in done:
-                continue
-            line = {"seed": seed, "masks": masks, "kind": kind, "table": number}
-            line |= watch(system, meshes, (seed, number), kind, masks)
-            written.write(json.dumps(line) + "\n")
-            written.flush()
-            lines.append(line)
-    print(summary([line for line in lines if (line["kind"], line["table"]) in wanted]))
+    asked = [(seed, masks, "moved", number) for number in range(tables)]
+    asked += [(seed, masks, "still", number) for number in range(still)]
+    print(
+        summary(results(out, FIELDS, asked, partial(watch, system, meshes), "tables"))
+    )
 
 
 if __name__ == "__main__":

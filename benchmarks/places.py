@@ -32,27 +32,20 @@ is named. The things come in a random order, so what is there of a run that was 
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
 
 import numpy as np
 import trimesh
 import tyro
 from scipy.spatial import cKDTree
-from scipy.stats import binomtest
 
 import nextview
+from benchmarks.shared import markdown, names_to_stage, results, share
 from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
@@ -68,10 +61,11 @@ from benchmarks.staged_things import (
     true_pose,
 )
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import ObservationError
 from nextview.recognition.belief import Stopping
 from nextview.sensing import Frame, ObservedObject
-from research.extras import extras
+
+FIELDS = ("terms", "place", "thing")  # by which a line of the results is known
 
 
 @dataclass(frozen=True)
@@ -200,30 +194,28 @@ def recognised(
     return found
 
 
-def episode(place: Place, name: str, terms: Terms) -> dict[str, Any]:
-    """Stage a thing in a place, look at it three times: a line of the output."""
+def episode(asked: tuple[Terms, Place, str]) -> dict[str, Any]:
+    """Stage a thing in a place, and look at it three times.
+
+    Args:
+        asked: values of ``FIELDS``.
+
+    Returns:
+        What is written of it; views are None if the thing does not stay there.
+    """
+    terms, place, name = asked
     numbers = [terms.seed, PLACES.index(place), *name.encode()]
     rng = np.random.default_rng(numbers)
-    line: dict[str, Any] = {"place": place, "thing": name, "terms": asdict(terms)}
     found_rest = staged(place, terms.scans, name, rng)
     if found_rest is None:
-        return {**line, "views": None}
+        return {"views": None}
     scene, tries = found_rest
     true = true_pose(scene[1])
     shots, distance = shots_of(
         place, scene, scan_of(terms.scans, name), terms.arm_error, rng
     )
     found = recognised(place, name, shots, distance, true, terms)
-    line["tries"] = tries
-    return {**line, "views": [None if view is None else asdict(view) for view in found]}
-
-
-def share(count: int, total: int) -> str:
-    """A share, and its 95 % Wilson interval."""
-    if not total:
-        return "-"
-    low, high = binomtest(count, total).proportion_ci(method="wilson")
-    return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"
+    return {"tries": tries, "views": found}
 
 
 def distances(views: Sequence[dict[str, Any]]) -> str:
@@ -235,22 +227,23 @@ def distances(views: Sequence[dict[str, Any]]) -> str:
     return f"{low:.1f}, {high:.1f}"
 
 
-def table(lines: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """The results as lines of a table."""
-    heads = [f"right after {k + 1}" for k in range(VIEW_COUNT)]
+def table(lines: Sequence[dict[str, Any]]) -> str:
+    """The results as a table."""
     last = f"after {VIEW_COUNT}"
+    heads = ["place", "shown"]
+    heads += [f"right after {k + 1}" for k in range(VIEW_COUNT)]
     heads += [f"confident and right {last}", f"confident and wrong {last}"]
     heads += [f"unknown {last}", "refused frames"]
     heads += [f"off {last}, mm: median, 90 %", "s a view"]
-    yield f"| place | shown | {' | '.join(heads)} |"
-    yield "|---" * (len(heads) + 2) + "|"
+    rows = []
     for place in (*PLACES, "all"):
         here = [line for line in lines if place in (line["place"], "all")]
         shown = [line["views"] for line in here if line["views"] is not None]
         if not shown:
             continue
         after = [[views[k] for views in shown if views[k]] for k in range(VIEW_COUNT)]
-        cells = [share(sum(v["right"] for v in some), len(some)) for some in after]
+        cells = [place, f"{len(shown)} of {len(here)}"]
+        cells += [share(sum(v["right"] for v in some), len(some)) for some in after]
         end = after[-1]
         sure = [view for view in end if view["confident"]]
         good = sum(view["right"] for view in sure)
@@ -262,7 +255,8 @@ def table(lines: Sequence[dict[str, Any]]) -> Iterator[str]:
         cells.append(
             f"{np.median([view['seconds'] for view in views]):.2f}" if views else "-"
         )
-        yield f"| {place} | {len(shown)} of {len(here)} | {' | '.join(cells)} |"
+        rows.append(cells)
+    return markdown(heads, rows)
 
 
 def main(
@@ -289,59 +283,13 @@ def main(
         any_orientation: places in which the things are recognised in any orientation.
         workers: processes.
     """
-    with extras():
-        import mujoco  # noqa: F401  # staged_things needs it
-
-    names = sorted(path.stem for path in scans.glob("*.ply"))
-    if not names:
-        raise UsageError(f"{scans}: holds no scan, NAME.ply")
-    names = np.random.default_rng(seed).permutation(names).tolist()
-    names = names[: things or None]
-
+    names = np.random.default_rng(seed).permutation(names_to_stage(scans)).tolist()
     terms = Terms(str(scans), models, seed, arm_error, any_orientation)
-    # as JSON gives it back
-    same = json.loads(json.dumps(asdict(terms)))
-    lines: list[dict[str, Any]] = []
-    if output.exists():
-        lines = [json.loads(line) for line in output.read_text().splitlines()]
-        if any(line["terms"] != same for line in lines):
-            raise UsageError(
-                f"{output}: holds episodes of other options; name another file"
-            )
-    done = {(line["place"], line["thing"]) for line in lines}
-    asked = [(place, name) for name in names for place in places]
-    missing = [each for each in asked if each not in done]
-
-    with output.open("a") as file:
-        for number, line in enumerate(lines_of(missing, terms, workers), 1):
-            file.write(json.dumps(line) + "\n")
-            file.flush()
-            lines.append(line)
-            said = [
-                view and (view["answer"] or "unknown") for view in line["views"] or []
-            ]
-            print(
-                f"{number} of {len(missing)}: {line['thing']}, {line['place']}: {said}",
-                file=sys.stderr,
-            )
-    print(
-        *table([line for line in lines if (line["place"], line["thing"]) in asked]),
-        sep="\n",
-    )
-
-
-def lines_of(
-    asked: Sequence[tuple[Place, str]], terms: Terms, workers: int
-) -> Iterator[dict[str, Any]]:
-    """Run episodes, by places and names of things, in some processes; yield them as they end."""
-    if workers < 2:
-        for place, name in asked:
-            yield episode(place, name, terms)
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        ends = [pool.submit(episode, place, name, terms) for place, name in asked]
-        for end in as_completed(ends):
-            yield end.result()
+    asked = [
+        (terms, place, name) for name in names[: things or None] for place in places
+    ]
+    processes = workers if workers > 1 else 0
+    print(table(results(output, FIELDS, asked, episode, "episodes", processes)))
 
 
 if __name__ == "__main__":

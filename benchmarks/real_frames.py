@@ -1,7 +1,7 @@
 """Real frames of things on a table, one view each: things that were taught, or none of which was.
 
-    python benchmarks/real_frames.py taught FOLDER SCANS [--models ycb] [--network CARD]
-    python benchmarks/real_frames.py untaught FOLDER [--models ycb] [--show] [--network CARD]
+    python -m benchmarks.real_frames taught FOLDER SCANS [--models ycb] [--network CARD]
+    python -m benchmarks.real_frames untaught FOLDER [--models ycb] [--show] [--network CARD]
 
 No camera pose is known: up is the normal of the table. Nothing is drawn at random. ``--network``
 is the card of a network of ``nextview train segmentation`` in place of the bundled one.
@@ -23,7 +23,6 @@ those with a name, and those with a confident one; with ``--show`` each confiden
 and how uncertain its pose is.
 """
 
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -33,12 +32,18 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from PIL import Image
-from rich.progress import track
 from tyro.extras import subcommand_cli_from_dict
 
 import nextview
+from benchmarks.shared import (
+    camera_matrix,
+    frame_in,
+    markdown,
+    mesh_of,
+    progress,
+    scans_of,
+)
 from nextview.errors import ObservationError, UsageError
-from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Observation
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
@@ -47,12 +52,11 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
+from nextview.types import Mask
 
 # of the camera of the PoseCNN demo: fx, fy, cx, cy
 INTRINSICS = (618.017, 618.003, 312.377, 232.375)
 LEAST_PIXELS = 200  # of a label
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -108,15 +112,8 @@ def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
     recogniser = TaughtRecogniser(models, threads=1)
     assert recogniser.card.memory is not None
     names = [thing.name for thing in recogniser.card.memory.things]
-    files = {path.stem: path for path in scans.iterdir() if path.is_file()}
-    missing = [name for name in names if name not in files]
-    if missing:
-        raise UsageError(
-            f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
-        )
-
     whole = [
-        Surface.from_mesh(load_mesh(files[name], unit="m"), name) for name in names
+        Surface.from_mesh(mesh_of(path), path.stem) for path in scans_of(scans, names)
     ]
     return TaughtThings(recogniser, [surface.simplified() for surface in whole])
 
@@ -295,8 +292,7 @@ def taught(
     """
     things = memory_with_surfaces(models, scans)
     names = (folder / "names.txt").read_text().split()
-    fx, fy, cx, cy = intrinsics
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    matrix = camera_matrix(*intrinsics)
 
     learned = None if network is None else LearnedSegmenter(network)
     found: list[Named] = []
@@ -330,17 +326,10 @@ def taught(
     print_scenes(nextview.load(models), paths, names, matrix, learned)
 
 
-def frame_in(folder: Path) -> Frame:
-    """The frame that a folder holds, without a pose."""
-    fx, fy, cx, cy = json.loads((folder / "K.json").read_text())
-    depth = np.asarray(Image.open(folder / "depth.png"))
-    return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
-
-
-def in_words(name: str, thing: SceneObject) -> str:
+def in_words(name: str, thing: SceneObject) -> tuple[object, ...]:
     """A row of a table on a confident name."""
     pixels = max(int(mask.sum()) for mask in thing.pixels.values())
-    return f"| {name} | {thing.name} | {pixels} | {thing.pose_uncertainty} |"
+    return name, thing.name, pixels, thing.pose_uncertainty
 
 
 def untaught(
@@ -364,7 +353,7 @@ def untaught(
     learned = None if network is None else LearnedSegmenter(network)
     counts = Counts()
     rows = []
-    for path in track(frames, f"frames of {folder.name}"):
+    for path in progress(frames, f"frames of {folder.name}"):
         scene = nextview.Scene(system, up=None, segmentation=learned)
         try:
             scene.update(frame_in(path))
@@ -380,8 +369,7 @@ def untaught(
         rows += [in_words(path.name, thing) for thing in sure]
 
     if show:
-        print("| frame | name | pixels | uncertainty |", "|---|---|---|---|", sep="\n")
-        print("\n".join(rows))
+        print(markdown(("frame", "name", "pixels", "uncertainty"), rows))
     share = counts.confident / max(counts.objects, 1)
     print(
         f"{counts.frames} frames taken in, {counts.refused} refused: {counts.objects} objects,"

@@ -1,7 +1,7 @@
 """Views a second from mesh files to a store on disk, beside the bare ray casts and other renderers,
 on the same meshes.
 
-    python benchmarks/render.py MODELNET10 [--objects 100] [--workers 2]
+    python -m benchmarks.render MODELNET10 [--objects 100] [--workers 2]
         [--python RIVALS/bin/python]
 
 Open3D and pyrender are no part of this project: give a Python that has them, and rows without one

@@ -1,7 +1,7 @@
 """How long the benchmark's full grid takes by replay, how that grows, and what it would take with
 the networks.
 
-    python benchmarks/replay.py [--predictions test.npz] [--meshes table.off desk.off ...]
+    python -m benchmarks.replay [--predictions test.npz] [--meshes table.off desk.off ...]
 
 Each row of the growth table runs in a process of its own, so that its memory is its own peak too.
 """

@@ -1,6 +1,6 @@
 """Write docs/reproduction.md: what of the thesis's comparison of policies holds up, with intervals.
 
-    python benchmarks/reproduction.py predictions.npz docs/reproduction.md
+    python -m benchmarks.reproduction predictions.npz docs/reproduction.md
 
 Every number and every verdict on the page is worked out here from the predictions; none is typed
 in.
@@ -145,7 +145,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         ),
         "",
         (
-            "`python benchmarks/reproduction.py predictions.npz docs/reproduction.md` makes this"
+            "`python -m benchmarks.reproduction predictions.npz docs/reproduction.md` makes this"
             " page, verdicts and all."
         ),
         f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview predict"

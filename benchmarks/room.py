@@ -2,10 +2,10 @@
 good and a poor camera.
 
     nextview scenes ModelNet10 rooms --room --split train --scenes 60
-    python benchmarks/room.py rooms ModelNet10 out [--mistakes page]
+    python -m benchmarks.room rooms ModelNet10 out [--mistakes page]
 
     nextview scenes YCB tables --room --unit m --scenes 40
-    python benchmarks/room.py tables YCB out-ycb --models ycb --by point mask
+    python -m benchmarks.room tables YCB out-ycb --models ycb --by point mask
 
 Each room is looked at from its first view on, with all defaults, until the session is done. By
 "pose" nothing is said but where the camera is and that it is aimed at the object. The point lies
@@ -34,12 +34,11 @@ from zlib import crc32
 import numpy as np
 import tyro
 from msgspec import Struct
-from numpy.typing import NDArray
-from room_pictures import Picture, write_page
 from scipy.ndimage import binary_dilation
-from scipy.stats import binomtest
 
 import nextview
+from benchmarks.room_pictures import Picture, write_page
+from benchmarks.shared import markdown, wilson
 from nextview import System
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -51,8 +50,8 @@ from nextview.session.session import Session
 from nextview.simulation.room import Room, RoomCamera, build_room
 from nextview.simulation.room_layout import RoomLayout
 from nextview.simulation.sensor import Sensor, sensor_named
+from nextview.types import Mask
 
-Mask = NDArray[np.bool_]
 By = Literal["pose", "point", "mask"]
 
 POINT_OFF = 0.02  # standard deviation of the point, as a part of the camera's distance
@@ -312,8 +311,8 @@ def table(
     found: Sequence[Outcome],
     sensors: Sequence[str],
     by: Sequence[By],
-) -> Iterator[str]:
-    """The results as lines of a table."""
+) -> str:
+    """The results as a table."""
     columns = (
         "camera, by",
         "episodes",
@@ -325,13 +324,12 @@ def table(
         "radius within 15 %",
         "views",
     )
-    yield f"| {' | '.join(columns)} |"
-    yield "|---" * len(columns) + "|"
+    rows = []
     for sensor in sensors:
         for way in by:
             some = [o for o in found if (o.sensor, o.by) == (sensor, way)]
             right = sum(o.right for o in some)
-            low, high = binomtest(right, len(some)).proportion_ci(method="wilson")
+            low, high = wilson(right, len(some))
             shares = (
                 [o.unknown for o in some],
                 [o.confident and not o.right for o in some],
@@ -341,11 +339,9 @@ def table(
             )
             cells = [f"{np.mean(share):.3f}" for share in shares]
             views = np.mean([o.views for o in some])
-            first = (
-                f"{sensor}, {way} | {len(some)} | {right / len(some):.3f} "
-                f"({low:.2f}-{high:.2f})"
-            )
-            yield f"| {first} | {' | '.join(cells)} | {views:.2f} |"
+            named = f"{right / len(some):.3f} ({low:.2f}-{high:.2f})"
+            rows.append((f"{sensor}, {way}", len(some), named, *cells, f"{views:.2f}"))
+    return markdown(columns, rows)
 
 
 def causes(found: Sequence[Outcome]) -> Iterator[str]:
@@ -443,7 +439,7 @@ def main(
 
         track(run(), len(jobs), "recognising")
     found = [read_record(job.out, Outcome, "an episode", DatasetError) for job in jobs]
-    print(*table(found, sensors, by), "", *causes(found), sep="\n")
+    print(table(found, sensors, by), "", *causes(found), sep="\n")
     if mistakes is not None:
         write_page(mistakes, pictures(jobs), CAUSES)
 

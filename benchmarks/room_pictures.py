@@ -12,14 +12,12 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.ndimage import binary_closing
 
 from nextview.files import new_folder
 from nextview.sensing import Frame
 from nextview.session.style import ACCENT, BLUE, FIGURE_STYLE, INK, PAPER
-
-Mask = NDArray[np.bool_]
+from nextview.types import Mask
 
 ACROSS = 3  # pictures in a row
 WIDTH = 4.2  # inches of one

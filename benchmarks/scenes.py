@@ -1,11 +1,12 @@
 """Choose and judge policies in scenes: objects among others, half hidden.
 
-    python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0
+    python -m benchmarks.scenes choose learning.npz [--policies random-all visibility@0
         visible-gain@0]
     python -m research.plan scenes.zarr volumetric  # the store that scenes.npz was predicted from
-    python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...]
+    python -m benchmarks.scenes judge scenes.npz ... --ours visible-gain [--policies ...]
         [--figure scenes_travel.png]
-    python benchmarks/scenes.py calibration scenes.npz ... --alone single-objects.npz ...
+    python -m benchmarks.scenes picture ModelNet10 docs/images/scenes.png [--target chair_0917]
+    python -m benchmarks.scenes calibration scenes.npz ... --alone single-objects.npz ...
 
 ``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in
 the truth and accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level
@@ -14,7 +15,9 @@ with 95 % bootstrap intervals over scenes and one Holm correction for all that i
 of what one step of foresight gains; as a figure, accuracy against travel in cells and in seconds of
 a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
 ``calibration``: how far the belief after 1, 2, 3 and 5 random views can be trusted, by level and by
-how much of the target they show.
+how much of the target they show. ``picture``: one object at three levels, seen from some of the
+40 views. The target is orange, what stands around it grey, the table light. Above each picture is
+the share of the target that shows; a view to which no camera can be brought is crossed out.
 """
 
 from __future__ import annotations
@@ -41,14 +44,26 @@ from nextview.benchmark.replay import Grid, make_specs, run_grid
 from nextview.benchmark.statistics import interval, resample
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
+from nextview.data.folders import list_dataset
 from nextview.data.metrics import calibration_error
 from nextview.data.predictions import Predictions
+from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.data.scene_views import scenes_of
 from nextview.errors import UsageError
+from nextview.geometry.depth import headlight
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import of_true_class
-from nextview.session.style import FIGURE_STYLE
+from nextview.session.style import FIGURE_STYLE, PAPER
+from nextview.simulation.scene import TargetScene, build_scene
 from nextview.simulation.scene_layout import CLUTTER_LEVELS
+from nextview.simulation.simulated import (
+    SHOWS_OTHER,
+    SHOWS_TABLE,
+    SHOWS_TARGET,
+    SceneCamera,
+)
 from nextview.training.rollout import ReplayTable
 from nextview.training.rollout import judge as follow
 
@@ -78,6 +93,14 @@ COLOURS = (
     "#7a6fd0",
     "#38a0d9",
 )
+PICTURE_SIZE = 240  # pixels
+WIDER = 0.55  # of the focal length with which the target fills the picture
+OWNER_COLOURS = {
+    SHOWS_TARGET: (0.95, 0.55, 0.15),
+    SHOWS_OTHER: (0.74, 0.71, 0.67),
+    SHOWS_TABLE: (0.95, 0.92, 0.86),
+}
+SHOWN_VIEWS = (10, 12, 14, 16, 18, 27)
 CEILING = dict(zip(CEILINGS, [("--", "#8a939b"), (":", "#8a939b")], strict=True))
 
 
@@ -506,8 +529,107 @@ def trusted(
     return " | ".join(map(", ".join, zip(*cells, strict=True)))
 
 
+def in_colours(scene: TargetScene, pose: np.ndarray) -> np.ndarray:
+    """What a camera sees, (PICTURE_SIZE, PICTURE_SIZE, 3), in the colours of the owners."""
+    intrinsics = pinhole(PICTURE_SIZE, 3.0) * [[WIDER, 1, 1], [1, WIDER, 1], [1, 1, 1]]
+    depth, owner = SceneCamera(scene, intrinsics, (PICTURE_SIZE, PICTURE_SIZE)).look(
+        pose
+    )
+    shade = headlight(depth, intrinsics)[..., None] / 255
+    image = np.tile(np.array([0.98, 0.965, 0.94]), (PICTURE_SIZE, PICTURE_SIZE, 1))
+    for which, colour in OWNER_COLOURS.items():
+        image = np.where(
+            (owner == which)[..., None],
+            np.array(colour) * (0.45 + 0.55 * shade),
+            image,
+        )
+    return np.clip(image, 0, 1)
+
+
+def picture(
+    dataset: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    target: str = "chair_0917",
+    split: str = "test",
+    seed: int = 0,
+) -> None:
+    """Draw one object at three levels of clutter, from some of the 40 views.
+
+    Args:
+        dataset: folder of the objects.
+        out: PNG.
+        target: name of the object.
+        split: of it, and of what stands around it.
+        seed: of what stands around it.
+    """
+    files = {
+        e.name: e.path.relative_to(dataset).as_posix()
+        for e in list_dataset(dataset)
+        if e.split == split
+    }
+    if target not in files:
+        raise UsageError(
+            f"{dataset}: no object of the split {split} is called {target}"
+        )
+    meshes = Meshes(dataset, tuple(sorted(files.values())))
+    sphere = ViewSphere.named("40")
+    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False}):
+        figure = Figure((1.65 * len(SHOWN_VIEWS), 1.85 * len(CLUTTER_LEVELS)))
+        axes = figure.subplots(
+            len(CLUTTER_LEVELS),
+            len(SHOWN_VIEWS),
+            gridspec_kw={"wspace": 0.04, "hspace": 0.16},
+        )
+        for row, level in zip(axes, CLUTTER_LEVELS, strict=True):
+            layout = draw_scene(
+                files[target],
+                meshes,
+                level,
+                seed,
+                f"{target}@{level}-0",
+            )
+            scene = build_scene(layout, dataset)
+            for axis, view in zip(row, SHOWN_VIEWS, strict=True):
+                axis.imshow(in_colours(scene, sphere.poses[view]))
+                axis.set_title(
+                    f"view {view}: {layout.visible[view]:.0%}",
+                    fontsize=8,
+                    pad=3,
+                )
+                axis.set(xticks=[], yticks=[])
+                if view in layout.unreachable:
+                    axis.plot(
+                        [0, PICTURE_SIZE - 1],
+                        [0, PICTURE_SIZE - 1],
+                        color="#b00020",
+                        linewidth=1.2,
+                    )
+                    axis.plot(
+                        [0, PICTURE_SIZE - 1],
+                        [PICTURE_SIZE - 1, 0],
+                        color="#b00020",
+                        linewidth=1.2,
+                    )
+            row[0].set_ylabel(
+                f"{level}, {np.mean(layout.visible):.0%} on average",
+                fontsize=8,
+            )
+        figure.savefig(
+            out,
+            dpi=120,
+            facecolor=PAPER,
+            bbox_inches="tight",
+            pad_inches=0.05,
+        )
+
+
 if __name__ == "__main__":
     with orderly_end("run it again"):
         tyro.extras.subcommand_cli_from_dict(
-            {"choose": choose, "judge": judge, "calibration": calibration}
+            {
+                "choose": choose,
+                "judge": judge,
+                "calibration": calibration,
+                "picture": picture,
+            }
         )

@@ -1,7 +1,7 @@
 """Which pixels are one thing: the segmentation against the truth, on real and simulated frames.
 
-    python benchmarks/segmentation.py real FOLDER [--network CARD] [--figure OUT.png]
-    python benchmarks/segmentation.py {table,bin,shelf,floor,belt} SCANS [--frames 40] [--seed 0]
+    python -m benchmarks.segmentation real FOLDER [--network CARD] [--figure OUT.png]
+    python -m benchmarks.segmentation {table,bin,shelf,floor,belt} SCANS [--frames 40] [--seed 0]
 
 ``real``: FOLDER holds a folder a frame: depth.png (uint16, millimetres), K.json (fx, fy, cx, cy,
 the middle of the first pixel at 0) and labels.png (0: none, 1: table, else the tens digit is the
@@ -21,7 +21,6 @@ names the card of a network of ``nextview train segmentation``; without it the b
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -32,8 +31,8 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from PIL import Image
-from rich.progress import track
 
+from benchmarks.shared import frame_in, progress, scans_in
 from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.segmentation.instances import LearnedSegmenter
@@ -132,18 +131,16 @@ class Counts:
 def real_frames(folder: Path) -> Iterator[Truth]:
     """The labelled frames of a folder."""
     for path in sorted(folder.glob("*/labels.png")):
-        fx, fy, cx, cy = json.loads((path.parent / "K.json").read_text())
-        depth = np.asarray(Image.open(path.parent / "depth.png"))
+        frame = frame_in(path.parent)
         given = np.asarray(Image.open(path)).astype(np.int64)
-        labels = np.where((given >= 10) & (depth > 0), given // 10, 0)
-        intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-        yield Truth(path.parent.name, Frame(depth, intrinsics), labels)
+        labels = np.where((given >= 10) & (frame.depth > 0), given // 10, 0)
+        yield Truth(path.parent.name, frame, labels)
 
 
 def simulated_frames(kind: str, scans: Path, frames: int, seed: int) -> Iterator[Truth]:
     """Frames of worlds of a kind, made of scans."""
     shapes = []
-    for path in sorted(scans.iterdir()):
+    for path in scans_in(scans).values():
         mesh = load_mesh(path)
         vertices = mesh.vertices / np.ptp(mesh.vertices, axis=0).max()
         shapes.append(Shape.of((vertices, mesh.faces)))
@@ -221,7 +218,7 @@ def main(
     learned = LearnedSegmenter(network)
     counts = Counts()
     rows = []
-    for truth in track(every, f"frames of {kind}"):
+    for truth in progress(every, f"frames of {kind}"):
         begun = time.perf_counter()
         found = learned(truth.frame).labels
         counts.seconds += time.perf_counter() - begun

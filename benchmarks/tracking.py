@@ -1,6 +1,6 @@
 """Accuracy, losses and speed of the tracker on simulated trajectories of things in a gripper.
 
-    python benchmarks/tracking.py SCANS OUT.jsonl [--trajectories 10] [--seed 0]
+    python -m benchmarks.tracking SCANS OUT.jsonl [--trajectories 10] [--seed 0]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Four of
 them stand on a table, and a scene names them from three views. One whose pose it finds is then
@@ -20,10 +20,10 @@ that was stopped goes on.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +31,13 @@ import numpy as np
 import trimesh
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 import nextview
+from benchmarks.shared import mesh_of, results, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.scene.objects import SceneObject
@@ -52,8 +52,7 @@ from nextview.simulation.tables import (
     TableCamera,
     poses_around,
 )
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 RATE = 30  # frames a second
 SECONDS = 4.0
@@ -71,6 +70,7 @@ HAND = (0.204, 0.063, 0.066)  # metres
 DEEPEST_TIPS = 0.04  # metres below the top of a thing
 HIDDEN_SECONDS = 0.5
 HAND_FROM = 0.65  # share of the way from the camera to the thing
+FIELDS = ("seed", "number")  # by which a line of the results is known
 LOST_MILLIMETRES = 20.0
 LOST_DEGREES = 15.0
 CENTRE = np.array([0, 0, 0.08])
@@ -319,10 +319,10 @@ def _named_table(
 def follow(
     system: nextview.System,
     meshes: Sequence[Mesh],
-    seed: tuple[int, int],
+    asked: tuple[int, int],
 ) -> dict[str, Any]:
-    """Track one thing along a trajectory."""
-    rng = np.random.default_rng(seed)
+    """Track one thing along a trajectory; ``asked`` are the values of ``FIELDS``."""
+    rng = np.random.default_rng(asked)
     trajectory, scene, one = _named_table(system, meshes, rng)
     table = trajectory.table
     thing = table.things[trajectory.row]
@@ -424,23 +424,15 @@ def main(
         models: memory that knows the scans by their names.
     """
     system = nextview.load(models)
-    known = set(system.classes)
-    paths = [path for path in sorted(scans.iterdir()) if path.stem in known]
+    paths = [path for name, path in scans_in(scans).items() if name in system.classes]
     if len(paths) < THINGS:
         raise UsageError(
             f"{scans}: fewer than {THINGS} scans have names of known things"
         )
-    meshes = [replace(load_mesh(path, unit="m"), name=path.stem) for path in paths]
-
-    lines = []
-    if out.exists():
-        lines = [json.loads(line) for line in out.read_text().splitlines()]
-    done = {line["number"] for line in lines}
-    for number in track([k for k in range(trajectories) if k not in done], "tracking"):
-        lines.append({"number": number, **follow(system, meshes, (seed, number))})
-        with out.open("a") as file:
-            file.write(json.dumps(lines[-1]) + "\n")
-    print(summary(lines))
+    meshes = [mesh_of(path) for path in paths]
+    asked = [(seed, number) for number in range(trajectories)]
+    run = partial(follow, system, meshes)
+    print(summary(results(out, FIELDS, asked, run, "trajectories")))
 
 
 if __name__ == "__main__":

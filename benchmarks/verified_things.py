@@ -1,6 +1,6 @@
 """Taught things recognised by outline and size, and verified by their geometry, at true size.
 
-    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3]
+    python -m benchmarks.verified_things SCANS [--models ycb] [--draws 0 1] [--every 3]
         [--poses thrown] [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
@@ -41,10 +41,10 @@ import numpy as np
 import trimesh
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.shared import markdown, progress, scans_of
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError, UsageError
 from nextview.files import command, read_record, write_record
@@ -61,8 +61,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified
 from nextview.things.weighing import EvidenceWeights
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 Poses = Literal["scanned", "thrown", "stood"]
@@ -231,14 +230,7 @@ class Taught:
                 f"{models}: does not know the geometry of all its things; teach it with --unit"
             )
         names = list(known.names)
-        files = {path.stem: path for path in scans.iterdir() if path.is_file()}
-        missing = [name for name in names if name not in files]
-        if missing:
-            raise UsageError(
-                f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
-            )
-
-        meshes = [load_mesh(files[name], unit="m") for name in names]
+        meshes = [load_mesh(path, unit="m") for path in scans_of(scans, names)]
         whole = [
             Surface.from_mesh(mesh, name)
             for mesh, name in zip(meshes, names, strict=True)
@@ -508,8 +500,8 @@ def table(
     outcomes: Sequence[Outcome],
     views: Sequence[int],
     held: bool,
-) -> Iterator[str]:
-    """The results as lines of a table.
+) -> str:
+    """The results as a table.
 
     Args:
         outcomes: of all draws.
@@ -518,11 +510,11 @@ def table(
     """
     left_out = OF_STANDING_THINGS if held else OF_HELD_THINGS
     kept = [number for number, name in enumerate(COLUMNS) if name not in left_out]
-    yield f"| {' | '.join(COLUMNS[number] for number in kept)} |"
-    yield "|---" * len(kept) + "|"
-    for k in views:
-        cells = row([outcome for outcome in outcomes if outcome.views == k], k)
-        yield f"| {' | '.join(cells[number] for number in kept)} |"
+    rows = (row([one for one in outcomes if one.views == k], k) for k in views)
+    return markdown(
+        [COLUMNS[number] for number in kept],
+        [[cells[number] for number in kept] for cells in rows],
+    )
 
 
 def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
@@ -575,10 +567,9 @@ def unknown_table(
     outcomes: Sequence[Outcome],
     known: NDArray[np.int64],
     views: Sequence[int],
-) -> Iterator[str]:
+) -> str:
     """How many of the things that were not taught, and of those that were, are called unknown."""
-    yield "| views | strangers unknown | known unknown | strangers named with confidence |"
-    yield "|---|---|---|---|"
+    rows = []
     for k in views:
         some = [o for o in outcomes if o.views == k and o.p_value is not None]
         strangers = [o for o in some if o.thing not in known]
@@ -588,7 +579,14 @@ def unknown_table(
         sure = np.mean(
             [not unknown(o) and o.confidence >= CONFIDENT for o in strangers]
         )
-        yield f"| {k} | {refused:.3f} | {wrongly:.3f} | {sure:.3f} |"
+        rows.append((k, f"{refused:.3f}", f"{wrongly:.3f}", f"{sure:.3f}"))
+    columns = (
+        "views",
+        "strangers unknown",
+        "known unknown",
+        "strangers named with confidence",
+    )
+    return markdown(columns, rows)
 
 
 def unknown(outcome: Outcome) -> bool:
@@ -651,7 +649,7 @@ def main(
             continue
 
         here: list[Outcome] = []
-        for thing in track(everything[draw % every :: every], f"draw {draw}"):
+        for thing in progress(everything[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
             here += [judged(things, taught, some, episode, k) for k in counts]
@@ -662,13 +660,13 @@ def main(
     together = [outcome for draw in outcomes for outcome in draw]
     if known == "all":
         print(
-            *table(together, views, any_orientation),
+            table(together, views, any_orientation),
             "",
             *mistakes(taught, together, views),
             sep="\n",
         )
     else:
-        print(*unknown_table(together, some, views), sep="\n")
+        print(unknown_table(together, some, views))
     print(
         f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB"
     )

@@ -1,6 +1,6 @@
 """``nextview benchmark classes --views`` with policies and references of its own, and its figure.
 
-    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5]
+    python -m benchmarks.views test.npz views [--policies gain@0.01 ...] [--views 2 3 5]
         [--against lem ...]
 
 Writes views.md (the table), measures.csv and tests.csv (every number in a row of its own) and

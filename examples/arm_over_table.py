@@ -419,10 +419,10 @@ def main(
 
     shown = None
     if film is not None:
-        from table_film import Film
+        from films import TableFilm
 
         title = f"{things} things on a table, {HIDDEN_THINGS} of them hidden"
-        shown = Film(arm, MIDDLE, title, film)
+        shown = TableFilm(arm, MIDDLE, title, film)
     truly: list[np.ndarray] = []
 
     def looked(scene: nextview.Scene, look: Look) -> None:
@@ -446,7 +446,7 @@ def main(
     )
     print(f"{arm.seconds:.2f} s of motion")
     if shown is not None:
-        shown.save(summary(found, table))
+        shown.end(summary(found, table))
     if figure is not None:
         scene.plot(figure, f"{things} things before an arm")
 

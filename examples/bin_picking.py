@@ -332,7 +332,7 @@ def main(
                 f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'"
             )
     from bin_cell import Cell
-    from bin_film import BinFilm
+    from films import BinFilm
 
     with tempfile.TemporaryDirectory() as folder:
         system, grasps = teach(Path(folder))

@@ -48,7 +48,7 @@ def main(
             raise MissingExtraError(
                 f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'"
             )
-    from panda_film import Film
+    from films import ArmFilm
 
     from research.arm import Arm, first_joints, put_down
 
@@ -58,7 +58,7 @@ def main(
     if start is None:
         raise SystemExit("the arm cannot look from there")
     arm.joints = start
-    shown = Film(arm, film)
+    shown = ArmFilm(arm, film)
     result = recognise(arm, shown.looked, threshold)
     print(f"{result}; {arm.seconds:.2f} s of motion")
     shown.save()

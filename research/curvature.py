@@ -6,10 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from research.area import bits
+from research.area import bits, seen_area, seen_share
 from research.bending import bent
 from research.mesh_view import MeshView
-from research.seen_area import seen_area, seen_share
 
 LEVELS = 32
 """Steps of the arc tangent of a curvature from 0 to infinity, half as wide at both ends: a flat

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from nextview.data.measures import Measure
 from research import area, curvature, depth_spread, saliency, semantic, silhouette
-from research import fused_descriptor as fused
 from research import gradient_entropy as gradient
 
 viewpoint_entropy = Measure(
@@ -45,7 +44,7 @@ gaussian_curvature = Measure(curvature.gaussian_curvature, "mesh", "Secord et al
 mesh_saliency = Measure(saliency.mesh_saliency, "mesh", "Lee et al. 2005")
 above_preference = Measure(semantic.above_preference, "depth", "Secord et al. 2011")
 base_avoidance = Measure(semantic.base_avoidance, "mesh", "Secord et al. 2011")
-fused_descriptor = Measure(fused.fused_descriptor, "depth", "Ding et al.")
+fused_descriptor = Measure(depth_spread.fused_descriptor, "depth", "Ding et al.")
 gradient_entropy = Measure(
     gradient.gradient_entropy,
     "depth",

@@ -24,7 +24,7 @@ thread.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,10 +36,10 @@ import cv2
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.shared import markdown, progress
 from benchmarks.verified_things import (
     Episode,
     Poses,
@@ -295,10 +295,15 @@ def add_s(surface: Surface, points: Float, pose: Float, episode: Episode) -> flo
     return float(cKDTree(true).query(here)[0].mean()) / surface.diameter
 
 
-def table(results: Sequence[Compared]) -> Iterator[str]:
-    """The results as lines of a table."""
-    yield "| | named right | ADD-S < 0.1 d of these | s of CPU a frame: median, worst |"
-    yield "|---|---|---|---|"
+def table(results: Sequence[Compared]) -> str:
+    """The results as a table."""
+    columns = (
+        "",
+        "named right",
+        "ADD-S < 0.1 d of these",
+        "s of CPU a frame: median, worst",
+    )
+    rows = []
     for row, name in enumerate(("point pairs", "nextview")):
         seconds = [result.seconds[row] for result in results]
         posed = [
@@ -310,7 +315,8 @@ def table(results: Sequence[Compared]) -> Iterator[str]:
             f"{np.mean(posed):.3f}" if posed else "-",
             f"{np.median(seconds):.2f}, {max(seconds):.2f}",
         )
-        yield f"| {' | '.join(cells)} |"
+        rows.append(cells)
+    return markdown(columns, rows)
 
 
 def main(
@@ -353,14 +359,14 @@ def main(
         known = known.in_any_orientation()
     results = []
     for draw in draws:
-        for thing in track(some[draw % every :: every], f"draw {draw}"):
+        for thing in progress(some[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, int(thing), draw, setting)
             results.append(compared(pairs, known, taught, some, episode))
 
     print(
         f"{len(results)} frames of {len(some)} things; point pairs learned in {learned:.0f} s"
     )
-    print(*table(results), sep="\n")
+    print(table(results))
 
 
 if __name__ == "__main__":

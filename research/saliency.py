@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from research.area import seen_area
 from research.bending import BentSurface, bent
 from research.mesh_view import MeshView
-from research.seen_area import seen_area
 
 UNIT = 0.006
 """Of the scales, object radii: Lee's 0.003 diagonals of a bounding box whose corners the object's

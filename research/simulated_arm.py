@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 import nextview
+from benchmarks.shared import read_lines
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
@@ -235,11 +236,7 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     """Run the episodes that the file lacks, and print the table."""
-    rows = (
-        [json.loads(line) for line in settings.episodes.open()]
-        if settings.episodes.exists()
-        else []
-    )
+    rows = read_lines(settings.episodes)
     done = {(row["object"], row["start"], row["policy"]): row for row in rows}
     track(
         run(settings, done),
@@ -247,9 +244,7 @@ def main(settings: Settings) -> None:
         "recognising",
     )
     rows = [
-        row
-        for row in map(json.loads, settings.episodes.open())
-        if row["start"] < settings.runs
+        row for row in read_lines(settings.episodes) if row["start"] < settings.runs
     ]
     print("\n".join(table(rows)))
     longest = max(row["moved"] for row in rows)

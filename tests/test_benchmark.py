@@ -2,10 +2,8 @@
 thesis's own tables.
 """
 
-import runpy
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +11,7 @@ import pandas as pd
 import pytest
 from pipeline import benchmark, refused
 
+from benchmarks.reproduction import page
 from nextview.benchmark import leaderboard
 from nextview.benchmark.classes import load
 from nextview.benchmark.leaderboard import promised_risks
@@ -267,9 +266,6 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
 
 
 def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
-    page = runpy.run_path(
-        str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py")
-    )["page"]
     text = page(results / "p.npz", samples=200)
     benchmark(results / "p.npz", tmp_path / "full", samples=200)
     measures = pd.read_csv(tmp_path / "full" / "measures.csv").query("set == 'all'")

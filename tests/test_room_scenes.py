@@ -22,7 +22,6 @@ from nextview.simulation.room_layout import RoomLayout, Slab, Standing
 from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.sensor import SENSORS
 
-BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "room.py"
 FOUR_LEGS = 4
 
 
@@ -255,7 +254,8 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
 
 def run(*arguments: object) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, str(BENCHMARK), *map(str, arguments)],
+        [sys.executable, "-m", "benchmarks.room", *map(str, arguments)],
+        cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,
     )

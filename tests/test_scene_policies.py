@@ -2,10 +2,8 @@
 in replay and live.
 """
 
-import runpy
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from test_policies import state_of as state_at
 from test_scenes import GRID, scene_of
 
 import nextview
+from benchmarks.scenes import Believed
 from nextview.benchmark import statistics
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.published import ACCURACY, read_table
@@ -42,7 +41,6 @@ from nextview.simulation.simulated import SHOWS_TARGET, OccludedCamera, SceneCam
 from research.plan import plan
 
 TEN = tuple(read_table(ACCURACY[10]))
-SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "scenes.py"))
 POSITIONS = GRID.poses[:, :3, 3]
 BEFORE = Block(1.6, 0.0, 0.0, 0.2, 2.6, 2.2)
 """Hides the ball from the front, and nothing from behind."""
@@ -342,7 +340,7 @@ def test_the_script_agrees_with_the_beliefs_of_replay(predictions):
     specs = make_specs(predictions, 4, 0)
     path = replay("random-all", specs, 4, 0)
     assert (path.views >= 0).all()
-    found = SCRIPT["Believed"].of(predictions, specs.objects, path.views)
+    found = Believed.of(predictions, specs.objects, path.views)
     np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
     sure = found.confidence > 0.11  # else all classes are alike
     np.testing.assert_array_equal(

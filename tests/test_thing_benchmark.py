@@ -2,17 +2,16 @@
 
 import json
 import re
-import runpy
 import shutil
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from msgspec.structs import replace as replace_record
 
+from benchmarks import joined_things
 from nextview.benchmark import things as stage
 from nextview.benchmark.confusable import Alikeness, how_alike
 from nextview.benchmark.results import compared_markdown, latex
@@ -38,9 +37,6 @@ from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.sensed_camera import SensedCamera
 
-JOINED = runpy.run_path(
-    str(Path(__file__).parents[1] / "benchmarks" / "joined_things.py")
-)
 SETTINGS = ThingSettings(
     views=(1, 2),
     policies=("random", "geometry"),
@@ -781,15 +777,15 @@ def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings
 
 def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsys):
     again = shutil.copytree(results, tmp_path / "again")
-    _, alone = JOINED["read_runs"]([results])
-    measures, both = JOINED["read_runs"]([results, again])
+    _, alone = joined_things.read_runs([results])
+    measures, both = joined_things.read_runs([results, again])
     assert set(measures["run"]) == {results.name, "again"}
     # Twice as many tests: the least p-value is multiplied by twice as much, up to 1.
     least = alone["p"].min()
     count = alone["p"].notna().sum()
     assert both["p_holm"].min() == pytest.approx(min(1, 2 * count * least))
 
-    JOINED["main"]([results, again])
+    joined_things.main([results, again])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" | ")[1] for line in lines[2:]] == ["random", "geometry"] * 2
     record = json.loads((again / "benchmark.json").read_text())
@@ -797,6 +793,6 @@ def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsy
         json.dumps(record | {"reference": "spread", "compared_with": "spread"})
     )
     with pytest.raises(UsageError, match="is compared with spread"):
-        JOINED["read_runs"]([results, again])
+        joined_things.read_runs([results, again])
     with pytest.raises(UsageError, match="holds no results"):
-        JOINED["main"]([tmp_path / "nothing"])
+        joined_things.main([tmp_path / "nothing"])

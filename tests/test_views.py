@@ -2,17 +2,14 @@
 a time.
 """
 
-import runpy
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 from pipeline import benchmark, refused, some_predictions
 
+from benchmarks.views import main as compare
 from nextview.cli.main import main
 
-VIEWS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "views.py"))
 NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 
 
@@ -20,7 +17,7 @@ NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("n_views")
     some_predictions(24, seed=2).save(folder / "p.npz")
-    VIEWS["main"](folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
+    compare(folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
     return folder
 
 

@@ -64,8 +64,8 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"examples/arm_over_table": (
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
-    r"benchmarks/(real_frames|segmentation)\.py": "needs real frames, which are not part of this",
-    r"^nextview benchmark tables|benchmarks/moves\.py": (
+    r"benchmarks\.(real_frames|segmentation)": "needs real frames, which are not part of this",
+    r"^nextview benchmark tables|benchmarks\.moves": (
         "needs scans of all things that the bundled memory knows"
     ),
     r"^make ": "the workflow is run by tests/test_workflow.py",
@@ -92,7 +92,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|growth|point_pairs)|(verified|many)_things": (
+    r"research\.(film|point_pairs)|verified_things|made_things stretched": (
         "needs the YCB scans, and minutes"
     ),
     r"benchmarks\.frozen|nextview-bench": (
@@ -105,9 +105,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
-    r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
+    r"benchmarks\.(render|replay|latency)": "measures time, on a quiet machine",
     r"research/tests": "they are in make test",
-    r"benchmarks/scenes\.py judge": (
+    r"benchmarks\.scenes judge": (
         "needs 200 scenes of each level; tests/test_scene_policies.py judges few"
     ),
     r"SceneLayout\.load": (
@@ -125,10 +125,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
     r"nextview (benchmark|evaluate|report|leaderboard) ": "nextview[benchmark]",
-    r"benchmarks/(ablations|views)\.py|research\.(measure_study|example_maps)": (
+    r"benchmarks\.views|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
-    r"benchmarks/ablations\.py": "nextview[train]",
     r"--record|viewers\.(scene_)?recording": "nextview[record]",
     r"--explorer|viewers\.scene_page": "nextview[explore]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
@@ -154,8 +153,8 @@ SMALL = {  # options that make a command quick
     "python examples/bin_picking.py": "--parts 1",
     "python -m research.measure": "--workers 1",
     "python -m research.plan": "--workers 1",
-    "python benchmarks/views.py": "--runs 2",
-    "python benchmarks/fixed_cameras.py": "--seeds 100 101 --moments 1",
+    "python -m benchmarks.views": "--runs 2",
+    "python -m benchmarks.fixed_cameras": "--seeds 100 101 --moments 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--scenes \d+": "--scenes 4",

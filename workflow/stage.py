@@ -72,9 +72,7 @@ def runnable(command: str) -> str:
     python = shlex.quote(sys.executable)
     if command.startswith("nextview "):
         return f"{python} -m nextview.cli.main {command.removeprefix('nextview ')}"
-    if command.startswith(
-        ("python benchmarks/", "python research/", "python workflow/")
-    ):
+    if command.startswith("python workflow/"):
         script, _, rest = command.removeprefix("python ").partition(" ")
         return f"{python} {shlex.quote(str(ROOT / script))} {rest}"
     if command.startswith("python "):

@@ -17,7 +17,7 @@ to the decision.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,9 +25,9 @@ from typing import Literal
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
+from benchmarks.shared import markdown, progress
 from benchmarks.verified_things import (
     Outcome,
     Setting,
@@ -124,7 +124,7 @@ def beside(taught: Taught, episodes: Sequence[Episode], draw: int) -> list[Outco
     things = taught.things(some).in_any_orientation()
     setting = Setting("wrist", VIEWS, poses="scanned", clutter=0, any_orientation=True)
     outcomes = []
-    for number, episode in enumerate(track(episodes, "nextview")):
+    for number, episode in enumerate(progress(episodes, "nextview")):
         thing = taught.names.index(episode.name)
         seen = shown(taught, thing, 1000 * draw + number, setting, episode.turn)
         outcomes += [judged(things, taught, some, seen, k) for k in range(1, VIEWS + 1)]
@@ -135,20 +135,16 @@ def table(
     episodes: Sequence[Episode],
     outcomes: Sequence[Outcome],
     taught: Taught,
-) -> Iterator[str]:
+) -> str:
     """Monty's row, and one for each number of frames."""
-    yield "| | right | steps or frames | seconds: median, worst | rotation, degrees: median, 95 % |"
-    yield "|---|---|---|---|---|"
     steps = np.array([episode.steps for episode in episodes])
     seconds = np.array([episode.seconds for episode in episodes])
     share = np.mean([episode.right for episode in episodes])
     errors = median_and_most(
         [error_of(episode, taught) for episode in episodes if episode.right]
     )
-    yield (
-        f"| Monty | {share:.3f} | {steps.mean():.0f} | "
-        f"{np.median(seconds):.1f}, {seconds.max():.1f} | {errors} |"
-    )
+    spent = f"{np.median(seconds):.1f}, {seconds.max():.1f}"
+    rows = [("Monty", f"{share:.3f}", f"{steps.mean():.0f}", spent, errors)]
 
     for k in range(1, VIEWS + 1):
         here = [outcome for outcome in outcomes if outcome.views == k]
@@ -158,10 +154,16 @@ def table(
             [outcome.rotation for outcome in here if outcome.right]
         )
         frames = f"{k} frame{'s' if k > 1 else ''}"
-        yield (
-            f"| nextview, {frames} | {share:.3f} | {k} | "
-            f"{np.median(seconds):.2f}, {seconds.max():.2f} | {errors} |"
-        )
+        spent = f"{np.median(seconds):.2f}, {seconds.max():.2f}"
+        rows.append((f"nextview, {frames}", f"{share:.3f}", f"{k}", spent, errors))
+    columns = (
+        "",
+        "right",
+        "steps or frames",
+        "seconds: median, worst",
+        "rotation, degrees: median, 95 %",
+    )
+    return markdown(columns, rows)
 
 
 def error_of(episode: Episode, taught: Taught) -> float | None:
@@ -192,7 +194,7 @@ def main(
         episodes = episodes_of(work, things)
         outcomes = beside(taught, episodes, draw)
         print(f"\nten {things} things, {len(episodes)} episodes", "", sep="\n")
-        print(*table(episodes, outcomes, taught), sep="\n")
+        print(table(episodes, outcomes, taught))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from nextview.scene.grasps import FreeGrasp, propose_grasps
 def examples():
     with pytest.MonkeyPatch.context() as patched:
         patched.syspath_prepend(str(ROOT / "examples"))
-        names = ("bin_parts", "bin_cell", "bin_picking", "bin_film")
+        names = ("bin_parts", "bin_cell", "bin_picking", "films")
         yield {name: importlib.import_module(name) for name in names}
 
 
@@ -44,7 +44,7 @@ def test_a_part_is_gripped_by_friction_and_dropped_into_the_box(
     examples, cell, row, tmp_path
 ):
     module = examples["bin_cell"]
-    film = examples["bin_film"].BinFilm(cell, tmp_path / f"{row}.gif")
+    film = examples["films"].BinFilm(cell, tmp_path / f"{row}.gif")
     solid = examples["bin_parts"].bin_parts()[cell.names[row]].solid
     mesh = make_mesh(0.001 * solid[0], solid[1], cell.names[row], "m")
     pose = cell.pose_of(row)

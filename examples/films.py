@@ -1,21 +1,25 @@
-"""A film of an arm over a full table, by ray casting: no graphics card and no OpenGL is needed.
+"""Films of arms at work, by ray casting: no graphics card and no OpenGL is needed.
 
-On the left the arm and the things, which get their colours once they are known; on the right what
-the camera on its wrist sees, with what was found in it, and from above what is known by now.
+``ArmFilm`` shows an arm that looks at an object, ``BinFilm`` a cell that empties a bin, and
+``TableFilm`` an arm over a full table, whose things get their colours once they are known. Beside
+each stands what the camera on the wrist saw last, and what is known by now.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
 from contourpy import contour_generator
-from panda_film import on_the_way
 from PIL import Image, ImageColor, ImageDraw
 from scipy import ndimage
 
 import nextview
+from nextview.geometry.depth import headlight
+from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.scene.figure import (
     FIGURE_CELL,
@@ -24,19 +28,302 @@ from nextview.scene.figure import (
     seen_from_above,
 )
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
-from nextview.session.style import ACCENT, GREY, INK, PAPER
-from research.arm import Arm, seconds_of
+from nextview.session.session import Session
+from nextview.session.style import ACCENT, BLUE, GREY, INK, PAPER
+from research.arm import Arm, along, seconds_of
 from research.film_stage import KEY, SKY, SUN, Array, Stage, font, rays_of, toned
 
-SIZE = (600, 540)  # of the picture of the arm, pixels
-SIDE = 348  # width of what is shown beside it, pixels
+if TYPE_CHECKING:
+    from bin_cell import Cell
+
+COLOURS_IN_GIF = 255
+FRAMES_OF_PALETTE = 10  # from which the palette is made
+
+
+class Film:
+    """Frames that become a GIF.
+
+    Args:
+        path: that is written; None for no film.
+    """
+
+    RATE = 10  # frames a second
+    LAST = 2.0  # seconds that the last frame is shown
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self.frames: list[Image.Image] = []
+
+    def hold(self, seconds: float) -> None:
+        """Show the last frame for some seconds."""
+        self.frames += [self.frames[-1]] * int(seconds * self.RATE)
+
+    def save(self) -> None:
+        """Write the film."""
+        if self.path is None or not self.frames:
+            return
+        self.hold(self.LAST)
+        few = strip(self.frames[:: max(1, len(self.frames) // FRAMES_OF_PALETTE)])
+        coverage = Image.Quantize.MAXCOVERAGE  # small things keep their colours
+        palette = few.quantize(COLOURS_IN_GIF, method=coverage, kmeans=3)
+        plain = Image.Dither.NONE
+        frames = [
+            frame.quantize(palette=palette, dither=plain) for frame in self.frames
+        ]
+        frames[0].save(
+            self.path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=1000 // self.RATE,
+            loop=0,
+            optimize=True,
+        )
+
+
+def strip(frames: Sequence[Image.Image]) -> Image.Image:
+    """Frames side by side, half as large."""
+    small = [frame.reduce(2) for frame in frames]
+    whole = Image.new("RGB", (sum(frame.width for frame in small), small[0].height))
+    for k, frame in enumerate(small):
+        whole.paste(frame, (k * frame.width, 0))
+    return whole
+
+
+def on_the_way(arm: Arm, ways: Sequence[Array], rate: float) -> Iterator[float]:
+    """Put an arm where it was on its ways, frame after frame, and in the end where it is.
+
+    Args:
+        arm: that has come these ways.
+        ways: joints along each, one after the other.
+        rate: frames a second of motion.
+
+    Yields:
+        The seconds of motion until each frame.
+    """
+    here = arm.joints
+    passed = 0.0
+    for way in ways:
+        total = seconds_of(way)
+        for joints, done in evenly(way, int(np.ceil(total * rate))):
+            arm.joints = joints
+            yield passed + done * total
+        passed += total
+    arm.joints = here
+
+
+def evenly(way: Array, n: int) -> Iterator[tuple[Array, float]]:
+    """n places on a way and how much of it is done there, in step with time; the first one left
+    out.
+    """
+    fine = along(way, 0.02)
+    at = np.array([seconds_of(fine[: k + 1]) for k in range(len(fine))]) / seconds_of(
+        fine
+    )
+    for done in np.linspace(0, 1, max(n, 1) + 1)[1:]:
+        k = min(int(np.searchsorted(at, done)), len(fine) - 1)
+        yield fine[k], done
+
+
+# An arm that looks at an object, and a cell that empties a bin
+
+SIZE = (440, 400)  # of the scene, pixels
+SIDE = 200  # width of what is shown beside it, pixels
+LIGHT = np.array([-0.5, -0.55, 0.67])
+SLOWER = 3  # times than at the joints' velocity limits motions are shown
+ROWS = 14  # objects of a bin that are listed
+
+
+class SmallFilm(Film):
+    """A film of things in a small picture, with a panel beside it.
+
+    Args:
+        path: that is written; None for no film.
+        pose: of the camera that films, (4, 4).
+    """
+
+    def __init__(self, path: Path | None, pose: Array) -> None:
+        super().__init__(path)
+        self.pose = pose
+        self.beside = Image.new("RGB", (SIDE, SIZE[1]), PAPER)
+
+    def show(self, things: Sequence[Any], words: str) -> None:
+        """Add a frame of things, triangles and a colour each, with words on it."""
+        frame = Image.new("RGB", (SIZE[0] + SIDE, SIZE[1]), PAPER)
+        frame.paste(picture_of(things, self.pose), (0, 0))
+        frame.paste(self.beside, (SIZE[0], 0))
+        text(frame, (14, 12), words, 15)
+        self.frames.append(frame)
+
+
+class ArmFilm(SmallFilm):
+    """A film of an arm that looks at an object."""
+
+    def __init__(self, arm: Arm, path: Path | None) -> None:
+        pose = look_at_origin(np.radians(24), np.radians(-52), 1.75)
+        pose[:3, 3] += [0.28, 0.0, 0.3]
+        super().__init__(path, pose)
+        self.arm = arm
+        self.filmed = 0
+        self.seconds = 0.0
+
+    def looked(self, session: Session) -> None:
+        """The way that the arm has come, and a still of what it believes now."""
+        if self.path is None:
+            return
+        ways = self.arm.motions[self.filmed :]
+        for seconds in on_the_way(self.arm, ways, SLOWER * self.RATE):
+            self.show_arm(self.seconds + seconds)
+        self.seconds += sum(seconds_of(way) for way in ways)
+        self.filmed = len(self.arm.motions)
+        self.beside = belief_panel(session)
+        self.show_arm(self.seconds)
+        self.hold(1.0)
+
+    def show_arm(self, seconds: float) -> None:
+        """Add a frame of the arm as it is now."""
+        self.show(self.arm.things(), f"{seconds:4.2f} s of motion")
+
+
+class BinFilm(SmallFilm):
+    """A film of a cell, from now on."""
+
+    EVERY = 4  # tenths of a second of simulated time between two frames
+    STILL = 0.8  # seconds that what is known is shown after a look
+
+    def __init__(self, cell: Cell, path: Path | None) -> None:
+        pose = look_at_origin(np.radians(33), np.radians(-38), 1.35)
+        pose[:3, 3] += [0.38, -0.16, 0.2]
+        super().__init__(path, pose)
+        self.cell = cell
+        self._count = 0
+        self._begin = cell.seconds
+        if path is not None:
+            cell.watch = self.passed
+
+    def passed(self) -> None:
+        """A tenth of a second of simulated time has passed."""
+        self._count += 1
+        if self._count % self.EVERY == 0:
+            self.show_cell()
+
+    def show_cell(self) -> None:
+        """Add a frame of the cell as it is now."""
+        self.show(self.cell.things(), f"{self.cell.seconds - self._begin:5.1f} s")
+
+    def looked(self, known: nextview.Scene) -> None:
+        """Show what is known after a look for a while."""
+        if self.path is None:
+            return
+        self.beside = bin_panel(known)
+        self.show_cell()
+        self.hold(self.STILL)
+
+
+def picture_of(things: Sequence[Any], pose: Array) -> Image.Image:
+    """A picture of things, lit by a lamp that throws shadows."""
+    width, height = SIZE
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5) / width - 0.5,
+        (np.arange(height) + 0.5 - height / 2) / width,
+    )
+    rays = np.stack([x, y, np.full(x.shape, 1.0)], -1).reshape(-1, 3) @ pose[:3, :3].T
+    triangles = [each for each, _ in things]
+    colours = np.array([colour for _, colour in things])
+    cast = embree_scene(triangles)
+    hits = first_hits(cast, pose[:3, 3], rays)
+    hit = hits["primID"] >= 0
+    normals = hits["Ng"][hit] / np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True)
+    normals *= -np.sign((normals * rays[hit]).sum(1))[:, None]
+    points = pose[:3, 3] + rays[hit] * hits["tfar"][hit, None] + 1e-3 * normals
+    shadow = (
+        first_hits(cast, points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
+    )
+    lit = np.maximum(normals @ LIGHT, 0) * ~shadow
+    facing = np.abs((normals * rays[hit]).sum(1)) / np.linalg.norm(rays[hit], axis=1)
+    picture = np.tile(np.array(ImageColor.getrgb(PAPER)) / 255, (len(rays), 1))
+    picture[hit] = (
+        colours[hits["geomID"][hit]] * (0.22 + 0.2 * facing + 0.55 * lit)[:, None]
+    )
+    pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
+    return Image.fromarray(pixels.reshape(height, width, 3))
+
+
+def first_hits(cast: Any, origins: Array, rays: Array) -> Any:
+    """What Embree says of where rays, (N, 3), end first: primID (-1 for nothing), geomID, tfar,
+    and normals Ng.
+    """
+    origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
+    return cast.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
+
+
+def depth_picture(depth: Array) -> Array:
+    """Depth in colours, near ones bright, (H, W, 3) uint8."""
+    near, far = np.quantile(depth[depth > 0], [0.02, 0.98])
+    shade = np.where(depth > 0, (far - depth) / (far - near), 0).clip(0, 1)
+    return (255 * matplotlib.colormaps["viridis"](shade)[..., :3]).astype(np.uint8)
+
+
+def depth_panel(number: int, colours: Array) -> tuple[Image.Image, int]:
+    """A panel with a picture of the depth of a view, and the height at which that ends."""
+    panel = Image.new("RGB", (SIDE, SIZE[1]), PAPER)
+    text(panel, (8, 12), f"view {number}: depth", 13)
+    width = SIDE - 16
+    height = width * colours.shape[0] // colours.shape[1]
+    panel.paste(Image.fromarray(colours).resize((width, height)), (8, 34))
+    return panel, 34 + height
+
+
+def belief_panel(session: Session) -> Image.Image:
+    """What the camera on the wrist saw last, and what is believed."""
+    view = session.views[-1]
+    depth = session.object.sightings[-1].frame.depth
+    panel, _ = depth_panel(len(session.views), depth_picture(depth))
+    text(panel, (8, 152), "the object, found", 13)
+    shaded = headlight(view.observation.depth, view.observation.intrinsics)
+    panel.paste(Image.fromarray(shaded).resize((104, 104)).convert("RGB"), (8, 174))
+    text(panel, (8, 284), "belief", 13)
+    draw = ImageDraw.Draw(panel)
+    order = np.argsort(-view.belief)[:4]
+    for row, k in enumerate(order):
+        y = 306 + 21 * row
+        draw.rectangle(
+            (90, y + 2, 90 + 100 * float(view.belief[k]), y + 14),
+            BLUE if row == 0 else GREY,
+        )
+        text(panel, (8, y), session.models.classes[k].replace("_", " "), 12)
+    return panel
+
+
+def bin_panel(known: nextview.Scene) -> Image.Image:
+    """The last depth image with the outlines of the objects, and their names."""
+    number = len(known.frames) - 1
+    colours = depth_picture(known.frames[-1].depth)
+    for one in known.objects:
+        if number in one.pixels:
+            mask = one.pixels[number]
+            rim = ndimage.binary_dilation(mask, iterations=3) & ~mask
+            colours[rim] = (255, 255, 255) if one.confident else (120, 120, 120)
+    panel, end = depth_panel(number + 1, colours)
+    draw = ImageDraw.Draw(panel)
+    for row, one in enumerate(known.objects[:ROWS]):
+        y = end + 12 + 20 * row
+        draw.rectangle((8, y + 2, 18, y + 12), BLUE if one.confident else GREY)
+        doubt = "" if one.confident else " ?"
+        text(panel, (24, y), one.name.replace("_", " ") + doubt, 12)
+    return panel
+
+
+def text(picture: Image.Image, where: tuple[int, int], words: str, size: int) -> None:
+    """Write words into a picture."""
+    ImageDraw.Draw(picture).text(where, words, INK, font(size))
+
+
+# An arm over a full table
+
+TABLE_SIZE = (600, 540)  # of the picture of the arm, pixels
+TABLE_SIDE = 348  # width of what is shown beside it, pixels
 INSET = 12  # pixels
 FINER = 2  # rays for a pixel, along each side
-RATE = 12  # frames a second
-# so many times slower than at the joints' velocity limits motions are shown
-SLOWER = 4.0
-STILL = 1.4  # seconds that are shown after a look
-LAST = 4.0  # and at the end
 FOCAL = 1.45  # of the camera that films, widths of the picture
 LOOKED_AT = np.array([0.34, 0.02, 0.21])
 FILMED_FROM = np.radians([26.0, -47.0])
@@ -48,8 +335,6 @@ LAMP = 0.09  # radius of the lamp, a unit away
 SHADOW_SAMPLES = 5
 SKY_SAMPLES = 48
 PLAN = 0.31  # metres from its middle to the border of the view from above
-COLOURS_IN_GIF = 255
-FRAMES_OF_PALETTE = 10  # from which the palette is made
 # red is for what is wrong
 NO_RED = tuple(OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8))
 BESIDE = 24  # pixels beside what was found that are shown with it
@@ -59,7 +344,7 @@ FRAME = "#d5dbe1"
 SHARP = 2000  # triangles of a thing up to which its edges are sharp
 
 
-class Film:
+class TableFilm(Film):
     """Frames of an arm over a table.
 
     Args:
@@ -69,10 +354,14 @@ class Film:
         path: GIF that is written.
     """
 
+    RATE = 12
+    LAST = 4.0
+    STILL = 1.4  # seconds that are shown after a look
+    SLOWER = 4.0  # times than at the joints' velocity limits motions are shown
+
     def __init__(self, arm: Arm, middle: Array, title: str, path: Path) -> None:
+        super().__init__(path)
         self.arm = arm
-        self.path = path
-        self.frames: list[Image.Image] = []
         self._middle = middle
         self._title = title
         self._filmed = 0
@@ -97,39 +386,20 @@ class Film:
             wrong: numbers of objects that are named wrongly.
         """
         ways = self.arm.motions[self._filmed :]
-        for seconds in on_the_way(self.arm, ways, SLOWER * RATE):
+        for seconds in on_the_way(self.arm, ways, self.SLOWER * self.RATE):
             self._show(self._seconds + seconds)
         self._seconds += sum(seconds_of(way) for way in ways)
         self._filmed = len(self.arm.motions)
 
         self._colour(scene, owner, wrong)
-        self._beside = beside(scene, self._middle, wrong)
+        self._beside = table_panel(scene, self._middle, wrong)
         self._show(self._seconds, looking=True)
-        self.frames += [self.frames[-1]] * int(STILL * RATE)
+        self.hold(self.STILL)
 
-    def save(self, said: Sequence[str]) -> None:
-        """Write the film.
-
-        Args:
-            said: lines at its end.
-        """
+    def end(self, said: Sequence[str]) -> None:
+        """Write the film, with lines at its end."""
         self._show(self._seconds, said)
-        self.frames += [self.frames[-1]] * int(LAST * RATE)
-        few = strip(self.frames[:: max(1, len(self.frames) // FRAMES_OF_PALETTE)])
-        coverage = Image.Quantize.MAXCOVERAGE  # small things keep their colours
-        palette = few.quantize(COLOURS_IN_GIF, method=coverage, kmeans=3)
-        plain = Image.Dither.NONE
-        frames = [
-            frame.quantize(palette=palette, dither=plain) for frame in self.frames
-        ]
-        frames[0].save(
-            self.path,
-            save_all=True,
-            append_images=frames[1:],
-            duration=1000 // RATE,
-            loop=0,
-            optimize=True,
-        )
+        self.save()
 
     # The table under the lamp
 
@@ -170,9 +440,9 @@ class Film:
         """Rays of the camera that films, row by row."""
         return rays_of(
             self._pose,
-            FINER * FOCAL * SIZE[0],
-            FINER * SIZE[0],
-            FINER * SIZE[1],
+            FINER * FOCAL * TABLE_SIZE[0],
+            FINER * TABLE_SIZE[0],
+            FINER * TABLE_SIZE[1],
         )
 
     def _colour(
@@ -200,7 +470,7 @@ class Film:
         looking: bool = False,
     ) -> None:
         """Add a frame: the arm as it is now, and lines on it."""
-        frame = Image.new("RGB", (SIZE[0] + SIDE, SIZE[1]), PAPER)
+        frame = Image.new("RGB", (TABLE_SIZE[0] + TABLE_SIDE, TABLE_SIZE[1]), PAPER)
         picture = self._filmed_now()
         draw = ImageDraw.Draw(picture, "RGBA")
         if looking:
@@ -214,9 +484,9 @@ class Film:
             tag(draw, at, name, colour, taken)
         frame.paste(picture, (0, 0))
         if self._beside is not None:
-            frame.paste(self._beside, (SIZE[0], 0))
+            frame.paste(self._beside, (TABLE_SIZE[0], 0))
         draw = ImageDraw.Draw(frame, "RGBA")
-        speed = f"{seconds:.1f} s of motion, shown {SLOWER:g} times slower"
+        speed = f"{seconds:.1f} s of motion, shown {self.SLOWER:g} times slower"
         lines(draw, said or [self._title, speed])
         self.frames.append(frame)
 
@@ -237,11 +507,11 @@ class Film:
             np.clip(
                 f(self._place(corners), axis=0) * FINER + d,
                 0,
-                np.array(SIZE) * FINER,
+                np.array(TABLE_SIZE) * FINER,
             ).astype(int)
             for f, d in ((np.min, -2), (np.max, 2))
         )
-        part = np.zeros((SIZE[1] * FINER, SIZE[0] * FINER), bool)
+        part = np.zeros((TABLE_SIZE[1] * FINER, TABLE_SIZE[0] * FINER), bool)
         part[low[1] : high[1], low[0] : high[0]] = True
         within = np.flatnonzero(part)
         hit, points, normals, colours = stage.hits(eye, self._rays()[within])
@@ -251,13 +521,16 @@ class Film:
         sky = SKY * (0.6 + 0.3 * normals[:, 2:])
         light[within[hit][nearer]] = (colours * (sky + SUN * facing[:, None]))[nearer]
 
-        pixels = toned(light).reshape(SIZE[1] * FINER, SIZE[0] * FINER, 3)
-        return Image.fromarray(pixels).resize(SIZE, Image.Resampling.BOX)
+        pixels = toned(light).reshape(TABLE_SIZE[1] * FINER, TABLE_SIZE[0] * FINER, 3)
+        return Image.fromarray(pixels).resize(TABLE_SIZE, Image.Resampling.BOX)
 
     def _place(self, points: Array) -> Array:
         """Pixels, (..., 2), of points, (..., 3), world."""
         inside = (points - self._pose[:3, 3]) @ self._pose[:3, :3]
-        return inside[..., :2] / inside[..., 2:] * FOCAL * SIZE[0] + np.array(SIZE) / 2
+        return (
+            inside[..., :2] / inside[..., 2:] * FOCAL * TABLE_SIZE[0]
+            + np.array(TABLE_SIZE) / 2
+        )
 
     def _draw_view(self, draw: ImageDraw.ImageDraw) -> None:
         """What the camera on the wrist has in view, down to the table."""
@@ -279,29 +552,20 @@ class Film:
         draw.line([*flat, flat[0]], (*ImageColor.getrgb(ACCENT), 220), 2)
 
 
-def strip(frames: Sequence[Image.Image]) -> Image.Image:
-    """Frames side by side, half as large."""
-    small = [frame.reduce(2) for frame in frames]
-    whole = Image.new("RGB", (sum(frame.width for frame in small), small[0].height))
-    for k, frame in enumerate(small):
-        whole.paste(frame, (k * frame.width, 0))
-    return whole
-
-
 def lines(draw: ImageDraw.ImageDraw, said: Sequence[str]) -> None:
     """Write lines at the lower left, the first of them bold."""
     wide = max(draw.textlength(line, font(14, True)) for line in said)
-    box = (6, SIZE[1] - 14 - 20 * len(said), 22 + wide, SIZE[1] - 6)
+    box = (6, TABLE_SIZE[1] - 14 - 20 * len(said), 22 + wide, TABLE_SIZE[1] - 6)
     draw.rounded_rectangle(box, 8, (*ImageColor.getrgb(PAPER), 215))
     for k, line in enumerate(said):
-        y = SIZE[1] - 14 - 20 * (len(said) - 1 - k)
+        y = TABLE_SIZE[1] - 14 - 20 * (len(said) - 1 - k)
         letters = font(14 if k == 0 else 13, k == 0)
         draw.text((14, y), line, INK, letters, anchor="ls")
 
 
-def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image:
+def table_panel(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image:
     """What the camera saw last with what was found in it, and all from above."""
-    panel = Image.new("RGB", (SIDE, SIZE[1]), PAPER)
+    panel = Image.new("RGB", (TABLE_SIDE, TABLE_SIZE[1]), PAPER)
     draw = ImageDraw.Draw(panel)
     number = len(scene.frames)
     draw.text((INSET, 12), f"look {number}: what its camera sees", INK, font(13, True))
@@ -310,7 +574,7 @@ def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image
 
     top = 32 + seen.height + 14
     draw.text((INSET, top), "what it knows, from above", INK, font(13, True))
-    side = SIZE[1] - top - 20 - 34
+    side = TABLE_SIZE[1] - top - 20 - 34
     plan = plan_picture(scene, middle, wrong, (seen.width, side))
     panel.paste(plan, (INSET, top + 20))
 
@@ -318,7 +582,7 @@ def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image
     sure = sum(thing.confident for thing in named)
     unknown = len(scene.objects) - len(named)
     said = f"{sure} sure, {len(named) - sure} not sure, {unknown} unknown"
-    draw.text((INSET, SIZE[1] - 26), said, INK, font(14, True))
+    draw.text((INSET, TABLE_SIZE[1] - 26), said, INK, font(14, True))
     return panel
 
 
@@ -343,7 +607,7 @@ def wrist_picture(scene: nextview.Scene, wrong: set[int]) -> Image.Image:
         picture[rim] = colour
         rows, columns = np.nonzero(mask)
         names.append((thing, columns.mean(), rows.min()))
-    width = SIDE - 2 * INSET
+    width = TABLE_SIDE - 2 * INSET
     left, top, right, bottom = part_of_frame(scene)
     share = width / (right - left)
     cut = Image.fromarray(picture.clip(0, 255).astype(np.uint8)).crop(

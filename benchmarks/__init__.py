@@ -1,0 +1,3 @@
+"""What the pages measure: each script runs as ``python -m benchmarks.NAME`` from the root of the
+repository.
+"""
