@@ -191,8 +191,8 @@ class BinFilm(SmallFilm):
     STILL = 0.8  # seconds that what is known is shown after a look
 
     def __init__(self, cell: Cell, path: Path | None) -> None:
-        pose = look_at_origin(np.radians(33), np.radians(-38), 1.35)
-        pose[:3, 3] += [0.38, -0.16, 0.2]
+        pose = look_at_origin(np.radians(38), np.radians(-38), 1.1)
+        pose[:3, 3] += [0.42, -0.18, 0.2]
         super().__init__(path, pose)
         self.cell = cell
         self._count = 0
