@@ -50,7 +50,7 @@ HEARD = {
     "next_poses": PoseArray,
     "planning_scene": PlanningScene,
 }
-"""Topics of the node, with their types."""
+"""Latched topics of the node, with their types."""
 
 
 class Robot(Node):
@@ -67,6 +67,7 @@ class Robot(Node):
         change: what is done to an image, its camera_info and its transform before they are sent.
         heard: the last message of each topic of the node.
         objects: transforms of objects that were heard, by name.
+        looks_new: number that changes where the cameras see something else from the same poses.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Robot(Node):
         super().__init__("robot", **options)
         self.see, self.k, self.start = see, k, start
         self.depth_of = {}
+        self.looks_new = 0
         self.heard = {}
         self.objects = {}
         self.reset()
@@ -105,6 +107,12 @@ class Robot(Node):
                 lambda given, topic=topic: self.heard.update({topic: given}),
                 LATCHED,
             )
+        self.create_subscription(
+            Detection3DArray,
+            "tracked",
+            lambda given: self.heard.update(tracked=given),
+            10,
+        )
         self.create_subscription(TFMessage, "/tf", self.hear_transforms, 100)
         self.look_client = self.create_client(Trigger, "look")
         self.failed_client = self.create_client(Trigger, "failed")
@@ -116,6 +124,13 @@ class Robot(Node):
             ),
         }
         self.create_timer(0.1, self.publish)
+
+    @property
+    def is_served(self):
+        """Whether any service or action of the node is there."""
+        return self.look_client.service_is_ready() or any(
+            client.server_is_ready() for client in self.actions.values()
+        )
 
     @property
     def pose(self):
@@ -153,7 +168,7 @@ class Robot(Node):
             self.publish_camera(name, pose)
 
     def publish_camera(self, name, pose):
-        key = pose.tobytes()
+        key = pose.tobytes(), self.looks_new
         if key not in self.depth_of:
             self.depth_of[key] = self.see(pose)
         depth = self.depth_of[key]
@@ -194,6 +209,17 @@ class Robot(Node):
     def look(self):
         assert self.look_client.wait_for_service(SECONDS)
         return wait(self.look_client.call_async(Trigger.Request()))
+
+    def look_when_all_is_there(self):
+        """The answer to the first look for which all messages have come to a node that began."""
+        answers = []
+
+        def looks():
+            answers.append(self.look())
+            return answers[-1].success
+
+        until(looks, "a look")
+        return answers[-1]
 
     def failed(self):
         return wait(self.failed_client.call_async(Trigger.Request()))
