@@ -151,6 +151,11 @@ class Robot(Node):
         self.heard.clear()
         self.objects.clear()
 
+    def show(self, pose, depth):
+        """Let a camera see this depth from a pose from now on."""
+        self.depth_of[pose.tobytes(), self.looks_new + 1] = depth
+        self.looks_new += 1
+
     def hear_transforms(self, message):
         for each in message.transforms:
             if "tool" not in each.child_frame_id:
