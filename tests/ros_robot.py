@@ -287,8 +287,14 @@ class Running:
         self.executor = MultiThreadedExecutor(8)
         self.executor.add_node(self.node)
         self.executor.add_node(self.robot)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.closed = threading.Event()
+        self.thread = threading.Thread(target=self.spin, daemon=True)
         self.thread.start()
+
+    def spin(self):
+        """Until ``close``: nothing is begun any more when the executor shuts down."""
+        while not self.closed.is_set():
+            self.executor.spin_once(0.1)
 
     def add(self, other):
         """One more node or robot; it is destroyed at the end, as the executor uses it."""
@@ -297,8 +303,9 @@ class Running:
         return other
 
     def close(self):
-        self.executor.shutdown(5.0)
+        self.closed.set()
         self.thread.join(10.0)
+        self.executor.shutdown(5.0)
         for each in (self.node, self.robot, *self.others):
             for made in (*getattr(each, "servers", ()),):
                 made.destroy()

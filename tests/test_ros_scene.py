@@ -47,6 +47,7 @@ from small_tables import camera_over, leaning, view, without
 from test_scene_changes import shifted
 
 import nextview
+from nextview.sensing import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera
 from nextview.teaching.learn import learn
@@ -451,7 +452,12 @@ def test_two_cameras_look_at_one_scene(running, mine, camera, see, intrinsics):
     node = running.add(
         node_with("/pair", models=[str(mine)], cameras=["left", "right"], patience=10.0)
     )
-    answer = pair.look_when_all_is_there()
+    until(
+        lambda: all(isinstance(one, Frame) for one in node.frames()),
+        "a frame of each camera",
+    )
+    answer = pair.look()
+    assert answer.success, answer.message
     assert answer.message.startswith("2 views")
     assert "camera right is " in answer.message
     assert "relative to camera left" in answer.message
