@@ -50,7 +50,7 @@ HEARD = {
     "next_poses": PoseArray,
     "planning_scene": PlanningScene,
 }
-"""Topics of the node, with their types."""
+"""Latched topics of the node, with their types."""
 
 
 class Robot(Node):
@@ -67,6 +67,7 @@ class Robot(Node):
         change: what is done to an image, its camera_info and its transform before they are sent.
         heard: the last message of each topic of the node.
         objects: transforms of objects that were heard, by name.
+        looks_new: number that changes where the cameras see something else from the same poses.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Robot(Node):
         super().__init__("robot", **options)
         self.see, self.k, self.start = see, k, start
         self.depth_of = {}
+        self.looks_new = 0
         self.heard = {}
         self.objects = {}
         self.reset()
@@ -105,6 +107,12 @@ class Robot(Node):
                 lambda given, topic=topic: self.heard.update({topic: given}),
                 LATCHED,
             )
+        self.create_subscription(
+            Detection3DArray,
+            "tracked",
+            lambda given: self.heard.update(tracked=given),
+            10,
+        )
         self.create_subscription(TFMessage, "/tf", self.hear_transforms, 100)
         self.look_client = self.create_client(Trigger, "look")
         self.failed_client = self.create_client(Trigger, "failed")
@@ -116,6 +124,13 @@ class Robot(Node):
             ),
         }
         self.create_timer(0.1, self.publish)
+
+    @property
+    def is_served(self):
+        """Whether any service or action of the node is there."""
+        return self.look_client.service_is_ready() or any(
+            client.server_is_ready() for client in self.actions.values()
+        )
 
     @property
     def pose(self):
@@ -136,6 +151,11 @@ class Robot(Node):
         self.heard.clear()
         self.objects.clear()
 
+    def show(self, pose, depth):
+        """Let a camera see this depth from a pose from now on."""
+        self.depth_of[pose.tobytes(), self.looks_new + 1] = depth
+        self.looks_new += 1
+
     def hear_transforms(self, message):
         for each in message.transforms:
             if "tool" not in each.child_frame_id:
@@ -153,7 +173,7 @@ class Robot(Node):
             self.publish_camera(name, pose)
 
     def publish_camera(self, name, pose):
-        key = pose.tobytes()
+        key = pose.tobytes(), self.looks_new
         if key not in self.depth_of:
             self.depth_of[key] = self.see(pose)
         depth = self.depth_of[key]
@@ -194,6 +214,17 @@ class Robot(Node):
     def look(self):
         assert self.look_client.wait_for_service(SECONDS)
         return wait(self.look_client.call_async(Trigger.Request()))
+
+    def look_when_all_is_there(self):
+        """The answer to the first look for which all messages have come to a node that began."""
+        answers = []
+
+        def looks():
+            answers.append(self.look())
+            return answers[-1].success
+
+        until(looks, "a look")
+        return answers[-1]
 
     def failed(self):
         return wait(self.failed_client.call_async(Trigger.Request()))
@@ -256,8 +287,14 @@ class Running:
         self.executor = MultiThreadedExecutor(8)
         self.executor.add_node(self.node)
         self.executor.add_node(self.robot)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.closed = threading.Event()
+        self.thread = threading.Thread(target=self.spin, daemon=True)
         self.thread.start()
+
+    def spin(self):
+        """Until ``close``: nothing is begun any more when the executor shuts down."""
+        while not self.closed.is_set():
+            self.executor.spin_once(0.1)
 
     def add(self, other):
         """One more node or robot; it is destroyed at the end, as the executor uses it."""
@@ -266,8 +303,9 @@ class Running:
         return other
 
     def close(self):
-        self.executor.shutdown(5.0)
+        self.closed.set()
         self.thread.join(10.0)
+        self.executor.shutdown(5.0)
         for each in (self.node, self.robot, *self.others):
             for made in (*getattr(each, "servers", ()),):
                 made.destroy()

@@ -3,10 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from nextview.geometry.mesh import Mesh
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.simulation.tables import (
+    PlacedThing,
+    SimulatedTable,
+    TableCamera,
+    poses_around,
+)
 from nextview.things.memory import taught_meshes
 
 CENTRE = np.array([0, 0, 0.03])
@@ -26,6 +32,17 @@ def camera_over(
     """A camera over a table on which some things are put down at random."""
     rng = np.random.default_rng(seed)
     return TableCamera(SimulatedTable.draw(meshes, rng, gap), SENSORS[sensor], rng)
+
+
+def leaning(mesh: Mesh, degrees: float, place: Sequence[float]) -> PlacedThing:
+    """A thing that touches the table at (x, y) around its middle, tilted about the y axis."""
+    metres = mesh.vertices * mesh.radius + mesh.centre
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    turned = metres @ pose[:3, :3].T
+    middle = (turned.min(0) + turned.max(0)) / 2
+    pose[:3, 3] = place[0] - middle[0], place[1] - middle[1], -turned[:, 2].min()
+    return PlacedThing(mesh.name, metres, mesh.faces, pose)
 
 
 def view(degrees: float, elevation: float = 50.0, distance: float = 0.65) -> np.ndarray:

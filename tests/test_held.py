@@ -1,18 +1,20 @@
-"""Things in a gripper, chosen by a point: no plane is under them, and there is no mask."""
+"""Things that do not rest: in a gripper, where no plane is under them, or leaning on a table."""
+
+import pickle
 
 import numpy as np
 import pytest
 from pipeline import box
 from scipy.spatial.transform import Rotation
-from small_tables import meshes_of
+from small_tables import leaning, meshes_of, view
 
 import nextview
-from nextview.errors import ObservationError
+from nextview.errors import ModelError, ObservationError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.sensing import Frame, ObservedObject
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import poses_around
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 
 PLACE = np.array([0.1, 0.0, 0.35])  # of the thing, above a table
 SENSOR = SENSORS["stereo"]
@@ -95,3 +97,57 @@ def test_a_point_where_nothing_is_seen_is_refused():
     )
     with pytest.raises(ObservationError, match="finds nothing at the point"):
         nothing.add(frame)
+
+
+# Leaning on a table
+
+
+@pytest.fixture(scope="module")
+def leans():
+    """Frames of a cracker box that leans against a box of sugar, and its pose."""
+    meshes = meshes_of(["cracker_box", "sugar_box"])
+    table = SimulatedTable(
+        (
+            leaning(meshes["cracker_box"], 25, (0, 0)),
+            leaning(meshes["sugar_box"], 0, (0.13, 0)),
+        )
+    )
+    camera = TableCamera(table, SENSOR, np.random.default_rng(1))
+    return [camera.frame(view(degrees)) for degrees in (20, 110)], camera.truth
+
+
+def named(scene, name):
+    """The likeliest object of a name."""
+    return max(
+        (thing for thing in scene.objects if thing.name == name),
+        key=lambda thing: thing.confidence,
+    )
+
+
+def test_a_thing_that_leans_is_confident_in_a_scene_of_any_orientation(leans, ycb):
+    frames, truth = leans
+    resting = nextview.Scene(ycb)
+    scene = nextview.Scene(ycb, any_orientation=True)
+    for frame in frames:
+        resting.update(frame)
+        scene.update(frame)
+    doubtful = named(resting, "cracker_box")
+    assert not doubtful.confident
+    assert "would not stand" in doubtful.result.doubt
+    thing = named(scene, "cracker_box")
+    assert thing.confident
+    np.testing.assert_allclose(thing.pose, truth["cracker_box"], atol=0.02)
+    assert named(scene, "sugar_box").confident
+
+
+def test_a_system_of_any_orientation_is_pickled_as_one(ycb):
+    again = pickle.loads(pickle.dumps(ycb.in_any_orientation()))
+    assert again.any_orientation
+    assert again.models.recogniser.things.any_orientation
+    assert not ycb.any_orientation
+    assert not ycb.models.recogniser.things.any_orientation
+
+
+def test_models_without_geometry_know_no_other_orientation():
+    with pytest.raises(ModelError, match="recognised by their geometry"):
+        nextview.Scene("modelnet10", any_orientation=True)

@@ -32,8 +32,9 @@ from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 import nextview
+from nextview.captured.transforms import NoTransformError
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.sensing import Frame, ObservedObject
 
 ROS = Path(__file__).parents[1] / "ros2"
@@ -445,7 +446,8 @@ def node(monkeypatch):
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
     ours = [
-        f"nextview_ros.{name}" for name in ("inputs", "outputs", "parameters", "node")
+        f"nextview_ros.{name}"
+        for name in ("inputs", "outputs", "parameters", "following", "node")
     ]
     for name in ours:
         monkeypatch.delitem(sys.modules, name, raising=False)
@@ -492,6 +494,24 @@ def test_a_thing_cannot_be_learned_under_the_name_of_a_path(node, tmp_path, name
         node.add_to_memory(SimpleNamespace(path=str(mesh), name=name, unit="m"))
 
 
+def test_frames_of_one_time_are_used_together_and_alone_where_one_is_refused(node):
+    taken = []
+
+    def update(frames):
+        if "nothing" in frames:
+            raise ObservationError("it shows nothing")
+        taken.append(list(frames))
+        warning = SimpleNamespace(message="a warning")
+        return tuple(SimpleNamespace(taken=True, warnings=[warning]) for _ in frames)
+
+    node.session, node.scene = None, SimpleNamespace(update=update)
+    assert node.take_in(["left", "right"]) == (2, ["a warning"])
+    assert taken == [["left", "right"]]
+    assert node.take_in(["left", "nothing"]) == (1, ["a warning", "it shows nothing"])
+    assert taken[1:] == [["left"]]
+    assert node.take_in([]) == (0, [])
+
+
 def mask_message(rows, encoding="mono8", padding=0):
     rows = np.pad(rows.astype(np.uint8), ((0, 0), (0, padding)), constant_values=9)
     return message(
@@ -514,6 +534,156 @@ def test_a_mask_is_an_image_of_eight_bits():
         conversion.mask_of(replace(given, encoding="rgb8"))
     with pytest.raises(ObservationError, match="has not 20 bytes"):
         conversion.mask_of(replace(given, data=given.data[:20]))
+
+
+def label_message(rows, encoding, big=0):
+    """A message of labels, (H, W), with rows that are 4 bytes longer than needed."""
+    kind = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}[encoding]
+    data = rows.astype(f"{'>' if big else '<'}{kind}").view(np.uint8)
+    data = np.pad(data, ((0, 0), (0, 4)), constant_values=9)
+    height, width = rows.shape
+    return message(
+        "sensor_msgs/msg/Image",
+        header=header("optical"),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=big,
+        step=data.shape[1],
+        data=data.ravel(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("encoding", "largest", "big"),
+    [("mono8", 255, 0), ("8UC1", 255, 1), ("mono16", 60_000, 0), ("16UC1", 60_000, 1)],
+)
+def test_labels_are_an_image_of_eight_or_sixteen_bits(encoding, largest, big):
+    rows = np.random.default_rng(0).integers(0, largest + 1, (7, 9))
+    rows[0, 0] = largest
+    given = label_message(rows, encoding, big)
+    np.testing.assert_array_equal(conversion.labels_of(given), rows)
+    with pytest.raises(ObservationError, match="a label image is encoded as mono8 or"):
+        conversion.labels_of(replace(given, encoding="32SC1"))
+    with pytest.raises(ObservationError, match="has not 20 bytes"):
+        conversion.labels_of(replace(given, data=given.data[:20]))
+
+
+def test_labels_are_of_the_frame_with_which_they_came():
+    labels = importlib.import_module("nextview_ros.labels").LabelledFrames()
+    thing = box((0.1, 0.1, 0.1), (0, 0, 0.05))
+    k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
+    depth, shown = cast([TABLE, thing], pose_at(40, 20, 0.7, (0, 0, 0)), k, (60, 80))
+    one, other = (Frame(depth, k, pose_at(40, 20, 0.7, (0, 0, 0))) for _ in range(2))
+    with pytest.raises(ObservationError, match="labels of 80 x 10 pixels do not"):
+        labels.add(one, np.zeros((10, 80), np.int64))
+    labels.add(one, 7 * (shown == 1))
+    np.testing.assert_array_equal(labels(one).labels, 7 * (shown == 1))
+    assert labels(one).surface is None
+    assert labels(other).surface is not None  # of the network
+
+
+# Following, with stand-ins for cameras and tracker
+
+
+class Tracked:
+    """A tracker that keeps the times of its frames."""
+
+    def __init__(self, scene):
+        self.scene, self.times, self.things = scene, [], ()
+
+    def update(self, frame, time):
+        assert time >= max(self.times, default=time)
+        self.times.append(time)
+
+    def follow(self, scene, since):
+        assert scene is self.scene
+        self.since = since
+
+
+def arrived(camera, time):
+    """An image of a camera that has just come."""
+    camera.latest = SimpleNamespace(header=header("optical", time)), None
+
+
+@pytest.fixture
+def follower(node, monkeypatch):
+    """Two cameras that are followed, and the frames without a transform."""
+    monkeypatch.setattr(nextview, "Tracker", Tracked)
+    module = sys.modules["nextview_ros.following"]
+    cameras = [
+        SimpleNamespace(namespace=name, latest=None) for name in ("left", "right")
+    ]
+    missing = set()
+
+    def frame_of(camera, image, info):
+        if camera.namespace in missing:
+            raise NoTransformError("tf has nothing")
+        return image
+
+    made = module.Follower(cameras, frame_of)
+    made.begin(SimpleNamespace(tops=(1,)))
+    return made, cameras, missing
+
+
+def times(steps):
+    """Seconds of the stamps of steps, or what is wrong with them."""
+    return [
+        str(step) if isinstance(step, NextviewError) else step.sec + step.nanosec / 1e9
+        for step in steps
+    ]
+
+
+def test_each_image_is_followed_once_in_the_order_of_the_stamps(follower):
+    made, (left, right), _ = follower
+    assert times(made.steps(10.0)) == []
+    arrived(left, 10.25)
+    arrived(right, 10.0)
+    assert times(made.steps(10.3)) == [10.0, 10.25]
+    assert times(made.steps(10.3)) == []
+    arrived(right, 10.125)  # late: an image of the other camera was followed
+    assert times(made.steps(10.3)) == []
+    arrived(right, 10.5)
+    assert times(made.steps(10.5)) == [10.5]
+    assert made.tracker.times == [10.0, 10.25, 10.5]
+
+
+def test_an_image_waits_for_its_transform_but_not_for_ever(follower):
+    made, (left, _), missing = follower
+    missing.add("left")
+    arrived(left, 10.0)
+    assert times(made.steps(10.0)) == []
+    arrived(left, 10.125)
+    missing.clear()
+    assert times(made.steps(10.125)) == [10.0]  # newer ones do not overtake it
+    missing.add("left")
+    assert times(made.steps(10.2)) == []
+    assert times(made.steps(10.5)) == ["tf has nothing"]
+    assert times(made.steps(10.5)) == []
+
+
+def test_a_bag_that_begins_again_is_followed_anew(follower):
+    made, (left, _), _ = follower
+    first = made.tracker
+    arrived(left, 20.0)
+    assert times(made.steps(20.0)) == [20.0]
+    arrived(left, 10.0)
+    assert times(made.steps(10.0)) == [10.0]
+    assert made.tracker is not first
+    assert made.tracker.times == [10.0]
+
+
+def test_nothing_is_followed_before_the_first_look(follower):
+    made, (left, _), _ = follower
+    scene = SimpleNamespace(tops=())
+    made.begin(scene)
+    arrived(left, 10.0)
+    assert times(made.steps(10.0)) == []
+    scene.tops = (1,)
+    made.look_taken(())
+    assert times(made.steps(10.0)) == [10.0]
+    made.look_taken(("since",))
+    assert made.tracker.since == ("since",)
 
 
 # What cannot be run here is at least well formed

@@ -308,16 +308,14 @@ def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
     process = started()
     try:
         second.goal(distance=0.7)
-        assert second.look().success
+        assert second.look_when_all_is_there().message == "view 1 is taken in"
         process.send_signal(signal.SIGKILL)
         process.wait()
-        until(
-            lambda: not second.look_client.service_is_ready(), "the end of the service"
-        )
+        until(lambda: not second.is_served, "the end of the services")
         process = started()
         handle, _ = second.goal(distance=0.7)
         assert handle.accepted
-        assert second.look().message == "view 1 is taken in"
+        assert second.look_when_all_is_there().message == "view 1 is taken in"
     finally:
         process.kill()
         process.wait()

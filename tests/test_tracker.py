@@ -1,5 +1,8 @@
 """Things are followed from frame to frame: moved, hidden, taken away and found again."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -115,6 +118,47 @@ def test_a_thing_that_was_taken_away_is_lost_and_followed_again_after_the_scene(
     scene.update(frame)
     tracker.follow(scene)
     assert off(camera, tracker.update(frame))["banana"] < 0.004
+
+
+def test_a_thing_that_rests_takes_the_pose_of_the_scene_moved_as_it_was_since(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    tracker.update(camera.frame(view(20)))
+    scene.update(camera.frame(view(110)))
+    since = tracker.things
+    tracker.follow(scene)
+    for kept, before in zip(tracker.things, since, strict=True):
+        assert np.array_equal(kept.pose, before.pose)
+    tracker.follow(scene, since)
+    in_scene = {one.number: one.pose for one in scene.objects}
+    for one, before in zip(tracker.things, since, strict=True):
+        assert not np.allclose(one.pose, before.pose, atol=1e-5)
+        assert np.allclose(one.pose, in_scene[one.number], atol=1e-9)
+
+    # the scene takes its time, and something is moved meanwhile
+    for step in range(16):
+        if step < 8:
+            camera.change(shifted(camera.table, "banana", STEP))
+        tracker.update(camera.frame(view(110)))
+    tracker.follow(scene, since)
+    banana = next(one for one in tracker.things if one.name == "banana")
+    moved = banana.pose - in_scene[banana.number]
+    assert np.allclose(moved[:2, 3], 8 * STEP, atol=0.006)
+    assert max(off(camera, tracker.things).values()) < 0.005
+
+
+def test_a_name_that_changes_or_is_doubted_is_taken_from_the_scene(watched):
+    _, scene = watched
+    tracker = nextview.Tracker(scene)
+    bottle, can, banana = (
+        next(one for one in scene.objects if one.name == name) for name in NAMES
+    )
+    as_can = replace(can, number=bottle.number)
+    doubted = replace(banana, confident=False)
+    tracker.follow(SimpleNamespace(tops=scene.tops, objects=(as_can, doubted)))
+    (followed,) = tracker.things
+    assert (followed.number, followed.name) == (bottle.number, can.name)
+    assert np.array_equal(followed.pose, can.pose)
 
 
 def test_what_is_out_of_view_keeps_its_place(watched):

@@ -7,6 +7,7 @@ forward, x right, y down), which are nextview's own axes.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,13 @@ from nextview.captured.messages import depth_of, intrinsics_of, pose_of, seconds
 from nextview.errors import ObservationError
 from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.sensing.object_frame import Box
-from nextview.types import Mask
+from nextview.types import Index, Mask
 
 Float = NDArray[np.float64]
 
 MASK_ENCODINGS = ("mono8", "8UC1")
+LABEL_ENCODINGS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+"""Type of a label, by encoding of a label image."""
 SIMULTANEOUS = 0.02
 """Seconds that image, camera_info and transform may be apart: a camera at 30 Hz never mixes
 neighbours.
@@ -70,10 +73,12 @@ def frame_at(
     rectified: bool = False,
     axes: str = "opencv",
     mask: Any = None,
+    camera: str = "",
 ) -> Frame:
     """The same, with the pose of the image's frame in the world as a matrix, (4, 4), metres.
 
     ``mask`` is a ``sensor_msgs/Image`` of the object's pixels, see ``mask_of``; None for none.
+    ``camera`` is the name of the camera, see ``Frame``.
     """
     if (image.width, image.height) != (info.width, info.height):
         raise ObservationError(
@@ -90,7 +95,12 @@ def frame_at(
         raise ObservationError(f"image and camera_info are {late:.3f} s apart")
     inside = None if mask is None else mask_of(mask)
     return Frame(
-        depth_of(image), intrinsics_of(info, rectified), pose, inside, axes=axes
+        depth_of(image),
+        intrinsics_of(info, rectified),
+        pose,
+        inside,
+        axes=axes,
+        camera=camera,
     )
 
 
@@ -103,17 +113,37 @@ def mask_of(image: Any) -> Mask:
     Raises:
         ObservationError: it has more than 8 bits a pixel, or data is missing.
     """
-    if image.step < image.width or len(image.data) != image.step * image.height:
+    return _pixels_of(image, "a mask", MASK_ENCODINGS) > 0
+
+
+def labels_of(image: Any) -> Index:
+    """The label of each pixel of an image of 8 or 16 bits a pixel, (H, W) int64, 0 for none.
+
+    Args:
+        image: ``sensor_msgs/Image`` of the encodings mono8, 8UC1, mono16 and 16UC1.
+
+    Raises:
+        ObservationError: it has another encoding, or data is missing.
+    """
+    return _pixels_of(image, "a label image", LABEL_ENCODINGS).astype(np.int64)
+
+
+def _pixels_of(image: Any, what: str, encodings: Collection[str]) -> NDArray[Any]:
+    """The values of an image with one of some encodings, (H, W), of unsigned integers."""
+    if image.encoding not in encodings:
         raise ObservationError(
-            f"a mask of {image.width} x {image.height} pixels has not {len(image.data)} bytes in"
+            f"{what} is encoded as {' or '.join(encodings)}, not {image.encoding!r}"
+        )
+    order = ">" if image.is_bigendian else "<"
+    kind = np.dtype(LABEL_ENCODINGS[image.encoding]).newbyteorder(order)
+    width = image.width * kind.itemsize
+    if image.step < width or len(image.data) != image.step * image.height:
+        raise ObservationError(
+            f"{what} of {image.width} x {image.height} pixels has not {len(image.data)} bytes in"
             f" rows of {image.step}"
         )
-    if image.encoding not in MASK_ENCODINGS:
-        raise ObservationError(
-            f"a mask is encoded as {' or '.join(MASK_ENCODINGS)}, not {image.encoding!r}"
-        )
     rows = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)
-    return rows[:, : image.width] > 0
+    return np.ascontiguousarray(rows[:, :width]).view(kind)
 
 
 def box_of(box: Any) -> Box:

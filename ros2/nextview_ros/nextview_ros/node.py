@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,8 +44,10 @@ from nextview.recognition.belief import Stopping
 from nextview.recognition.protocol import JudgesTogether
 from nextview.sensing import ObservedObject
 from nextview.sensing.frame import Frame
-from nextview_ros.conversion import box_of, frame_at
+from nextview_ros.conversion import box_of, frame_at, labels_of
+from nextview_ros.following import Follower
 from nextview_ros.inputs import DepthCamera, Transforms
+from nextview_ros.labels import LabelledFrames
 from nextview_ros.outputs import (
     Detection3DArray,
     PlanningScene,
@@ -56,6 +58,7 @@ from nextview_ros.outputs import (
     pose_stamped,
     ranked_poses,
     scene_detections,
+    tracked_detections,
     transforms_of,
 )
 from nextview_ros.parameters import declare
@@ -79,9 +82,14 @@ class NextviewNode(Node):
         super().__init__("nextview", **options)
         declare(self)
         self.system = self.load()
+        self.asked: LookUntilSettled.Goal | None = (
+            None  # of the scene; None without a goal
+        )
+        self.segmentation = LabelledFrames()
         self.scene = nextview.Scene(self.system)
         self.session: nextview.Session | None = None
-        self.mask = None  # of the object in the next image of the first camera
+        # of the object, or the labels of all things, in the next image of the first camera
+        self.mask = self.labels = None
         self.goal = None
         self.seen_at = self.get_clock().now().to_msg()
         self.in_planning_scene: set[str] = set()
@@ -97,6 +105,9 @@ class NextviewNode(Node):
             DepthCamera(self, namespace, self.value("image"), group)
             for namespace in self.value("cameras")
         ]
+        self.follower = Follower(self.cameras, partial(self.frame_of, patience=0.0))
+        self.follower.begin(self.scene)
+        self.followed_at = -math.inf  # seconds, when an image was followed last
         self.publish()
         self.serve(group)
 
@@ -105,15 +116,18 @@ class NextviewNode(Node):
         self.next_pose = self.create_publisher(PoseStamped, "next_pose", LATCHED)
         self.next_poses = self.create_publisher(PoseArray, "next_poses", LATCHED)
         self.tf = self.create_publisher(TFMessage, "/tf", 100)
-        self.detections = self.planning_scene = None
+        self.detections = self.tracked = self.planning_scene = None
         if Detection3DArray is None:
-            self.get_logger().info("vision_msgs is not installed: no topic detections")
+            self.get_logger().info(
+                "vision_msgs is not installed: no topics detections and tracked"
+            )
         else:
             self.detections = self.create_publisher(
                 Detection3DArray,
                 "detections",
                 LATCHED,
             )
+            self.tracked = self.create_publisher(Detection3DArray, "tracked", 10)
         if PlanningScene is None:
             self.get_logger().info(
                 "moveit_msgs is not installed: no topic planning_scene"
@@ -150,13 +164,15 @@ class NextviewNode(Node):
                 (Recognise, "recognise", self.begin_session, self.session_result),
             )
         ]
-        for period, repeat in (
-            (self.value("period"), self.look_by_itself),
-            (1 / self.value("tf_rate") if self.value("tf_rate") else 0, self.tell_tf),
+        period = self.value("period")
+        for rate, repeat in (
+            (1 / period if period else 0.0, self.look_by_itself),
+            (self.value("tf_rate"), self.tell_tf),
+            (self.value("track_rate"), self.track),
         ):
-            if period:
+            if rate:
                 alone = MutuallyExclusiveCallbackGroup()
-                self.create_timer(period, repeat, callback_group=alone)
+                self.create_timer(1 / rate, repeat, callback_group=alone)
 
     def value(self, name: str) -> Any:
         """A parameter."""
@@ -176,40 +192,74 @@ class NextviewNode(Node):
             max_views=self.value("max_views"),
         )
 
-    def header(self) -> Header:
-        """That of a message in the world's frame, of now."""
-        now = self.get_clock().now().to_msg()
-        return Header(frame_id=self.value("world_frame"), stamp=now)
+    def header(self, stamp: Any = None) -> Header:
+        """That of a message in the world's frame, of a time; now by default."""
+        stamp = stamp or self.get_clock().now().to_msg()
+        return Header(frame_id=self.value("world_frame"), stamp=stamp)
 
     # Frames
 
     def frames(self) -> list[Frame | NextviewError]:
         """A frame of each camera that was taken from now on, or why there is none.
 
-        Earlier images may have been taken on the way.
+        Earlier images may have been taken on the way. All are the latest ones when all have come,
+        so that they are of one time.
+
+        Raises:
+            ObservationError: a mask or labels are for a frame that the first camera has not given.
         """
         now = seconds(self.get_clock().now().to_msg())
-        mask = self.mask
-        found: list[Frame | NextviewError] = []
+        patience = self.value("patience")
+        come: list[NextviewError | None] = []
         for camera in self.cameras:
             try:
-                found.append(self.frame(camera, now, mask))
+                camera.image_after(now, patience)
+                come.append(None)
             except NextviewError as error:
+                come.append(error)
+        if come[0] is not None and not (self.mask is None and self.labels is None):
+            raise come[0]
+
+        found: list[Frame | NextviewError] = []
+        for number, (camera, error) in enumerate(zip(self.cameras, come, strict=True)):
+            if error is not None:
                 found.append(error)
-            mask = None
+                continue
+            mask = self.mask if number == 0 else None
+            image, info = camera.latest
+            self.seen_at = image.header.stamp
+            try:
+                found.append(self.frame_of(camera, image, info, patience, mask))
+            except NextviewError as error:
+                if number == 0 and not (self.mask is None and self.labels is None):
+                    raise
+                found.append(error)
         return found
 
-    def frame(self, camera: DepthCamera, start: float, mask: Any) -> Frame:
-        """A frame of a camera that was taken after a time, seconds."""
-        patience = self.value("patience")
-        image, info = camera.image_after(start, patience)
-        self.seen_at = image.header.stamp
+    def frame_of(
+        self,
+        camera: DepthCamera,
+        image: Any,
+        info: Any,
+        patience: float,
+        mask: Any = None,
+    ) -> Frame:
+        """The frame of an image of a camera.
+
+        Args:
+            camera: that took it.
+            image: its depth image.
+            info: its camera_info.
+            patience: seconds to wait for its transform.
+            mask: image of the object's pixels in it; None for none.
+        """
         pose = self.transforms.pose(
             image.header.frame_id,
             self.value("world_frame"),
             seconds(image.header.stamp),
             patience,
         )
+        named = len(self.cameras) > 1 or self.value("standing")
         return frame_at(
             image,
             info,
@@ -217,6 +267,7 @@ class NextviewNode(Node):
             self.value("rectified"),
             self.value("axes"),
             mask,
+            camera.namespace if named else "",
         )
 
     # Looks
@@ -276,25 +327,40 @@ class NextviewNode(Node):
         """
         if self.session is not None and self.session.done:
             raise SessionError("the goal has ended")
-        taken = 0
-        said = []
-        for frame in self.frames():
-            try:
-                if isinstance(frame, NextviewError):
-                    raise frame
-                if self.session is None:
-                    look = self.scene.update(frame)
-                    taken += look.taken
-                    said += [warning.message for warning in look.warnings]
-                elif not self.session.done:
-                    self.session.update(frame)
-                    taken += 1
-            except NextviewError as error:
-                said.append(str(error))
+        found = self.frames()
+        since = self.follower.things
+        frames = [one for one in found if isinstance(one, Frame)]
+        said = [str(one) for one in found if not isinstance(one, Frame)]
+        if self.labels is not None:
+            self.segmentation.add(frames[0], self.labels)
+        taken, warned = self.take_in(frames)
+        said += warned
         if not taken:
             raise ObservationError("; ".join(said))
-        self.mask = None
+        self.mask = self.labels = None
+        if self.session is None:
+            self.follower.look_taken(since)
         return "; ".join([self.in_words(), *said])
+
+    def take_in(self, frames: Sequence[Frame]) -> tuple[int, list[str]]:
+        """Take in frames of one time, together if all of them can be used.
+
+        Returns:
+            The number of frames that were used, and what is likely to be wrong, in words.
+        """
+        try:
+            if self.session is not None:
+                done = self.session.done or not frames
+                return (0 if done else len(self.session.update(frames))), []
+            looks = self.scene.update(frames)
+        except NextviewError as error:
+            if len(frames) == 1:
+                return 0, [str(error)]
+            alone = [self.take_in([frame]) for frame in frames]
+            said = [sentence for _, sentences in alone for sentence in sentences]
+            return sum(taken for taken, _ in alone), said
+        warnings = [warning.message for look in looks for warning in look.warnings]
+        return sum(look.taken for look in looks), list(dict.fromkeys(warnings))
 
     def in_words(self) -> str:
         """What is known now."""
@@ -369,10 +435,37 @@ class NextviewNode(Node):
             self.detections.publish(scene_detections(objects, header))
 
     def tell_tf(self) -> None:
-        """Publish the poses of the objects with a confident name."""
-        told = transforms_of(self.scene.objects, self.header())
-        if told.transforms:
-            self.tf.publish(told)
+        """Publish the poses of the objects with a confident name, unless images tell them."""
+        now = seconds(self.get_clock().now().to_msg())
+        if 0 <= now - self.followed_at < self.value("patience"):
+            return
+        if self.value("track_rate"):
+            things = self.follower.found
+        else:
+            things = [
+                thing
+                for thing in self.scene.objects
+                if thing.confident and thing.pose is not None
+            ]
+        if things:
+            self.tf.publish(transforms_of(things, self.header()))
+
+    def track(self) -> None:
+        """Follow the objects with a confident name into the latest images, and publish them."""
+        now = seconds(self.get_clock().now().to_msg())
+        for step in self.follower.steps(now):
+            if isinstance(step, NextviewError):
+                said = f"an image is not followed: {step}"
+                self.get_logger().warning(said, throttle_duration_sec=10.0)
+                continue
+            self.followed_at = now
+            header = self.header(step)
+            things = self.follower.found
+            if things and self.value("tf_rate"):
+                self.tf.publish(transforms_of(things, header))
+            if self.tracked is not None:
+                told = tracked_detections(things, self.scene.objects, header)
+                self.tracked.publish(told)
 
     def feedback(self, poses: list[Any]) -> Any:
         """The feedback of the goal."""
@@ -444,16 +537,28 @@ class NextviewNode(Node):
             return kind.Result(message=str(error))
         finally:
             with self.busy:
-                self.session = self.goal = self.mask = None
+                self.session = self.goal = self.mask = self.labels = None
                 self.taken = False
             self.begun.set()
 
     def begin_scene(self, asked: LookUntilSettled.Goal) -> None:
         """Forget the scene, and begin one as a goal asks for."""
-        self.scene = nextview.Scene(
+        labels = labels_of(asked.labels[0]) if asked.labels else None
+        self.segmentation = LabelledFrames()
+        self.scene = self.new_scene(asked)
+        self.asked, self.labels = asked, labels
+        self.follower.begin(self.scene)
+
+    def new_scene(self, asked: LookUntilSettled.Goal | None) -> nextview.Scene:
+        """A scene without frames as a goal asks for, or as without one."""
+        if asked is None:
+            return nextview.Scene(self.system)
+        return nextview.Scene(
             replace(self.system, stopping=self.stopping(0.0, asked.max_views)),
             region=box_of(asked.region[0]) if asked.region else None,
             distance=asked.distance or None,
+            segmentation=self.segmentation,
+            any_orientation=asked.any_orientation,
         )
 
     def scene_result(self) -> LookUntilSettled.Result:
@@ -537,9 +642,10 @@ class NextviewNode(Node):
                 response.message = self.add_to_memory(request)
                 self.system = self.load()
                 frames = self.scene.frames
-                self.scene = nextview.Scene(self.system)
+                self.scene = self.new_scene(self.asked)
                 for frame in frames:
                     self.scene.update(frame)
+                self.follower.begin(self.scene)
                 if frames:
                     self.tell_scene()
                 response.success = True

@@ -12,6 +12,7 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from tf2_msgs.msg import TFMessage
 
 import nextview
+from nextview.scene.body import Tracked
 from nextview.scene.objects import SceneObject
 from nextview.types import Float
 from nextview.viewers.scene_shapes import placed_shape
@@ -74,7 +75,7 @@ def pose_stamped(pose: Float | None, header: Any, axes: str = "opencv") -> PoseS
 # The objects of a scene
 
 
-def called(thing: SceneObject) -> str:
+def called(thing: SceneObject | Tracked) -> str:
     """The name of an object as a tf frame and in a planning scene, such as mug_3."""
     return f"{thing.name}_{thing.number}"
 
@@ -103,18 +104,15 @@ def object_message(thing: SceneObject, header: Any) -> ObjectMessage:
     return message
 
 
-def transforms_of(objects: Sequence[SceneObject], header: Any) -> TFMessage:
-    """The poses of all objects with a confident name, as transforms from the world."""
-    return TFMessage(
-        transforms=[
-            _transform(thing, header)
-            for thing in objects
-            if thing.confident and thing.pose is not None
-        ]
-    )
+def transforms_of(
+    things: Sequence[SceneObject | Tracked],
+    header: Any,
+) -> TFMessage:
+    """The poses of things, which have one, as transforms from the world."""
+    return TFMessage(transforms=[_transform(thing, header) for thing in things])
 
 
-def _transform(thing: SceneObject, header: Any) -> TransformStamped:
+def _transform(thing: SceneObject | Tracked, header: Any) -> TransformStamped:
     message = TransformStamped(header=header, child_frame_id=called(thing))
     fill_transform(message.transform, thing.pose)
     return message
@@ -192,6 +190,43 @@ def scene_detections(objects: Sequence[SceneObject], header: Any) -> Any:
         if thing.pose is None:
             low, high = thing.seen_points.min(0), thing.seen_points.max(0)
             _fill_box(detection.bbox, np.eye(4), low, high)
+        detections.append(detection)
+    return Detection3DArray(header=header, detections=detections)
+
+
+def tracked_detections(
+    things: Sequence[Tracked],
+    objects: Sequence[SceneObject],
+    header: Any,
+) -> Any:
+    """Things that are followed as a ``vision_msgs/Detection3DArray``, each with one hypothesis.
+
+    Args:
+        things: that are not lost; the id of a detection is the number of its object.
+        objects: of the scene, with the scans.
+        header: of the world's frame, with the time of the image.
+    """
+    scans = {
+        (one.number, posed.thing): posed.vertices
+        for one in objects
+        for posed in one.candidates
+    }
+    detections = []
+    for thing in things:
+        detection = Detection3D(header=header, id=str(thing.number))
+        detection.results = [
+            _hypothesis(
+                thing.name,
+                thing.probability,
+                thing.pose,
+                thing.uncertainty.degrees,
+                thing.uncertainty.millimetres,
+            )
+        ]
+        vertices = scans.get((thing.number, thing.name))
+        if vertices is not None:
+            low, high = vertices.min(0), vertices.max(0)
+            _fill_box(detection.bbox, thing.pose, low, high)
         detections.append(detection)
     return Detection3DArray(header=header, detections=detections)
 

@@ -93,6 +93,18 @@ PARAMETERS = {
         100.0,
         fixed=True,
     ),
+    "track_rate": NodeParameter(
+        10.0,
+        "rate at which objects with confident names are followed between looks, in images a second"
+        " at most; 0 for never",
+        0.0,
+        100.0,
+        fixed=True,
+    ),
+    "standing": NodeParameter(
+        False,
+        "the only camera never moves, so that what changes in its images has moved",
+    ),
     "rectified": NodeParameter(
         True, "the images are rectified: P of camera_info counts, not K and D"
     ),

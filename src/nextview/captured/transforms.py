@@ -3,6 +3,7 @@
 Foote, "tf: The transform library", TePRA 2013.
 """
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +39,7 @@ class _Link:
         positions: (3,) each, metres.
         quaternions: x, y, z, w each.
         fixed: static: then there is only one transform, and its stamp is ignored.
+        ordered: whether the stamps increase.
     """
 
     parent: str
@@ -45,9 +47,12 @@ class _Link:
     stamps: list[float] = field(default_factory=list)
     positions: list[tuple[float, ...]] = field(default_factory=list)
     quaternions: list[tuple[float, ...]] = field(default_factory=list)
+    ordered: bool = True
 
     def sorted(self) -> "_Link":
         """Return the link sorted by time; of several transforms at one time the last is kept."""
+        if self.ordered:
+            return self
         stamps, last = np.unique(np.array(self.stamps)[::-1], return_index=True)
         order = len(self.stamps) - 1 - last
         return _Link(
@@ -62,11 +67,12 @@ class _Link:
         """Return the transform to the parent at a time, (4, 4); None if it is not known."""
         if self.fixed:
             return matrix_of(self.positions[-1], self.quaternions[-1])
-        after = int(np.searchsorted(self.stamps, time))
+        after = bisect_left(self.stamps, time)
         before = after - 1
         inside = 0 < after < len(self.stamps)
         if not inside or self.stamps[after] - self.stamps[before] > LONGEST_GAP:
-            nearest = int(np.abs(np.array(self.stamps) - time).argmin())
+            beside = range(max(before, 0), min(after + 1, len(self.stamps)))
+            nearest = min(beside, key=lambda row: abs(self.stamps[row] - time))
             if abs(self.stamps[nearest] - time) > BEYOND:
                 return None
             return matrix_of(self.positions[nearest], self.quaternions[nearest])
@@ -121,6 +127,7 @@ class TransformTree:
             raise TransformError(
                 f"tf frame {child!r} has two parents, {link.parent!r} and {parent!r}"
             )
+        link.ordered &= not link.stamps or stamp > link.stamps[-1]
         link.stamps.append(stamp)
         link.positions.append(position)
         link.quaternions.append(quaternion)

@@ -85,26 +85,39 @@ class Body:
     adrift: bool = False
 
     @classmethod
-    def of(cls, one: SceneObject, model: MotionModel) -> Body | None:
+    def of(
+        cls,
+        one: SceneObject,
+        model: MotionModel,
+        motion: Float | None = None,
+    ) -> Body | None:
         """Start with an object of a scene; None if it has no confident name and pose.
 
         Args:
             one: the object.
             model: of its motion.
+            motion: of the object since the scene has seen it, (4, 4), in the world; None for none.
         """
         if not one.confident or one.pose is None:
             return None
         label = one.result.classes.index(one.name)
         posed = next(each for each in one.candidates if each.label == label)
-        return cls._placed(one.number, posed, model)
+        pose = posed.pose if motion is None else motion @ posed.pose
+        return cls._placed(one.number, posed, pose, model)
 
     @classmethod
-    def _placed(cls, number: int, posed: PoseCandidate, model: MotionModel) -> Body:
-        """Start with a thing in a pose."""
+    def _placed(
+        cls,
+        number: int,
+        posed: PoseCandidate,
+        pose: Float,
+        model: MotionModel,
+    ) -> Body:
+        """Start with a thing in a pose, (4, 4), metres, as uncertain as that of a candidate."""
         caster = caster_of(posed)
         surface = caster.surfaces[0]
 
-        rotation = posed.pose[:3, :3]
+        rotation = pose[:3, :3]
         deviations = [
             np.radians(max(posed.degrees, LEAST_DEGREES)),
             max(posed.millimetres, LEAST_MILLIMETRES) / 1000,
@@ -113,7 +126,7 @@ class Body:
         spins = [each.axis for each in posed.symmetry or () if each.order == 0]
         state = BodyState.at_rest(
             rotation,
-            rotation @ surface.centre + posed.pose[:3, 3],
+            rotation @ surface.centre + pose[:3, 3],
             np.repeat(deviations, 3),
             model,
             np.reshape(np.array(spins, np.float64), (-1, 3)),

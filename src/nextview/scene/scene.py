@@ -137,9 +137,12 @@ class Scene:
             quarter turn ahead, or your own: a function of a ``SceneChoice`` and a random generator,
             or MODULE:NAME of one; see ``scene.view_policies``.
         rng: source of the random numbers of the policy; seed 0 by default.
+        any_orientation: the objects are taught things that need not be in a resting pose: they may
+            lean against each other. They still have to touch a visible surface or another object.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
+        ModelError: ``any_orientation`` needs known geometry, and the models have none.
     """
 
     def __init__(
@@ -152,6 +155,7 @@ class Scene:
         segmentation: Segmenter | None = None,
         policy: str | ScenePolicy | type = INFORMATION_POLICY,
         rng: np.random.Generator | None = None,
+        any_orientation: bool = False,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -164,7 +168,8 @@ class Scene:
         self.distance = distance
         self.reachable = reachable
         self.segmentation = segmentation
-        self.system = models if isinstance(models, System) else load(models)
+        system = models if isinstance(models, System) else load(models)
+        self.system = system.in_any_orientation() if any_orientation else system
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
         self._judge = Judge(self.system, CORES)

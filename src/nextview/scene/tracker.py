@@ -57,14 +57,17 @@ class Tracker:
         self._ground: Plane | None = None
         self.follow(scene)
 
-    def follow(self, scene: Scene) -> None:
-        """Take over what a scene has found: new things, and those that are lost here.
+    def follow(self, scene: Scene, since: Sequence[Tracked] = ()) -> None:
+        """Take over what a scene has found: new things and names, and things that are lost here.
 
-        A thing that is followed keeps its pose, unless it was lost or found by a search. One that
-        the scene no longer has is no longer followed.
+        A thing that is followed keeps its pose, unless it is lost. One that the scene no longer
+        has, or whose name is no longer confident, is no longer followed.
 
         Args:
             scene: with at least one frame.
+            since: ``things`` when the last frame of the scene was taken. What was followed then,
+                and rests now, takes the pose of the scene, which is of all its frames, moved as it
+                was followed since then.
 
         Raises:
             SessionError: the scene has no frame yet.
@@ -77,13 +80,20 @@ class Tracker:
         self._noise = top.noise
         self._ground = top.plane if top.shows_ground else None
 
+        starts = {thing.number: thing.pose for thing in since if not thing.lost}
         bodies = {}
         for one in scene.objects:
+            fresh = Body.of(one, self.model)
+            if fresh is None:
+                continue
             body = self._bodies.get(one.number)
-            if body is None or body.lost:
-                body = Body.of(one, self.model)
-            if body is not None:
-                bodies[one.number] = body
+            if body is None or body.lost or body.name != fresh.name:
+                body = fresh
+            elif one.number in starts and body.rests:
+                motion = body.pose @ np.linalg.inv(starts[one.number])
+                body = Body.of(one, self.model, motion)
+            assert body is not None
+            bodies[one.number] = body
         self._bodies = bodies
 
     @property

@@ -73,6 +73,7 @@ class System:
         stopping: the stopping rule.
         unknown: significance level of the test for unknown objects; 0 disables it.
         loaded: the arguments of ``load``.
+        any_orientation: whether objects are taught things that need not be in a resting pose.
 
     Example:
 
@@ -87,6 +88,7 @@ class System:
     stopping: Stopping
     unknown: float
     loaded: dict[str, Any] = field(repr=False)
+    any_orientation: bool = False
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -140,9 +142,9 @@ class System:
         drawn = int(rng.integers(len(self.sphere)))
         start = drawn if start is None else start
         options = (self.stopping, rng, object, distance, self.unknown)
-        models = _in_any_orientation(self.models) if any_orientation else self.models
+        system = self.in_any_orientation() if any_orientation else self
         session = Session(
-            models, self.policy, self.sphere, start, *options, segmentation
+            system.models, self.policy, self.sphere, start, *options, segmentation
         )
         session.limits = Limits(min_height, max_height, clearance)
         session.goal = goal
@@ -247,22 +249,32 @@ class System:
             )
         return self.session_with(what, start, seed, any_orientation).run(what)
 
+    def in_any_orientation(self) -> "System":
+        """Return the same system for taught things that may lean, or be held.
+
+        Raises:
+            ModelError: that needs known geometry, and the models have none.
+        """
+        recogniser = self.models.recogniser
+        if not isinstance(recogniser, KnowsAnyOrientation):
+            what = "things in any orientation are recognised by their geometry, and it knows none"
+            raise ModelError(f"{recogniser.name}: {what}")
+        models = replace(self.models, recogniser=recogniser.in_any_orientation)
+        return replace(self, models=models, any_orientation=True)
+
     def __repr__(self) -> str:
         name = self.models.recogniser.name
         views = len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
-        return partial(load, **self.loaded), ()
+        return partial(_reloaded, self.loaded, self.any_orientation), ()
 
 
-def _in_any_orientation(models: Models) -> Models:
-    """Return models for things in any orientation; ModelError without known geometry."""
-    recogniser = models.recogniser
-    if not isinstance(recogniser, KnowsAnyOrientation):
-        what = "things in any orientation are recognised by their geometry, and it knows none"
-        raise ModelError(f"{recogniser.name}: {what}")
-    return replace(models, recogniser=recogniser.in_any_orientation)
+def _reloaded(loaded: dict[str, Any], any_orientation: bool) -> System:
+    """Return a system that was pickled as the arguments of ``load``."""
+    system = load(**loaded)
+    return system.in_any_orientation() if any_orientation else system
 
 
 def simulated(
