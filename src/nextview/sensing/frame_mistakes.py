@@ -53,9 +53,11 @@ HEIGHT_ERROR = 0.03  # relative error of the height of a camera above a plane
 TARGET_ERROR = 0.15  # relative distance of an object's surface from its centre
 LEVEL_ERROR = np.radians(4.0)  # tilt of a level plane by errors of pose and depth
 LEVEL_NATS = -2 * np.log(LEVEL_ERROR)  # of a plane that is exactly level
-OBLIQUE = 1e-3  # share of frames whose largest plane is neither level nor vertical
+OBLIQUE = 3e-4  # share of frames whose largest plane is neither level nor vertical
 LARGE_SHARE = 1 / 3  # of the samples on a plane, so that no other one has twice as many
-INDEPENDENT_SAMPLES = 240  # of a plane, given that errors of neighbours are alike
+ALL_FLAT = (
+    320.0  # nats if all samples lie on a plane in one reading, and none in the other
+)
 INDEPENDENT_SURFACES = 15  # that two frames see
 CONFIRMED = 2.0  # nats of a surface that both frames see in the same place
 CONTRADICTED = -4.0  # nats of a surface that one frame sees through
@@ -325,16 +327,16 @@ def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
     as_read = Explained("", _facts(read))
     rare = [row for row, fact in enumerate(as_read.facts) if fact.nats <= RARE]
     mistakes = mistakes_of_frame(posed.stored, frame.pose is not None)
-    flatness = INDEPENDENT_SAMPLES * float(np.log(flatter))
+    flatness = ALL_FLAT * flatter
     if not rare and _is_beyond_doubt(as_read, read, mistakes, flatness):
         return []
 
     others = _other_worlds(read)
     for mistake in mistakes:
-        other = _undone(mistake, read, posed)
-        if mistake.kind == "range":
-            other = replace(read, flatness=flatness)
-        others.append(Explained(mistake.sentence, _facts(other), mistake.prior))
+        for other in _undone(mistake, read, posed):
+            if mistake.kind == "range":
+                other = replace(read, flatness=flatness)
+            others.append(Explained(mistake.sentence, _facts(other), mistake.prior))
     odds = np.exp([min(one.nats - as_read.nats, 500) for one in others])
     right = 1 / (1 + odds.sum())
     if right >= WARNED:
@@ -345,7 +347,8 @@ def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
     best = max(others, key=lambda one: one.nats)
     gains = _gains(best, as_read, range(len(FACTS)))
     facts = [as_read.facts[row] for row in gains]
-    named = [one.sentence for one in others if one.nats > best.nats - AS_LIKELY]
+    likely = [one.sentence for one in others if one.nats > best.nats - AS_LIKELY]
+    named = dict.fromkeys(likely)
     words = f"{', and '.join(fact.words for fact in facts)}: {'; or '.join(named)}"
     if right < REFUSED:
         raise ObservationError(words)
@@ -376,21 +379,25 @@ def _is_beyond_doubt(
     return bool(np.log(prior) + most < as_read.nats)
 
 
-def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> Reading:
-    """Return the reading of a frame with a mistake undone.
+def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> list[Reading]:
+    """Return the readings of a frame with a mistake undone.
 
-    A wrong unit is in all frames; another mistake in a pose is in that of the new frame alone.
+    A mistake in a pose may be in that of the new frame alone, a wrong unit also in that of the last
+    one. The depth of both frames is in one unit.
     """
     right = mistake.undone(posed)
-    if mistake.scale == 1:
-        right = right.with_poses(np.stack([read.last_pose, right.poses[1]]))
-    other = replace(read, pose=right.poses[1], last_pose=right.poses[0])
-    if mistake.scale > 1:
-        other = replace(read, depth_scale=1 / mistake.scale)
-    if not posed.views or mistake.kind == "range":
-        return other
-    static = read.agreement > 0 or in_one_place(right)
-    return replace(other, agreement=CHANGED if static else _agreement(right))
+    alone = right.with_poses(np.stack([read.last_pose, right.poses[1]]))
+    found = []
+    for one in (alone, right) if mistake.scale < 1 else (alone,):
+        other = replace(read, pose=one.poses[1], last_pose=one.poses[0])
+        if mistake.scale > 1:
+            other = replace(read, depth_scale=1 / mistake.scale)
+            one = right
+        if posed.views and mistake.kind != "range":
+            static = read.agreement > 0 or in_one_place(one)
+            other = replace(other, agreement=CHANGED if static else _agreement(one))
+        found.append(other)
+    return found
 
 
 def _other_worlds(read: Reading) -> list[Explained]:
@@ -425,8 +432,8 @@ def _surfaces(seen: SegmentedFrame, up: Float | None) -> tuple[Plane | None, flo
     A level plane is taken for the largest one unless another has twice as many samples.
 
     Returns:
-        The plane; None if there is none. How many times more samples are on a plane if the depth is
-        read as range along each ray.
+        The plane; None if there is none. The share of samples that lie on a plane only if the depth
+        is read as range along each ray.
     """
     frame = seen.frame
     samples = seen.surface_samples

@@ -55,7 +55,7 @@ as millimetres.
 """
 # Of frames in 16 bits, one in twenty is not in millimetres: each of the five factors.
 STEPS_PRIOR = 0.01
-HALF_INVERSE = 1e-4  # prior of a pose of which one half is inverse
+UNUSUAL = 1e-4  # prior of centimetres, and of a pose of which one half is inverse
 # factors that are tried together with another mistake
 COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
 # a factor above this is rarely an error of the depth unit, and often one of the unit of length
@@ -394,7 +394,8 @@ def mistakes_of_frame(stored: Stored, has_pose: bool) -> tuple[Mistake, ...]:
         return found
     return (
         *found,
-        *of_one_frame((0.001, 0.01)),
+        *of_one_frame((0.001,)),
+        *(replace(one, prior=UNUSUAL) for one in of_one_frame((0.01,))),
         *mistakes_in_poses(),
         *_mistakes_in_quaternions(),
         *_mirrored_pictures(),
@@ -448,14 +449,14 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
             "inverse",
             f"the rotations are inverse: {wrong} only the translations are",
             _posed(_in_stored(_rotation_inverted, to_world)),
-            prior=HALF_INVERSE,
+            prior=UNUSUAL,
         ),
         Mistake(
             "inverse translation",
             "inverse",
             f"the translations are those of inverse poses: {wrong} only the rotations are",
             _posed(_in_stored(_translation_inverted, to_world)),
-            prior=HALF_INVERSE,
+            prior=UNUSUAL,
         ),
         Mistake(
             "opengl axes",
@@ -566,16 +567,16 @@ def _scale_in_words(scale: float, stored: Stored, median_depth: float) -> str:
 
     times = max(scale, 1 / scale)
     size = "large" if scale > 1 else "small"
-    depths = f"the depth is {times:g} times too {size}: "
     if stored.step:
-        depths += (
+        why = (
             f"its steps are of {1000 * stored.step / scale:.3g} mm, not of"
             f" {1000 * stored.step:.3g} mm ({stored.step_told_by})"
         )
     else:
         own = _nearest_unit(1 / scale)
         named = abs(np.log(own * scale)) < 0.01
-        depths += f"is it in {UNIT_NAMES[own] if named else 'another unit'}"
+        why = f"is it in {UNIT_NAMES[own] if named else 'another unit'}"
+    depths = f"the depth is {times:g} times too {size}: {why}"
     if not translations or not _is_plausible(median_depth):
         return depths
     return translations if times >= NEVER_A_DEPTH else f"{depths}; or {translations}"

@@ -290,7 +290,7 @@ def gain_as_range(
     rng: Generator,
     up: Float | None,
 ) -> float:
-    """Return how many times more samples lie on a plane with the depth read as range, at least 1.
+    """Return the share of samples that lie on a plane only with the depth read as range.
 
     Args:
         frame: the frame.
@@ -309,7 +309,7 @@ def gain_as_range(
     other = find_plane(nearer, deepcopy(rng), up)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
     if other is None or other.holds(nearer).mean() <= usual:
-        return 1.0
+        return 0.0
 
     # The two readings may find different planes of a room, so each plane is compared for both.
     share = held = 0.0
@@ -321,7 +321,7 @@ def gain_as_range(
             continue
         share = max(share, _share_held(samples, on, found.normal))
         held = max(held, _share_held(nearer, on, found.normal))
-    return max(1.0, held / max(share, 1 / len(samples.points)))
+    return max(0.0, held - share)
 
 
 def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
