@@ -193,13 +193,14 @@ def target(reading: Reading) -> Fact:
         )
         return Fact(IMPOSSIBLE, words)
 
+    words = "nothing is seen where the target is"
     around = _around(reading.frame, in_camera)
     if not len(around):
-        return Fact()
+        return Fact(0.0, words)
     there = reading.depth_scale * float(np.median(around))
     found = _coincidence(np.log(there / in_camera[2]), TARGET_ERROR)
     if min(there, reading.nearest) < BEHIND * (in_camera[2] + radius):
-        return Fact(found)
+        return Fact(found, words)
     return Fact(RARE, "all that is seen is far behind the target", "unit")
 
 
@@ -340,27 +341,25 @@ def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
     odds = np.exp([min(one.nats - as_read.nats, 500) for one in others])
     right = 1 / (1 + odds.sum())
     if right >= WARNED:
-        others = [one for one in others if _gains(one, as_read, rare)]
+        others = [one for one in others if any(_gains(one, as_read)[rare] > TOLD)]
         if not others:
             return []
 
     best = max(others, key=lambda one: one.nats)
-    gains = _gains(best, as_read, range(len(FACTS)))
-    facts = [as_read.facts[row] for row in gains]
+    gains = _gains(best, as_read)
+    told = [row for row in np.argsort(-gains) if gains[row] >= min(TOLD, gains.max())]
+    facts = [as_read.facts[row] for row in told]
     likely = [one.sentence for one in others if one.nats > best.nats - AS_LIKELY]
-    named = dict.fromkeys(likely)
+    named = dict.fromkeys(likely)  # each once
     words = f"{', and '.join(fact.words for fact in facts)}: {'; or '.join(named)}"
     if right < REFUSED:
         raise ObservationError(words)
     return [ViewWarning(facts[0].warning, f"{words}?")]
 
 
-def _gains(one: Explained, as_read: Explained, rows: Sequence[int]) -> list[int]:
-    """Return the facts for which a reading has much more evidence, the most first."""
-    gains = {row: one.facts[row].nats - as_read.facts[row].nats for row in rows}
-    return sorted(
-        (row for row in rows if gains[row] > TOLD), key=lambda row: -gains[row]
-    )
+def _gains(one: Explained, as_read: Explained) -> Float:
+    """Return the gain of evidence of each fact by a reading, nats."""
+    return np.array([fact.nats for fact in one.facts]) - [f.nats for f in as_read.facts]
 
 
 def _is_beyond_doubt(

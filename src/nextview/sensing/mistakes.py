@@ -202,7 +202,6 @@ def likeliest(
     posed: PosedViews,
     mistakes: Sequence[Mistake],
     as_read: Agreement,
-    part: Mask | None = None,
 ) -> Mistake | None:
     """Return the mistake whose correction confirms most points, if it explains enough.
 
@@ -210,16 +209,11 @@ def likeliest(
         posed: frames and poses as read.
         mistakes: candidates.
         as_read: agreement of the frames as read.
-        part: frames that may have the mistake, (N,) bool; all by default.
     """
     best = None
     most_confirmed = 0.0
     for mistake in mistakes:
         right = mistake.undone(posed)
-        if part is not None:
-            right = right.with_poses(
-                np.where(part[:, None, None], right.poses, posed.poses)
-            )
         if in_one_place(right):
             continue
 

@@ -9,8 +9,8 @@ class ViewWarning:
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
     "contradiction" and "repeated"; for frames "intrinsics", "unit", "far origin", "pose",
-    "support", "point", "size", "stale pose", "displaced", "lean" and "camera". The warnings of scenes
-    are listed on the page about tables.
+    "support", "point", "size", "stale pose", "displaced", "lean" and "camera". The
+    warnings of scenes are listed on the page about tables.
 
     Attributes:
         name: one of these.
