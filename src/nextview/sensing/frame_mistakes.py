@@ -51,7 +51,7 @@ UNKNOWN_LENGTHS = np.log(
 )  # range of lengths of which nothing is known, 1 mm to 1 km
 HEIGHT_ERROR = 0.03  # relative error of the height of a camera above a plane
 TARGET_ERROR = 0.15  # relative distance of an object's surface from its centre
-LEVEL_ERROR = np.radians(4.0)  # tilt of a level plane by errors of pose and depth
+LEVEL_ERROR = np.radians(3.0)  # tilt of a level plane by errors of pose and depth
 LEVEL_NATS = -2 * np.log(LEVEL_ERROR)  # of a plane that is exactly level
 OBLIQUE = 3e-4  # share of frames whose largest plane is neither level nor vertical
 LARGE_SHARE = 1 / 3  # of the samples on a plane, so that no other one has twice as many
@@ -393,8 +393,11 @@ def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> list[Reading]
             other = replace(read, depth_scale=1 / mistake.scale)
             one = right
         if posed.views and mistake.kind != "range":
-            static = read.agreement > 0 or in_one_place(one)
-            other = replace(other, agreement=CHANGED if static else _agreement(one))
+            # Where the last pose is confirmed, no other one agrees.
+            nats = CHANGED
+            if read.agreement <= 0:
+                nats = 0.0 if in_one_place(one) else _agreement(one)
+            other = replace(other, agreement=nats)
         found.append(other)
     return found
 
