@@ -26,8 +26,10 @@ from nextview.sensing import (
     check_views,
 )
 from nextview.sensing.facets import fit_facets
-from nextview.sensing.plausibility import check_frame, refuse_far
+from nextview.sensing.frame_mistakes import Known, check_mistakes
+from nextview.sensing.plausibility import check_frame
 from nextview.sensing.resampling import look_again, virtual_pose
+from nextview.sensing.segmented_frame import without_surfaces
 
 WEDGE = trimesh.util.concatenate(
     [box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))]
@@ -411,10 +413,7 @@ def test_poses_in_millimetres_are_rejected_by_the_target_or_another_frame():
         ):
             ObservedObject(**target).add(in_millimetres(first))
     # The camera's height over the table tells, if the world has its origin there.
-    with pytest.raises(
-        ObservationError,
-        match=r"0.45 m in millimetres: the pose is in milli",
-    ):
+    with pytest.raises(ObservationError, match=r"world's origin.* in millimetres"):
         ObservedObject().add(in_millimetres(first))
 
     thing = ObservedObject()
@@ -457,18 +456,16 @@ def test_a_wrong_unit_of_sixteen_bit_depth_is_rejected_with_the_depth_scale(step
             pixel_centre=0.5,
         )
 
-    said = f"{1 / steps:g} times too large: its steps look like {steps:g} mm"
+    said = f"{1 / steps:g} times too large: its steps are of {steps:g} mm"
     for target in ({"point": (0, 0, 0.1)}, {"known": true_frame(WEDGE)}):
         with pytest.raises(ObservationError, match=said):
             ObservedObject(**target).add(counted(25, steps))
     with pytest.raises(ObservationError, match=said):
-        refuse_far(counted(60, steps), counted(25, steps), None, 0.0)
+        check_mistakes(without_surfaces(counted(60, steps)), Known(counted(25, steps)))
     alone = ObservedObject()
     alone.add(counted(25, steps))
     assert [warning.name for warning in alone.warnings] == ["unit"]
-    assert (
-        f"are the steps of the uint16 depth {steps:g} mm?" in alone.warnings[0].message
-    )
+    assert said in alone.warnings[0].message
     for target in ({}, {"point": (0, 0, 0.1)}):
         thing = ObservedObject(**target)
         thing.add(counted(25, 1))

@@ -164,6 +164,15 @@ def test_a_level_that_a_frame_does_not_show_still_carries(small_table):
     assert after.ground(frame.depth > 0, None) is after.carriers[0]
 
 
+def test_an_object_on_another_one_does_not_choose_the_ground(small_table):
+    camera = LabelledCamera(small_table)
+    seen = supports_of(camera, camera.frame(looking_at((0, 0, 0.45), distance=1.0)))
+    top_of_another = replace(seen.carriers[0])
+    stacked = replace(seen, carriers=(top_of_another, *seen.carriers[1:]))
+    inside = np.ones(seen.frame.shape, bool)
+    assert stacked.ground(inside, None) is seen.carriers[1]
+
+
 def test_without_a_surface_there_is_no_support(ycb, small_table):
     camera = LabelledCamera(small_table)
     frame = camera.frame(looking_at((0, 0, 0.45), distance=1.0))

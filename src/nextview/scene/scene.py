@@ -377,7 +377,7 @@ class Scene:
         before = self._state
         top = self._top_of(frame, before.tops)
         shown = top.plane if top.shows_ground else None
-        top = replace(top, warnings=tuple(known.check(frame, shown)))
+        top = replace(top, warnings=(*top.warnings, *known.check(frame, shown)))
         state, look = self._after(before, top)
         self._state = state
         self._changed()
@@ -476,7 +476,7 @@ class Scene:
         """Segment a frame, and find its surfaces and its ground.
 
         Raises:
-            ObservationError: there is no ground.
+            ObservationError: there is no ground, or the frame was read with a mistake.
         """
         inside = frame.depth > 0 if frame.mask is None else frame.mask
         if self.region is not None:
@@ -493,7 +493,9 @@ class Scene:
             up,
             () if earlier is None else earlier.seen.levels,
         )
-        return TableTop.of(seen, self.up, earlier, inside, self._widest)
+        warnings = tuple(self._known_frames.check_mistakes(seen))
+        top = TableTop.of(seen, self.up, earlier, inside, self._widest)
+        return replace(top, warnings=warnings)
 
     def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
         """Return the scene after a frame; a frame that does not fit is left out.

@@ -11,16 +11,15 @@ from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.frame import Frame, one_stand
+from nextview.sensing.frame_mistakes import Known, check_mistakes
 from nextview.sensing.lean import lean_of
 from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
     check_frame,
     check_lean,
     check_pose_moved,
-    check_steps,
-    refuse_far,
-    refuse_millimetres,
 )
+from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
@@ -50,8 +49,7 @@ class KnownFrames:
             frame: new frame.
 
         Raises:
-            ObservationError: the type is wrong, the pose is missing, the camera is too far away, or
-                the depth is several times too large.
+            ObservationError: the type is wrong, or the pose is missing.
         """
         if not isinstance(frame, Frame):
             raise ObservationError(
@@ -61,8 +59,23 @@ class KnownFrames:
             raise ObservationError(
                 "a second frame needs a pose, and the first one too: how else do they fit together?"
             )
+
+    def check_mistakes(self, seen: SegmentedFrame) -> list[ViewWarning]:
+        """Warn if a frame was probably read with a mistake, see ``frame_mistakes``.
+
+        Args:
+            seen: new frame with its surfaces.
+
+        Raises:
+            ObservationError: it certainly was.
+        """
         last = self.frames[-1] if self.frames else None
-        refuse_far(frame, last, self.target, self.radius)
+        up = self.up
+        if up is None and self.frames:
+            shown = [plane for plane in self.planes if plane is not None]
+            up = shown[0].normal if shown else None
+        up = None if seen.frame.pose is None else up
+        return check_mistakes(seen, Known(last, up, self.target, self.radius))
 
     def check(self, frame: Frame, plane: Plane | None) -> list[ViewWarning]:
         """Return likely problems of a frame that was not rejected; usually empty.
@@ -70,9 +83,6 @@ class KnownFrames:
         Args:
             frame: new frame.
             plane: the support plane in this frame; None if it is not visible.
-
-        Raises:
-            ObservationError: the pose is in millimetres.
         """
         warnings = check_frame(frame)
         own = [one for one in self.frames if one.camera == frame.camera]
@@ -81,11 +91,6 @@ class KnownFrames:
         if frame.pose is None:
             return warnings
         warnings += self._check_cameras(frame)
-        if plane is not None and not self.frames:
-            up = plane.normal if self.up is None else self.up
-            height = float(plane.height(frame.pose[:3, 3]))
-            refuse_millimetres(frame.pose, height, up)
-            warnings += check_steps(frame, height, up)
         return warnings + self._check_lean(frame, plane)
 
     def stands(self, frame: Frame) -> bool:

@@ -8,6 +8,7 @@ has a magnitude.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import minimize
@@ -17,9 +18,8 @@ from nextview.sensing.agreement import (
     Agreement,
     SurfaceView,
     compare,
-    quick_view,
 )
-from nextview.sensing.frame import CAMERA_AXES, SAME_POSE, Frame
+from nextview.sensing.frame import CAMERA_AXES, SAME_POSE
 from nextview.types import Float, Index, Mask
 
 # A mistake explains contradictions if undoing it leaves at most this share of them, ...
@@ -35,8 +35,6 @@ NO_OVERLAP = 0.25
 # Least confirmed share once a mistake is undone. Usual calibration errors leave .88; for real
 # frames with shuffled poses, no mistake gives more than .2.
 WELL_EXPLAINED = 0.75
-# least confirmed share of two frames of a mostly static scene
-HALF_AGREES = 0.5
 # Cameras closer than this, relative to the depth, count as being in one place.
 ONE_PLACE = 0.02
 
@@ -51,6 +49,13 @@ DEPTH_SCALES = (1000, 100, 10, 8, 5, 4, 2.5, 2, 0.5, 0.4, 0.25, 0.2, 0.1, 0.01, 
 """Factors by which the depth may be too large. The depth units of cameras are 1, 0.5, 0.25, 0.2,
 0.125 and 0.1 mm.
 """
+TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
+"""Factors by which depth is too large if 16-bit units of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are read
+as millimetres.
+"""
+# Of frames in 16 bits, one in twenty is not in millimetres: each of the five factors.
+STEPS_PRIOR = 0.01
+UNUSUAL = 1e-4  # prior of centimetres, and of a pose of which one half is inverse
 # factors that are tried together with another mistake
 COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
 # a factor above this is rarely an error of the depth unit, and often one of the unit of length
@@ -135,6 +140,7 @@ class Mistake:
         undone: function that corrects the input.
         alone: whether it is never combined with another mistake.
         scale: factor by which the depth is too large, or the translations are too small.
+        prior: probability that a frame has it.
     """
 
     name: str
@@ -143,6 +149,7 @@ class Mistake:
     undone: Callable[[PosedViews], PosedViews]
     alone: bool = False
     scale: float = 1.0
+    prior: float = 1e-3
 
     def right_pose(self, pose: Float) -> Float:
         """Return the corrected pose, camera-to-world, (4, 4)."""
@@ -178,7 +185,7 @@ def find_mistake(posed: PosedViews) -> Mistake | None:
         The mistake; None if the frames agree, or no mistake explains the contradictions.
     """
     as_read = compare(posed.views, posed.poses)
-    overlap = as_read.judged / max(_judgeable(posed.views), 1)
+    overlap = as_read.judged / max(judgeable(posed.views), 1)
     if overlap > NO_OVERLAP and 1 - as_read.share < LEAST_CONTRADICTED:
         return None
     single = usual_mistakes(posed)
@@ -195,7 +202,6 @@ def likeliest(
     posed: PosedViews,
     mistakes: Sequence[Mistake],
     as_read: Agreement,
-    part: Mask | None = None,
 ) -> Mistake | None:
     """Return the mistake whose correction confirms most points, if it explains enough.
 
@@ -203,17 +209,12 @@ def likeliest(
         posed: frames and poses as read.
         mistakes: candidates.
         as_read: agreement of the frames as read.
-        part: frames that may have the mistake, (N,) bool; all by default.
     """
     best = None
     most_confirmed = 0.0
     for mistake in mistakes:
         right = mistake.undone(posed)
-        if part is not None:
-            right = right.with_poses(
-                np.where(part[:, None, None], right.poses, posed.poses)
-            )
-        if _in_one_place(right):
+        if in_one_place(right):
             continue
 
         changed = relative_change(posed.poses, right.poses)
@@ -225,41 +226,6 @@ def likeliest(
             best = mistake
             most_confirmed = confirmed
     return best
-
-
-def mistake_between(
-    frame: Frame, last: Frame, scales: Sequence[float]
-) -> Mistake | None:
-    """Return the mistake without which a frame agrees with the previous one.
-
-    It may be in the depth of both frames, or in the pose of the new one. Frames with at least half
-    agreement have no mistake, since objects in view may move.
-
-    Args:
-        frame: a frame with a pose.
-        last: the previous frame.
-        scales: factors by which the depth may be too large.
-
-    Returns:
-        The mistake; None if the frames agree, or no mistake explains the contradictions.
-    """
-    views = [quick_view(one) for one in (last, frame)]
-    poses = np.stack([last.camera_to_world, frame.camera_to_world])
-    posed = PosedViews(views, poses)
-    as_read = compare(views, poses)
-    if as_read.judged >= LEAST_EXPLAINED and as_read.share > HALF_AGREES:
-        return None
-
-    in_depth = _scales(posed, scales)
-    in_pose = [
-        *mistakes_in_poses(),
-        *_mistakes_in_quaternions(),
-        *_mirrored_pictures(),
-    ]
-    of_last = np.array([False, True])
-    return likeliest(posed, in_depth, as_read) or likeliest(
-        posed, in_pose, as_read, of_last
-    )
 
 
 def explains(before: Agreement, after: Agreement) -> bool:
@@ -287,7 +253,7 @@ def _explains_all(
     if after.judged < LEAST_EXPLAINED or after.share < WELL_EXPLAINED:
         return False
     count = len(posed.views)
-    possible = _judgeable(posed.views) * changed.sum() / max(count * (count - 1), 1)
+    possible = judgeable(posed.views) * changed.sum() / max(count * (count - 1), 1)
     looks_past = (
         before.judged < NO_OVERLAP * after.judged
         and after.judged > NO_OVERLAP * possible
@@ -347,12 +313,12 @@ def relative_change(poses: Float, others: Float) -> Mask:
     return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE
 
 
-def _judgeable(views: Sequence[SurfaceView]) -> float:
+def judgeable(views: Sequence[SurfaceView]) -> float:
     """Return the number of judgements if all frames saw all points, with both tolerances."""
     return 2.0 * sum(len(view.points) for view in views) * (len(views) - 1)
 
 
-def _in_one_place(posed: PosedViews) -> bool:
+def in_one_place(posed: PosedViews) -> bool:
     """Return True if all cameras are in one place, where rotations cannot be verified."""
     places = posed.poses[:, :3, 3]
     apart = np.linalg.norm(places - np.median(places, 0), axis=1)
@@ -396,8 +362,38 @@ def usual_mistakes(posed: PosedViews) -> list[Mistake]:
         *mistakes_in_poses(posed.stored.to_world),
         *_mistakes_in_quaternions(),
         *_mirrored_pictures(),
-        *_scales(posed, _all_scales(posed.stored)),
+        *_scales(posed.stored, posed.median_depth, _all_scales(posed.stored)),
     ]
+
+
+@cache
+def mistakes_of_frame(stored: Stored, has_pose: bool) -> tuple[Mistake, ...]:
+    """Return all mistakes that a single frame may have.
+
+    Args:
+        stored: storage conventions of the frame.
+        has_pose: whether it has a pose.
+    """
+    along_rays = (
+        "the depth is measured along the rays, a range: give it along the optical axis"
+    )
+    of_one_frame = partial(_scales, stored, 1.0)
+    steps = STEPS_PRIOR if stored.step else Mistake.prior
+    found = (
+        Mistake("range", "range", along_rays, lambda posed: posed),
+        *(replace(one, prior=steps) for one in of_one_frame(TIMES_TOO_LARGE)),
+        *of_one_frame((1 / 0.3048, 1 / 0.0254)),
+    )
+    if not has_pose:
+        return found
+    return (
+        *found,
+        *of_one_frame((0.001,)),
+        *(replace(one, prior=UNUSUAL) for one in of_one_frame((0.01,))),
+        *mistakes_in_poses(),
+        *_mistakes_in_quaternions(),
+        *_mirrored_pictures(),
+    )
 
 
 def fitted_mistakes(focal_length: float) -> dict[str, FittedMistake]:
@@ -447,12 +443,14 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
             "inverse",
             f"the rotations are inverse: {wrong} only the translations are",
             _posed(_in_stored(_rotation_inverted, to_world)),
+            prior=UNUSUAL,
         ),
         Mistake(
             "inverse translation",
             "inverse",
             f"the translations are those of inverse poses: {wrong} only the rotations are",
             _posed(_in_stored(_translation_inverted, to_world)),
+            prior=UNUSUAL,
         ),
         Mistake(
             "opengl axes",
@@ -533,13 +531,15 @@ def _all_scales(stored: Stored) -> list[float]:
     return sorted(units | set(DEPTH_SCALES))
 
 
-def _scales(posed: PosedViews, scales: Sequence[float]) -> list[Mistake]:
+def _scales(
+    stored: Stored, median_depth: float, scales: Sequence[float]
+) -> list[Mistake]:
     """Return mistakes in the unit of translations or of depth, which are equivalent up to scale."""
     return [
         Mistake(
             f"scale {scale:g}",
             "scale",
-            _scale_in_words(scale, posed),
+            _scale_in_words(scale, stored, median_depth),
             _posed(_scaled(scale)),
             alone=scale not in COMMON_SCALES,
             scale=scale,
@@ -548,11 +548,10 @@ def _scales(posed: PosedViews, scales: Sequence[float]) -> list[Mistake]:
     ]
 
 
-def _scale_in_words(scale: float, posed: PosedViews) -> str:
+def _scale_in_words(scale: float, stored: Stored, median_depth: float) -> str:
     """Describe the correction: multiply translations by a scale, or divide depths by it."""
-    stored = posed.stored
     unit = stored.unit * scale
-    other = min(UNIT_NAMES, key=lambda each: abs(np.log(each / unit)))
+    other = _nearest_unit(unit)
     translations = ""
     if abs(np.log(other / unit)) < 0.01:
         translations = (
@@ -562,14 +561,23 @@ def _scale_in_words(scale: float, posed: PosedViews) -> str:
 
     times = max(scale, 1 / scale)
     size = "large" if scale > 1 else "small"
-    depths = (
-        f"the depth is {times:g} times too {size}: its steps are of"
-        f" {1000 * stored.step / scale:.3g} mm, not of {1000 * stored.step:.3g} mm"
-        f" ({stored.step_told_by})"
-    )
-    if not translations or not _is_plausible(posed.median_depth):
+    if stored.step:
+        why = (
+            f"its steps are of {1000 * stored.step / scale:.3g} mm, not of"
+            f" {1000 * stored.step:.3g} mm ({stored.step_told_by})"
+        )
+    else:
+        own = _nearest_unit(1 / scale)
+        named = abs(np.log(own * scale)) < 0.01
+        why = f"is it in {UNIT_NAMES[own] if named else 'another unit'}"
+    depths = f"the depth is {times:g} times too {size}: {why}"
+    if not translations or not _is_plausible(median_depth):
         return depths
     return translations if times >= NEVER_A_DEPTH else f"{depths}; or {translations}"
+
+
+def _nearest_unit(unit: float) -> float:
+    return min(UNIT_NAMES, key=lambda each: abs(np.log(each / unit)))
 
 
 def _is_plausible(depth: float) -> bool:

@@ -41,7 +41,6 @@ from nextview.sensing.sighting import (
     object_frame_of,
     sighting_of,
 )
-from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
@@ -216,6 +215,7 @@ class ObservedObject:
 
         up = self._up(frame)
         segmented = self._segmented(frame, up)
+        warnings = known.check_mistakes(segmented)
         parting = before.parting
         pixels = self._pixels(segmented, parting)
         partings: tuple[Parting, ...] = ()
@@ -225,13 +225,13 @@ class ObservedObject:
                 for other in get_args(Parting)
                 if other != parting and _differ(pixels, self._pixels(segmented, other))
             )
-        plane = self._plane_under(pixels, segmented, up)
+        plane = self._plane_under(pixels, segmented)
         if up is None and plane is None:
             raise ObservationError(
                 "no support plane is seen, so there is no telling where up is: give it, and the"
                 " camera's pose"
             )
-        warnings = known.check(frame, plane)
+        warnings += known.check(frame, plane)
 
         mask = self._without_plane(pixels, segmented, plane)
         seen = sighting_of(frame, mask, plane, segmented.noise, self.denoise)
@@ -347,21 +347,15 @@ class ObservedObject:
             raise ObservationError(NO_OUTLINE)
         return choose_instance(seen, self.point, self.state.frame, parting)
 
-    def _plane_under(
-        self, pixels: Mask, seen: SegmentedFrame, up: Float | None
-    ) -> Plane | None:
+    def _plane_under(self, pixels: Mask, seen: SegmentedFrame) -> Plane | None:
         """Return the support plane of the object, by earlier frames if this one does not show it.
 
         Returns:
             The plane; None if no frame shows it.
-
-        Raises:
-            ObservationError: the pose is wrong, or the depth is a range.
         """
         if not self.support:
             return None
         level = seen.under(pixels, stands=True)
-        refuse_mistakes(seen, None if level is None else level.plane, up)
         if level is not None:
             return level.plane
         earlier = [one.plane for one in self.sightings if one.plane is not None]

@@ -20,8 +20,6 @@ STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # least share of the samples on a support plane; more if gravity is not known
 LEAST_SUPPORT = 0.04
 LEAST_ALONE = 0.15
-# least gain of samples on a plane if depth is read as range: small, as narrow lenses bend it little
-RANGE = 1.05
 BLOCKS_SAMPLED = (
     1500  # approximate number of blocks of pixels in which planes are searched
 )
@@ -285,15 +283,14 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
     return plane
 
 
-def lies_better_as_range(
+def gain_as_range(
     frame: Frame,
     plane: Plane | None,
     samples: Samples,
     rng: Generator,
     up: Float | None,
-    above: Float | None = None,
-) -> bool:
-    """Return True if a frame fits a plane better with its depth read as range along each ray.
+) -> float:
+    """Return the share of samples that lie on a plane only with the depth read as range.
 
     Args:
         frame: the frame.
@@ -301,7 +298,6 @@ def lies_better_as_range(
         samples: of the frame.
         rng: source of all random numbers.
         up: direction against gravity, (3,); None if it is not known.
-        above: point above the plane, (3,); None for none.
     """
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
@@ -310,10 +306,10 @@ def lies_better_as_range(
         points=samples.camera
         + along * (depth / np.linalg.norm(along, axis=1))[:, None],
     )
-    other = find_plane(nearer, deepcopy(rng), up, above)
+    other = find_plane(nearer, deepcopy(rng), up)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
-    if other is None or other.holds(nearer).mean() <= RANGE * usual:
-        return False
+    if other is None or other.holds(nearer).mean() <= usual:
+        return 0.0
 
     # The two readings may find different planes of a room, so each plane is compared for both.
     share = held = 0.0
@@ -325,7 +321,7 @@ def lies_better_as_range(
             continue
         share = max(share, _share_held(samples, on, found.normal))
         held = max(held, _share_held(nearer, on, found.normal))
-    return held > RANGE * share
+    return max(0.0, held - share)
 
 
 def _share_held(samples: Samples, on: Mask, normal: Float) -> float:

@@ -1,16 +1,15 @@
-"""Reject implausible frames, and name the likely mistake behind an observation."""
+"""Warn of implausible views and observations, and name the likely mistake."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.lean import Lean
-from nextview.sensing.mistakes import mistake_between, mistakes_in_poses
+from nextview.sensing.mistakes import mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
@@ -24,199 +23,13 @@ CONTRADICTION = 0.2
 COMPARED_VIEWS = 3  # earlier views with which the last one is compared
 # largest offset of the principal point from the centre of an uncropped image, in half sides
 OFF_CENTRE = 0.25
-# metres, median depth beyond the range of most depth cameras
-FAR_DEPTH = 10.0
 # object radii, largest horizontal distance of the selecting point from the object
 FARTHEST_POINT_ASIDE = 3.0
-# largest distance of an object as a multiple of the farthest depth in the frame
-TOO_FAR = 2.5
 CHANGED = 0.04
 CHANGED_SHARE = 0.03
 """Relative change of a changed pixel's depth, and share of changed pixels in a changed image."""
-TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
-"""Factors by which depth is too large if 16-bit units of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are read
-as millimetres.
-"""
-NOTHING_NEARER = 1.2
-MUCH_FARTHER = 1.7
-"""Multiples of the target distance. If depth is too large, nothing is nearer than the first, and
-the surface at the target's pixels is at least as far as the second.
-"""
-# metres from the world origin: workspace of robots; larger positions may be in millimetres
-FAR_ORIGIN = 30.0
-# largest distance of a robot's camera from the world origin, millimetres
-FARTHEST_MILLIMETRES = 20_000.0
-SAME_HEIGHT = 0.1  # relative tolerance of equal heights
-SAME_STEPS = 0.03  # the same for heights that identify the depth unit
 # factor above which a ratio of radii is closer to ten than to one
 ORDER_OF_SIZE = np.sqrt(10)
-
-
-def refuse_far(
-    frame: Frame,
-    last: Frame | None,
-    target: Float | None,
-    radius: float,
-) -> None:
-    """Reject a camera that is much farther away than anything it measures.
-
-    Args:
-        frame: the frame.
-        last: the previous frame; None for a first one.
-        target: expected position of the object, world, (3,); None if not known.
-        radius: of the object, metres.
-
-    Raises:
-        ObservationError: the camera is too far from its last position, or from its target.
-    """
-    camera = frame.camera_to_world[:3, 3]
-    farthest = float(frame.depth.max())
-    if last is not None:
-        moved = np.linalg.norm(camera - last.camera_to_world[:3, 3])
-        reach = farthest + float(last.depth.max())
-        if moved > TOO_FAR * reach:
-            what = (
-                f"the camera is {moved:.0f} m from where it was, and what it sees is within"
-                f" {reach:.1f} m"
-            )
-            raise ObservationError(f"{what}: is the pose in millimetres?")
-    distance = (
-        0.0
-        if target is None or frame.mask is not None
-        else np.linalg.norm(target - camera)
-    )
-    if distance - radius > TOO_FAR * farthest:
-        what = (
-            f"the target is {distance:.0f} m away, and nothing in the frame is farther than"
-            f" {farthest:.1f} m"
-        )
-        raise ObservationError(
-            f"{what}: is the pose in millimetres, or are target and pose of different worlds?"
-        )
-
-    refuse_mistake(frame, last, target, radius)
-
-
-def refuse_millimetres(pose: Float, height: float, up: Float) -> None:
-    """Reject a first pose in millimetres: its height is a thousand times that above the support.
-
-    Args:
-        pose: camera-to-world, (4, 4).
-        height: of the camera above the support plane according to the depth, metres.
-        up: against gravity, world, (3,).
-    """
-    place = pose[:3, 3]
-    origin = float(np.linalg.norm(place))
-    in_metres = float(place @ up) / 1000
-    near = abs(in_metres - height) < SAME_HEIGHT * height
-    if FAR_ORIGIN < origin < FARTHEST_MILLIMETRES and near:
-        raise ObservationError(
-            f"the camera is {origin:.0f} m from the world's origin and {height:.2g} m above the"
-            f" support, which is {in_metres:.2g} m in millimetres: the pose is in millimetres"
-        )
-
-
-def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
-    """Warn if 16-bit depth in another unit than millimetres would fit the pose.
-
-    If depth is several times too large, the support plane is too far below the camera. With the
-    right unit it is level with the world origin, as a robot's base or table often is.
-
-    Args:
-        frame: the first frame, with a pose.
-        height: of the camera above the support plane according to the depth, metres.
-        up: against gravity, world, (3,).
-    """
-    stands = float(frame.camera_to_world[:3, 3] @ up)
-    if not frame.counted or stands <= 0:
-        return []
-    for times in TIMES_TOO_LARGE:
-        if abs(height / times - stands) < SAME_STEPS * stands:
-            return [
-                ViewWarning(
-                    "unit",
-                    f"the support lies {height - stands:.2g} m below the world's origin, and level"
-                    f" with it if the depth is {times:g} times too large: are the steps of the"
-                    f" uint16 depth {1 / times:.3g} mm?",
-                )
-            ]
-    return []
-
-
-def refuse_mistake(
-    frame: Frame,
-    last: Frame | None,
-    target: Float | None,
-    radius: float,
-) -> None:
-    """Reject depth that is several times too large, and poses with an identifiable mistake.
-
-    16-bit depth in units smaller than a millimetre is read as too large. This is detected if
-    everything visible is behind the target, at a multiple of its distance; or if the frame and the
-    previous one contradict each other, but agree with smaller depth.
-
-    Args:
-        frame: the frame.
-        last: the previous frame; None for a first one.
-        target: expected position of the object, world, (3,); None if not known.
-        radius: of the object, metres.
-
-    Raises:
-        ObservationError: the depth is too large, with the likely factor; or another mistake.
-    """
-    times = 0.0
-    if target is not None and frame.mask is None:
-        times = _times_behind(frame, target, radius)
-    if not times and last is not None:
-        mistake = mistake_between(frame, last, TIMES_TOO_LARGE)
-        if mistake is None:
-            return
-        if mistake.kind != "scale":
-            raise ObservationError(
-                f"the frame does not agree with the last one, and without this mistake it would:"
-                f" {mistake.sentence}"
-            )
-        times = mistake.scale
-    if not times:
-        return
-    steps = (
-        f"its steps look like {1 / times:.3g} mm"
-        if frame.counted
-        else "is it in another unit?"
-    )
-
-    hint = (
-        ", and uint16 is taken for millimetres: hand it in as float metres"
-        if frame.counted
-        else ""
-    )
-    raise ObservationError(f"the depth is {times:g} times too large: {steps}{hint}")
-
-
-def _times_behind(frame: Frame, target: Float, radius: float) -> float:
-    """Return the factor by which depth is too large if everything is behind a target; else 0."""
-    pose = frame.camera_to_world
-    in_camera = pose[:3, :3].T @ (target - pose[:3, 3])
-    z = in_camera[2]
-    if z <= 0:
-        return 0.0
-
-    height, width = frame.shape
-    column, row = frame.pinhole.project(in_camera[None])[0].astype(int).tolist()
-    if not (0 <= column < width and 0 <= row < height):
-        return 0.0
-
-    few = frame.depth[::4, ::4]
-    around = frame.depth[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5]
-    if not (around > 0).any():
-        return 0.0
-
-    there = float(np.median(around[around > 0]))
-    nearest = float(np.quantile(few[few > 0], 0.02)) if (few > 0).any() else 0.0
-    if nearest < NOTHING_NEARER * (z + radius) or there < MUCH_FARTHER * (z + radius):
-        return 0.0
-
-    return min(TIMES_TOO_LARGE, key=lambda times: abs(np.log(times * z / there)))
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
@@ -235,23 +48,6 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
             " larger one"
         )
         found.append(ViewWarning("intrinsics", message))
-    seen = frame.depth[::4, ::4]
-    middle = float(np.median(seen[seen > 0])) if seen.any() else 0.0
-    if middle > FAR_DEPTH:
-        found.append(
-            ViewWarning(
-                "unit",
-                f"the depth has a median of {middle:.0f} m: is it in inches or feet?",
-            )
-        )
-    origin = float(np.linalg.norm(frame.camera_to_world[:3, 3]))
-    if origin > max(FAR_ORIGIN, 20 * middle):
-        message = (
-            f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far:"
-            " is the"
-        )
-        found.append(ViewWarning("far origin", message + " pose in millimetres?"))
-
     return found
 
 

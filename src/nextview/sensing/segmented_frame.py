@@ -81,7 +81,7 @@ class SegmentedFrame:
         load = np.zeros(len(self.levels))
         for mask, level in zip(self.masks, self.carriers, strict=True):
             pixels = mask & among & (self.frame.depth > 0)
-            if level is None or not pixels.any():
+            if level not in self.levels or not pixels.any():
                 continue
             size = np.linalg.norm(np.ptp(points_of(pixels, self.frame), axis=0))
             if widest is None or size <= widest:

@@ -20,7 +20,6 @@ from nextview.sensing.masks import (
 from nextview.sensing.planes import Plane
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
-from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Float32, Mask
 
@@ -92,8 +91,6 @@ class TableTop:
             level = seen.ground(inside, widest)
         else:
             level = seen.again(earlier.plane)
-        upright = None if frame.pose is None else up
-        refuse_mistakes(seen, None if level is None else level.plane, upright)
         if level is not None:
             plane = level.plane
         elif earlier is not None:
@@ -102,7 +99,7 @@ class TableTop:
             raise ObservationError(NO_SUPPORT)
 
         height, above = _heights(seen, plane)
-        upright = plane.normal if upright is None else upright
+        upright = plane.normal if up is None or frame.pose is None else up
         return cls(seen, plane, upright, above, height, level is not None)
 
     @property

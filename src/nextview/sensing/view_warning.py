@@ -8,9 +8,9 @@ class ViewWarning:
     """A likely problem of a view or a frame, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
-    "contradiction" and "repeated"; for frames "intrinsics", "unit", "far origin", "support",
-    "point", "size", "stale pose", "displaced", "lean" and "camera". The warnings of scenes
-    are listed on the page about tables.
+    "contradiction" and "repeated"; for frames "intrinsics", "unit", "far origin", "pose",
+    "support", "point", "size", "stale pose", "displaced", "lean" and "camera". The
+    warnings of scenes are listed on the page about tables.
 
     Attributes:
         name: one of these.
