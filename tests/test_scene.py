@@ -12,7 +12,7 @@ from small_tables import camera_over, view, without
 
 import nextview
 from nextview.cli.main import main
-from nextview.errors import ObservationError, SessionError
+from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
@@ -192,6 +192,31 @@ def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_mesh
     nowhere = nextview.Scene(ycb, reachable=lambda pose: False)
     nowhere.update(camera.frame(view(20)))
     assert nowhere.target is None
+
+
+def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    frame = camera.frame(view(20))
+    asked = []
+
+    def seconds(here, there):
+        asked.append(here)
+        return 0.0 if there[0, 3] > 0 else np.inf
+
+    scene = nextview.Scene(ycb, travel_cost=seconds)
+    scene.update(frame)
+    assert (scene.targets[:, 0, 3] > 0).all()
+    assert all(np.array_equal(here, frame.pose) for here in asked)
+
+    nearest = nextview.Scene(ycb, policy=lambda choice, rng: -choice.views.travel)
+    nearest.update(frame)
+    nearest.travel_cost = lambda here, there: 3.0 - there[2, 3]
+    highest = nearest.targets[:, 2, 3]
+    assert np.all(np.diff(highest) <= 1e-9)
+    assert np.ptp(highest) > 0.1
+    scene.travel_cost = lambda here, there: None
+    with pytest.raises(UsageError, match="a travel cost is a number from 0 on"):
+        _ = scene.target
 
 
 def test_a_view_that_failed_is_no_target_again(ycb, ycb_meshes):

@@ -215,7 +215,8 @@ class Candidates:
             (z against gravity).
         free: views that may be chosen: above the plane, within reach, and not close to an earlier
             view, (V,) bool.
-        travel: straight way from the last camera to each view, (V,), metres.
+        travel: straight way from the last camera to each view, (V,), metres; or its cost by
+            ``Scene.travel_cost``.
         current: direction from the centre of the scene to the last camera, unit vector, (3,),
             upright axes.
     """

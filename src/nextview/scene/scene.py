@@ -47,6 +47,7 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
+from nextview.session.reach import cost_of, truth_of
 from nextview.session.repeated import REPEATED
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
@@ -139,6 +140,9 @@ class Scene:
         rng: source of the random numbers of the policy; seed 0 by default.
         any_orientation: the objects are taught things that need not be in a resting pose: they may
             lean against each other. They still have to touch a visible surface or another object.
+        travel_cost: function that returns the cost of moving the camera from one pose to another,
+            such as the seconds of a motion planner; infinity if there is no path. Metres of a
+            straight line by default.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -156,6 +160,7 @@ class Scene:
         policy: str | ScenePolicy | type = INFORMATION_POLICY,
         rng: np.random.Generator | None = None,
         any_orientation: bool = False,
+        travel_cost: Callable[[Float, Float], float] | None = None,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -167,6 +172,7 @@ class Scene:
         self._lock = RLock()
         self.distance = distance
         self.reachable = reachable
+        self.travel_cost = travel_cost
         self.segmentation = segmentation
         system = models if isinstance(models, System) else load(models)
         self.system = system.in_any_orientation() if any_orientation else system
@@ -258,6 +264,20 @@ class Scene:
         self._changed()
 
     @property
+    def travel_cost(self) -> Callable[[Float, Float], float] | None:
+        """Cost of moving the camera from one pose, (4, 4), to another; None for metres.
+
+        It is asked once after each frame, for all candidates that can be reached. The unit is
+        arbitrary. A change takes effect immediately.
+        """
+        return self._travel_cost
+
+    @travel_cost.setter
+    def travel_cost(self, given: Callable[[Float, Float], float] | None) -> None:
+        self._travel_cost = given
+        self._changed()
+
+    @property
     def target(self) -> Float | None:
         """Next view that is expected to settle all objects soonest, camera-to-world, (4, 4).
 
@@ -307,10 +327,19 @@ class Scene:
             views = candidates(self.system, self._state.tops, around, self.distance)
             free = views.free.copy()
             free[list(self._failed)] = False
+            travel = views.travel.copy()
+            rows = np.flatnonzero(free)
             if self.reachable is not None:
+                free[rows] = [truth_of(self.reachable(views.poses[k])) for k in rows]
                 rows = np.flatnonzero(free)
-                free[rows] = [bool(self.reachable(views.poses[row])) for row in rows]
-            self._views = replace(views, free=free)
+            if self.travel_cost is not None:
+                here = self._state.tops[-1].frame.camera_to_world
+                costs = [cost_of(self.travel_cost(here, views.poses[k])) for k in rows]
+                travel = np.full(len(free), np.inf)
+                travel[rows] = costs
+                free &= travel < np.inf
+                travel[~free] = travel[free].max(initial=0.0)
+            self._views = replace(views, free=free, travel=travel)
         return self._views
 
     def _changed(self) -> None:

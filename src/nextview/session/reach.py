@@ -52,7 +52,7 @@ class Reach:
         if callable(self.reachable):
             at = poses()
             for k in np.flatnonzero(there):
-                there[k] = _truth(self.reachable(at[views[k]]))
+                there[k] = truth_of(self.reachable(at[views[k]]))
         elif self.reachable is not None:
             there &= self.reachable[views]
         return there
@@ -79,7 +79,7 @@ class Reach:
         views = views[self.can_reach(views, poses)]
         if self.cost is not None:
             if callable(self.cost):
-                costs = [_cost(self.cost(here, pose)) for pose in poses()[views]]
+                costs = [cost_of(self.cost(here, pose)) for pose in poses()[views]]
                 cost = np.array(costs, np.float64)
             else:
                 cost = self.cost[state.current[0], views]
@@ -101,7 +101,7 @@ class Reach:
         return replace(state, reachable=reachable[None])
 
 
-def _cost(answer: Any) -> float:
+def cost_of(answer: Any) -> float:
     """Check a cost returned by a user's function; infinity is allowed."""
     try:
         cost = float(answer)
@@ -114,7 +114,7 @@ def _cost(answer: Any) -> float:
     return cost
 
 
-def _truth(answer: Any) -> bool:
+def truth_of(answer: Any) -> bool:
     """Check the answer of a user's function for a pose.
 
     None is rejected: it is returned by a function without a return statement.
