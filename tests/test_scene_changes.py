@@ -7,6 +7,7 @@ import pytest
 from small_tables import camera_over, meshes_of, view, without
 
 import nextview
+from nextview.data.samples import sample_mesh
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable
@@ -146,3 +147,41 @@ def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, me
         middle = np.append(true.vertices.mean(0), 1)
         assert np.linalg.norm((one.pose - true.pose) @ middle) < 0.003
     assert {one.name for one in scene.objects} == set(NAMES)
+
+
+def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, meshes):
+    chair = replace(
+        sample_mesh("chair"),
+        radius=0.09,
+        centre=np.zeros(3),
+        name="chair",
+        unit="m",
+    )
+    camera = camera_over([*meshes.values(), chair], seed=8)
+    camera.sensor = SENSORS["stereo"]
+    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+
+    def look():
+        frame = camera.frame(view(20))
+        return scene.update(replace(frame, camera="fixed", pixel_centre=0.5))
+
+    def shown():
+        """The object that shows most of the chair."""
+        last = len(scene.frames) - 1
+        row = [thing.name for thing in camera.table.things].index("chair")
+        return max(
+            (one for one in scene.objects if last in one.pixels),
+            key=lambda one: np.count_nonzero(one.pixels[last] & (camera.owner == row)),
+        )
+
+    look()
+    before = shown()
+    assert before.pose is None
+    shift = 0.03 * outwards(camera.table, "chair")
+    camera.change(shifted(camera.table, "chair", shift))
+    moved = look()
+    assert [(one.number, one.before) for one in moved.moved] == [(before.number, None)]
+    assert moved.gone == moved.appeared == ()
+    after = shown()
+    assert after.number == before.number
+    assert np.allclose((after.place - before.place)[:2], shift, atol=0.005)

@@ -703,10 +703,15 @@ def _found_again(
         if not change.found:
             continue
         rendered = render_track(old, top, -1, change.there)
+        if rendered is None:
+            continue
+        # what was seen of an object without a name may be a small part of it
+        shown = np.count_nonzero(np.isfinite(rendered.depth) & ~rendered.hidden)
         for row in new.keys() - found.keys():
             mask = new[row].thing.sightings[-1].mask
-            explained = 0 if rendered is None else rendered.fit(mask)[0]
-            if explained >= SAME_OBJECT_SHARE * np.count_nonzero(mask):
+            explained, _ = rendered.fit(mask)
+            of_both = min(shown, np.count_nonzero(mask))
+            if explained and explained >= SAME_OBJECT_SHARE * of_both:
                 found[row] = old
                 break
 
