@@ -424,7 +424,11 @@ def _last_seen(
     last = track.frames[-1]
     known = [] if _in_one_place([last], top, tops) else [cameras[last]]
     radius = track.thing.object_frame.radius
-    error = float(scan_errors(radius))
+    away = np.linalg.norm(
+        track.thing.object_frame.centre - top.frame.camera_to_world[:3, 3]
+    )
+    noise = float(top.noise.at(away) * away**2)  # of both frames, alike in all pixels
+    error = float(np.hypot(scan_errors(radius), np.sqrt(2) * noise))
     own = np.diag(np.repeat([(error / radius) ** 2, error**2], 3) / 3)
     return _object_at(posed, own, known, top, segments)
 
@@ -485,14 +489,14 @@ def _in_one_place(
 def _own_covariance(track: Track, posed: PoseCandidate, same: bool) -> Float:
     """Covariance of the error of the pose of an object, (6, 6): rotation vector and shift.
 
-    Other candidates, which may be other things, and errors of the scan are a part of it. In the
-    same view they err as before: what is left is noise.
+    Errors of the scan are a part of it, and other candidates, which may be other things. In the
+    same view these err as before.
     """
     assert track.result is not None
     every = [] if same else track.result.pose_candidates
     off = uncertainty_of([posed, *(one for one in every if one is not posed)])
     radius = track.thing.object_frame.radius
-    error = 0.0 if same else float(scan_errors(radius))
+    error = float(scan_errors(radius))
     turn = np.hypot(np.radians(off.degrees), error / radius)
     shift = np.hypot(off.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2, shift**2], 3) / 3)
