@@ -326,7 +326,7 @@ def test_poses_do_not_extend_below_the_ground():
     fits, sunk = likelihood(view, render(caster, lowered, view, 0)).mean
     assert fits > -0.3
     assert sunk < fits - 0.5
-    unaware = replace(view, ground=None)
+    unaware = replace(view, ground=None, floor=None)
     assert likelihood(unaware, render(caster, lowered, unaware, 0)).mean[1] > fits - 0.3
 
 

@@ -194,6 +194,10 @@ class _Object:
         free[3:, 3:] = scale**2 * (np.eye(3) - vertical)
         return covariance + free
 
+    def beside(self, others: Sequence[PoseCandidate], top: TableTop) -> _Object:
+        """Return the same among other known objects, see ``PlacedSurface.beside``."""
+        return replace(self, surface=self.surface.beside(others, top))
+
     def looked_for(self, camera: CameraError, starts: Sequence[Float]) -> _Object:
         """Find its likeliest motion if it may have moved.
 
@@ -273,7 +277,10 @@ def changes(
         The change of each object, and the error of the pose of the new frame.
     """
     expected = CameraError.before(top.frame, tops, cameras)
-    named = _searched(_known(tracks, top, segments, tops, cameras), expected, top)
+    known = _known(tracks, top, segments, tops, cameras)
+    still = _still(list(known.values()), expected)
+    places = {row: _displaced(one, still) for row, one in known.items()}
+    named = _searched(known, places, still, expected, top)
     standing, camera = _agreeing(named, expected)
 
     by_others = {}  # the camera's error, without the object itself
@@ -298,9 +305,20 @@ def changes(
             change = _of_name(named[row], by_others[row], moved, track, tops)
         if row not in named or change.contradicts:
             seen = _last_seen(track, top, segments, tops, cameras)
-            change = _whatever_it_is(
-                change, named.get(row), seen, by_others[row], moved, track.confident
-            )
+            if seen is None:
+                change = Change()
+            else:
+                way = np.zeros(3)
+                if row in named:
+                    way = named[row].way(by_others[row])[0][3:]
+                unnamed = _without_name(
+                    seen, _others(places, row), by_others[row], moved, top, way
+                )
+                change = (
+                    _whatever_it_is(change, unnamed, track.confident)
+                    if row in named
+                    else unnamed
+                )
         found.append(change)
     return found, camera
 
@@ -340,21 +358,35 @@ def _known(
 
 
 def _searched(
-    named: dict[int, _Object], expected: CameraError, top: TableTop
+    known: dict[int, _Object],
+    places: dict[int, PoseCandidate],
+    still: CameraError,
+    expected: CameraError,
+    top: TableTop,
 ) -> dict[int, _Object]:
-    """Find the likeliest motion of each object, beside the others where they stand."""
-    still = _still(list(named.values()), expected)
-    places = {row: _displaced(one, still) for row, one in named.items()}
+    """Find the likeliest motion of each object beside the others.
+
+    Args:
+        known: the objects, by row.
+        places: surfaces of all of them if none moved.
+        still: error of the frame's pose if none moved.
+        expected: error of the frame's pose before the comparison.
+        top: support surfaces of the frame.
+    """
     found = {}
-    for row, one in named.items():
-        others = [place for other, place in places.items() if other != row]
-        beside = replace(one, surface=one.surface.beside(others, top))
+    for row, one in known.items():
         mean, _ = one.expected(still)
         starts = [mean]
         if one.shift.any():
             starts.append(mean + np.append(np.zeros(3), one.shift))
+        beside = one.beside(_others(places, row), top)
         found[row] = beside.looked_for(expected, starts)
     return found
+
+
+def _others(places: dict[int, PoseCandidate], row: int) -> list[PoseCandidate]:
+    """Return the surfaces of all objects but one."""
+    return [place for other, place in places.items() if other != row]
 
 
 def _object_at(
@@ -424,51 +456,56 @@ def _last_seen(
     last = track.frames[-1]
     known = [] if _in_one_place([last], top, tops) else [cameras[last]]
     radius = track.thing.object_frame.radius
-    away = np.linalg.norm(
-        track.thing.object_frame.centre - top.frame.camera_to_world[:3, 3]
-    )
+    camera = top.frame.camera_to_world[:3, 3]
+    away = float(np.linalg.norm(track.thing.object_frame.centre - camera))
     noise = float(top.noise.at(away) * away**2)  # of both frames, alike in all pixels
     error = float(np.hypot(scan_errors(radius), np.sqrt(2) * noise))
     own = np.diag(np.repeat([(error / radius) ** 2, error**2], 3) / 3)
     return _object_at(posed, own, known, top, segments)
 
 
-def _whatever_it_is(
-    change: Change,
-    named: _Object | None,
-    seen: _Object | None,
-    camera: CameraError,
-    moved: _Moved,
-    confident: bool,
-) -> Change:
-    """Consider that an object has no name or a wrong one: what was seen of it last stands or moved.
+def _whatever_it_is(change: Change, unnamed: Change, confident: bool) -> Change:
+    """Consider that a name is wrong: what was seen of the object last stands, or moved.
 
     Args:
         change: by its name.
-        named: the object by its name; None without one.
-        seen: the part of it that was seen last; None if the frame cannot show it.
-        camera: error of the frame's pose, by the other objects.
-        moved: the other objects that moved.
-        confident: whether its name is.
+        unnamed: by the part that was seen last.
+        confident: whether the name is.
     """
-    if seen is None:
-        return Change()
-    mean, _ = seen.expected(camera)
-    ways = [np.zeros(3), seen.shift]
-    if named is not None:
-        ways.append((named.fit.motion - named.expected(camera)[0])[3:])
-    starts = [mean + np.append(np.zeros(3), way) for way in ways]
-    seen = seen.looked_for(camera, starts)
-    unnamed = Change(seen.standing(camera), seen.elsewhere(camera, moved), seen.there)
-    if named is None:
-        return unnamed
     wrong = WRONG_NAMES if confident else WRONG_DOUBTFUL
     weights = np.log([1 - wrong, wrong])
-    stands, elsewhere = np.logaddexp(
-        weights[0] + [change.stands, change.elsewhere],
-        weights[1] + [unnamed.stands, unnamed.elsewhere],
+    stands = np.logaddexp(weights[0] + change.stands, weights[1] + unnamed.stands)
+    elsewhere = np.logaddexp(
+        weights[0] + change.elsewhere, weights[1] + unnamed.elsewhere
     )
     return replace(change, stands=float(stands), elsewhere=float(elsewhere))
+
+
+def _without_name(
+    seen: _Object,
+    others: Sequence[PoseCandidate],
+    camera: CameraError,
+    moved: _Moved,
+    top: TableTop,
+    way: Float,
+) -> Change:
+    """Compare a frame with an object by the part of it that was seen last.
+
+    Args:
+        seen: this part.
+        others: surfaces of the other objects. They explain what the object may not, but they err,
+            too: that they hide less of it than is hidden does not count against it.
+        camera: error of the frame's pose, by the other objects.
+        moved: the other objects that moved.
+        top: support surfaces of the frame.
+        way: likeliest shift by its name, (3,), metres.
+    """
+    mean, _ = seen.expected(camera)
+    ways = (np.zeros(3), seen.shift, way)
+    starts = [mean + np.append(np.zeros(3), one) for one in ways]
+    beside = seen.beside(others, top).looked_for(camera, starts)
+    elsewhere = beside.elsewhere(camera, moved)
+    return Change(seen.standing(camera), elsewhere, beside.there)
 
 
 def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:

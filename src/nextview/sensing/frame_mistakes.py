@@ -35,7 +35,7 @@ WARNED = 0.5
 AS_LIKELY = np.log(3)  # nats within which several mistakes are named
 TOLD = np.log(10)  # nats of a fact that is told
 OTHER_WORLD = 1e-3  # prior of a target, or of earlier frames, in another world
-RARE = np.log(1e-4)  # of what few right frames show
+RARE_FACT = np.log(1e-4)  # of what few right frames show
 IMPOSSIBLE = np.log(1e-6)  # of what no right frame shows
 
 COUNTED = Stored(step_told_by="as uint16 is taken; hand it in as float metres")
@@ -45,7 +45,9 @@ WORKSPACE = 30.0  # metres from the world's origin within which robots work
 FARTHEST_MEDIAN = 10.0  # metres, range of most depth cameras
 # A camera sees its target, and moves, within a few times the farthest depth that it measures.
 TOO_FAR = 2.5
-BEHIND = 1.2  # multiple of the target's distance beyond which a surface is behind it
+BEHIND_TARGET = (
+    1.2  # multiple of the target's distance beyond which a surface is behind it
+)
 UNKNOWN_LENGTHS = np.log(
     1e6
 )  # range of lengths of which nothing is known, 1 mm to 1 km
@@ -61,7 +63,9 @@ ALL_FLAT = (
 INDEPENDENT_SURFACES = 15  # that two frames see
 CONFIRMED = 2.0  # nats of a surface that both frames see in the same place
 CONTRADICTED = -4.0  # nats of a surface that one frame sees through
-CHANGED = np.log(0.05)  # of a world that has changed since, so that nothing need agree
+WORLD_CHANGED = np.log(
+    0.05
+)  # of a world that has changed since, so that nothing need agree
 FEWEST_JUDGED = 100  # judgements without which frames do not overlap
 
 
@@ -98,7 +102,7 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Reading:
+class FrameReading:
     """One reading of a frame.
 
     Attributes:
@@ -142,7 +146,7 @@ class Reading:
 # Facts
 
 
-def place(reading: Reading) -> Fact:
+def place(reading: FrameReading) -> Fact:
     """A robot's camera is near the origin of its world, or sees as far as it is away."""
     away = float(np.linalg.norm(reading.pose[:3, 3]))
     if away < max(WORKSPACE, 20 * reading.median):
@@ -151,18 +155,18 @@ def place(reading: Reading) -> Fact:
         f"the camera is {away:.0f} m from the world's origin, and sees"
         f" {reading.median:.2g} m far"
     )
-    return Fact(RARE, words, "far origin")
+    return Fact(RARE_FACT, words, "far origin")
 
 
-def depth(reading: Reading) -> Fact:
+def depth(reading: FrameReading) -> Fact:
     """Most depth cameras measure up to ten metres."""
     middle = reading.median
     if middle < FARTHEST_MEDIAN:
         return Fact()
-    return Fact(RARE, f"the depth has a median of {middle:.0f} m", "unit")
+    return Fact(RARE_FACT, f"the depth has a median of {middle:.0f} m", "unit")
 
 
-def motion(reading: Reading) -> Fact:
+def motion(reading: FrameReading) -> Fact:
     """A camera moves through what it sees."""
     last = reading.known.last
     if last is None:
@@ -178,7 +182,7 @@ def motion(reading: Reading) -> Fact:
     return Fact(IMPOSSIBLE, words)
 
 
-def target(reading: Reading) -> Fact:
+def target(reading: FrameReading) -> Fact:
     """An object is in sight of the camera that looks at it, and not before all that is seen."""
     if reading.known.target is None or reading.frame.mask is not None:
         return Fact()
@@ -199,12 +203,12 @@ def target(reading: Reading) -> Fact:
         return Fact(0.0, words)
     there = reading.depth_scale * float(np.median(around))
     found = _coincidence(np.log(there / in_camera[2]), TARGET_ERROR)
-    if min(there, reading.nearest) < BEHIND * (in_camera[2] + radius):
+    if min(there, reading.nearest) < BEHIND_TARGET * (in_camera[2] + radius):
         return Fact(found, words)
-    return Fact(RARE, "all that is seen is far behind the target", "unit")
+    return Fact(RARE_FACT, "all that is seen is far behind the target", "unit")
 
 
-def level(reading: Reading) -> Fact:
+def level(reading: FrameReading) -> Fact:
     """The largest plane is mostly a floor, a table or a wall."""
     if reading.plane is None or reading.known.up is None:
         return Fact()
@@ -216,7 +220,7 @@ def level(reading: Reading) -> Fact:
     return Fact(nats, "the largest plane in view is not level")
 
 
-def height(reading: Reading) -> Fact:
+def height(reading: FrameReading) -> Fact:
     """The largest plane is often level with the world's origin: a table, or the floor."""
     if reading.plane is None:
         return Fact()
@@ -233,12 +237,12 @@ def height(reading: Reading) -> Fact:
     return Fact(_coincidence(np.log(stands / above), HEIGHT_ERROR), words, "unit")
 
 
-def agreement(reading: Reading) -> Fact:
+def agreement(reading: FrameReading) -> Fact:
     """Two frames see the same surfaces in the same places, unless the world has changed."""
     return Fact(reading.agreement, "the frame does not agree with the last one")
 
 
-def flatness(reading: Reading) -> Fact:
+def flatness(reading: FrameReading) -> Fact:
     """Floors, tables and walls are flat."""
     return Fact(reading.flatness, "what is flat looks curved")
 
@@ -263,7 +267,7 @@ def _normal(value: float, deviation: float) -> float:
     )
 
 
-def _rise(reading: Reading) -> float:
+def _rise(reading: FrameReading) -> float:
     """Return the cosine of the angle between the normal of the largest plane and up."""
     assert reading.plane is not None
     assert reading.known.up is not None
@@ -323,10 +327,10 @@ def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
     poses = np.stack([last_pose, frame.camera_to_world])
     posed = PosedViews(views, poses, COUNTED if frame.counted else MEASURED)
     plane, flatter = _surfaces(seen, known.up)
-    read = Reading(frame, known, plane, _depths(frame), poses[1], poses[0])
+    read = FrameReading(frame, known, plane, _depths(frame), poses[1], poses[0])
     read = replace(read, agreement=_agreement(posed))
     as_read = Explained("", _facts(read))
-    rare = [row for row, fact in enumerate(as_read.facts) if fact.nats <= RARE]
+    rare = [row for row, fact in enumerate(as_read.facts) if fact.nats <= RARE_FACT]
     mistakes = mistakes_of_frame(posed.stored, frame.pose is not None)
     flatness = ALL_FLAT * flatter
     if not rare and _is_beyond_doubt(as_read, read, mistakes, flatness):
@@ -364,7 +368,7 @@ def _gains(one: Explained, as_read: Explained) -> Float:
 
 def _is_beyond_doubt(
     as_read: Explained,
-    read: Reading,
+    read: FrameReading,
     mistakes: Sequence[Mistake],
     flatness: float,
 ) -> bool:
@@ -373,12 +377,16 @@ def _is_beyond_doubt(
     if read.known.target is not None:
         most += _coincidence(0, TARGET_ERROR)
     if read.known.last is not None:
-        most += CHANGED if read.agreement > 0 else CONFIRMED * INDEPENDENT_SURFACES
+        most += (
+            WORLD_CHANGED if read.agreement > 0 else CONFIRMED * INDEPENDENT_SURFACES
+        )
     prior = sum(mistake.prior for mistake in mistakes) + 2 * OTHER_WORLD
     return bool(np.log(prior) + most < as_read.nats)
 
 
-def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> list[Reading]:
+def _undone(
+    mistake: Mistake, read: FrameReading, posed: PosedViews
+) -> list[FrameReading]:
     """Return the readings of a frame with a mistake undone.
 
     A mistake in a pose may be in that of the new frame alone, a wrong unit also in that of the last
@@ -394,7 +402,7 @@ def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> list[Reading]
             one = right
         if posed.views and mistake.kind != "range":
             # Where the last pose is confirmed, no other one agrees.
-            nats = CHANGED
+            nats = WORLD_CHANGED
             if read.agreement <= 0:
                 nats = 0.0 if in_one_place(one) else _agreement(one)
             other = replace(other, agreement=nats)
@@ -402,7 +410,7 @@ def _undone(mistake: Mistake, read: Reading, posed: PosedViews) -> list[Reading]
     return found
 
 
-def _other_worlds(read: Reading) -> list[Explained]:
+def _other_worlds(read: FrameReading) -> list[Explained]:
     """Return the readings in which the pose has nothing to do with what is known."""
     known = read.known
     found = []
@@ -424,7 +432,7 @@ def _depths(frame: Frame) -> Float:
     return np.array([*np.quantile(few, [0.02, 0.5]), frame.depth.max()])
 
 
-def _facts(reading: Reading) -> tuple[Fact, ...]:
+def _facts(reading: FrameReading) -> tuple[Fact, ...]:
     return tuple(fact(reading) for fact in FACTS)
 
 
@@ -465,4 +473,4 @@ def _agreement(posed: PosedViews) -> float:
         return 0.0
     surfaces = INDEPENDENT_SURFACES * found.judged / judgeable(posed.views)
     static = surfaces * (CONFIRMED * found.share + CONTRADICTED * (1 - found.share))
-    return float(np.logaddexp(static, CHANGED))
+    return float(np.logaddexp(static, WORLD_CHANGED))

@@ -55,7 +55,9 @@ as millimetres.
 """
 # Of frames in 16 bits, one in twenty is not in millimetres: each of the five factors.
 STEPS_PRIOR = 0.01
-UNUSUAL = 1e-4  # prior of centimetres, and of a pose of which one half is inverse
+UNUSUAL_MISTAKE = (
+    1e-4  # prior of centimetres, and of a pose of which one half is inverse
+)
 # factors that are tried together with another mistake
 COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
 # a factor above this is rarely an error of the depth unit, and often one of the unit of length
@@ -389,7 +391,7 @@ def mistakes_of_frame(stored: Stored, has_pose: bool) -> tuple[Mistake, ...]:
     return (
         *found,
         *of_one_frame((0.001,)),
-        *(replace(one, prior=UNUSUAL) for one in of_one_frame((0.01,))),
+        *(replace(one, prior=UNUSUAL_MISTAKE) for one in of_one_frame((0.01,))),
         *mistakes_in_poses(),
         *_mistakes_in_quaternions(),
         *_mirrored_pictures(),
@@ -443,14 +445,14 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
             "inverse",
             f"the rotations are inverse: {wrong} only the translations are",
             _posed(_in_stored(_rotation_inverted, to_world)),
-            prior=UNUSUAL,
+            prior=UNUSUAL_MISTAKE,
         ),
         Mistake(
             "inverse translation",
             "inverse",
             f"the translations are those of inverse poses: {wrong} only the rotations are",
             _posed(_in_stored(_translation_inverted, to_world)),
-            prior=UNUSUAL,
+            prior=UNUSUAL_MISTAKE,
         ),
         Mistake(
             "opengl axes",
