@@ -2,10 +2,9 @@
 
 Each of the three hypotheses gives the pixels around an object a likelihood (``placing``). They are
 weighed by their priors: few objects move between two frames, but where some have moved, such as on
-a belt, the others may have moved alike. An object that stands is displaced
-only by the error of the camera's pose, which is the same for all objects of a frame, and by that of
-its own pose. The surface of an object is the scan of its name or, as names may be wrong, the part
-that was seen last.
+a belt, the others may have moved alike. An object that stands is displaced only by the error of the
+camera's pose, which is the same for all objects of a frame, and by that of its own pose. The
+surface of an object is the scan of its name or, as names may be wrong, the part that was seen last.
 """
 
 from __future__ import annotations
@@ -284,42 +283,41 @@ def changes(
     standing, camera = _agreeing(named, expected)
 
     by_others = {}  # the camera's error, without the object itself
-    alone = {}
-    for row, track in enumerate(tracks):
+    for row in range(len(tracks)):
         rest = [named[other] for other in standing if other != row]
         by_others[row] = _camera_by(rest, expected)
-        if row in named:
-            alone[row] = _of_name(named[row], by_others[row], _Moved(), track, tops)
-    ways = {
-        row: named[row].way(by_others[row])
-        for row, change in alone.items()
-        if change.found
-    }
 
-    found = []
-    for row, track in enumerate(tracks):
+    def told(row: int, moved: _Moved) -> Change:
+        """Return the change of one object, given which others moved."""
+        track = tracks[row]
+        camera_by_others = by_others[row]
+        one = named.get(row)
+        change = Change()
+        if one is not None:
+            change = _of_name(one, camera_by_others, moved, track, tops)
+            if not change.contradicts:
+                return change
+
+        seen = _last_seen(track, top, segments, tops, cameras)
+        if seen is None:
+            return Change()
+        unnamed = Change(seen.standing(camera_by_others))
+        if not seen.known:  # from elsewhere the frame shows another part
+            way = None if one is None else one.way(camera_by_others)[0][3:]
+            beside = seen.beside(_others(places, row), top)
+            unnamed = _of_part(unnamed, beside, camera_by_others, moved, way)
+        if one is None:
+            return unnamed
+        return _whatever_it_is(change, unnamed, track.confident)
+
+    found = [told(row, _Moved()) for row in range(len(tracks))]
+    ways = {
+        row: one.way(by_others[row]) for row, one in named.items() if found[row].found
+    }
+    for row, change in enumerate(found):
         along = tuple(way for other, way in ways.items() if other != row)
-        moved = _Moved(along, len(along) / max(len(named), 1))
-        change = alone.get(row, Change())
-        if row in named and along:
-            change = _of_name(named[row], by_others[row], moved, track, tops)
-        if row not in named or change.contradicts:
-            seen = _last_seen(track, top, segments, tops, cameras)
-            if seen is None:
-                change = Change()
-            else:
-                way = np.zeros(3)
-                if row in named:
-                    way = named[row].way(by_others[row])[0][3:]
-                unnamed = _without_name(
-                    seen, _others(places, row), by_others[row], moved, top, way
-                )
-                change = (
-                    _whatever_it_is(change, unnamed, track.confident)
-                    if row in named
-                    else unnamed
-                )
-        found.append(change)
+        if along and not change.contradicts:
+            found[row] = told(row, _Moved(along, len(along) / len(named)))
     return found, camera
 
 
@@ -464,6 +462,31 @@ def _last_seen(
     return _object_at(posed, own, known, top, segments)
 
 
+def _of_part(
+    change: Change,
+    seen: _Object,
+    camera: CameraError,
+    moved: _Moved,
+    way: Float | None,
+) -> Change:
+    """Consider that the part of an object that was seen last, and is seen again, has moved.
+
+    Args:
+        change: of this part, as if nothing stood before it. The poses of the others err, so that
+            they may hide less of it than is hidden.
+        seen: this part beside the others, which explain what this object need not.
+        camera: error of the frame's pose, by the other objects.
+        moved: the other objects that moved.
+        way: shift of the object by its name, (3,), metres; None without one.
+    """
+    mean, _ = seen.expected(camera)
+    ways = [np.zeros(3), seen.shift, *([] if way is None else [way])]
+    starts = [mean + np.append(np.zeros(3), each) for each in ways]
+    seen = seen.looked_for(camera, starts)
+    stands = max(change.stands, seen.standing(camera))
+    return Change(stands, seen.elsewhere(camera, moved), seen.there)
+
+
 def _whatever_it_is(change: Change, unnamed: Change, confident: bool) -> Change:
     """Consider that a name is wrong: what was seen of the object last stands, or moved.
 
@@ -473,39 +496,12 @@ def _whatever_it_is(change: Change, unnamed: Change, confident: bool) -> Change:
         confident: whether the name is.
     """
     wrong = WRONG_NAMES if confident else WRONG_DOUBTFUL
-    weights = np.log([1 - wrong, wrong])
-    stands = np.logaddexp(weights[0] + change.stands, weights[1] + unnamed.stands)
-    elsewhere = np.logaddexp(
-        weights[0] + change.elsewhere, weights[1] + unnamed.elsewhere
-    )
-    return replace(change, stands=float(stands), elsewhere=float(elsewhere))
-
-
-def _without_name(
-    seen: _Object,
-    others: Sequence[PoseCandidate],
-    camera: CameraError,
-    moved: _Moved,
-    top: TableTop,
-    way: Float,
-) -> Change:
-    """Compare a frame with an object by the part of it that was seen last.
-
-    Args:
-        seen: this part.
-        others: surfaces of the other objects. They explain what the object may not, but they err,
-            too: that they hide less of it than is hidden does not count against it.
-        camera: error of the frame's pose, by the other objects.
-        moved: the other objects that moved.
-        top: support surfaces of the frame.
-        way: likeliest shift by its name, (3,), metres.
-    """
-    mean, _ = seen.expected(camera)
-    ways = (np.zeros(3), seen.shift, way)
-    starts = [mean + np.append(np.zeros(3), one) for one in ways]
-    beside = seen.beside(others, top).looked_for(camera, starts)
-    elsewhere = beside.elsewhere(camera, moved)
-    return Change(seen.standing(camera), elsewhere, beside.there)
+    right = np.log(1 - wrong)
+    stands = np.logaddexp(right + change.stands, np.log(wrong) + unnamed.stands)
+    if unnamed.there is None:
+        return replace(change, stands=float(stands))
+    moves = np.logaddexp(right + change.elsewhere, np.log(wrong) + unnamed.elsewhere)
+    return replace(change, stands=float(stands), elsewhere=float(moves))
 
 
 def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:

@@ -115,7 +115,8 @@ class PlacedSurface:
         part = window_around(in_camera, frame)
         if part is None:
             return None
-        rays, depth = _pixels_of(frame, part)
+        step = [max(1, (one.stop - one.start) // COMPARED_SIDE) for one in part]
+        rays, depth = _pixels_of(frame, part, step)
         if not len(depth):
             return None
 
@@ -128,7 +129,9 @@ class PlacedSurface:
         )
         alone = alone.beside([], top)
         count = int(np.isfinite(alone.shown()).sum())
-        return replace(alone, weight=min(1.0, INDEPENDENT_PIXELS / max(count, 1)))
+        independent = float(np.prod(np.minimum(1.0, np.array(step) / top.noise.grain)))
+        weight = min(independent, INDEPENDENT_PIXELS / max(count, 1))
+        return replace(alone, weight=weight)
 
     def beside(self, others: Sequence[PoseCandidate], top: TableTop) -> PlacedSurface:
         """Return the same among other known objects, which may hide it.
@@ -348,13 +351,11 @@ def log_density(off: Float, sigma: Float, otherwise: Float | float) -> Float:
     return np.asarray(np.log(near + otherwise / DEPTH_RANGE))
 
 
-def _pixels_of(frame: Frame, part: Part) -> tuple[Float, Float]:
+def _pixels_of(frame: Frame, part: Part, step: Sequence[int]) -> tuple[Float, Float]:
     """Return rays, (P, 3), and depths, (P,), of pixels of a grid that have depth."""
     rows, columns = (
-        np.arange(one.start, one.stop)[
-            (step := max(1, (one.stop - one.start) // COMPARED_SIDE)) // 2 :: step
-        ]
-        for one in part
+        np.arange(one.start, one.stop)[each // 2 :: each]
+        for one, each in zip(part, step, strict=True)
     )
     row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
     seen = frame.depth[row, column] > 0
