@@ -576,6 +576,7 @@ def _camera_by(standing: Sequence[_Object], expected: CameraError) -> CameraErro
     none = replace(expected, motion=np.zeros(6), covariance=np.zeros((6, 6)))
     information = np.linalg.inv(expected.covariance)
     pull = information @ expected.motion
+
     for one in standing:
         if not one.known:
             continue
@@ -604,6 +605,7 @@ def _told_before(track: Track, pose: Float, tops: Sequence[TableTop]) -> float:
     posed = track.posed
     assert posed is not None
     told = 0.0
+
     for place, number in enumerate(track.frames):
         old = posed.pose.copy()
         new = pose.copy()

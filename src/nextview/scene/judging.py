@@ -85,6 +85,7 @@ class Judge:
         if seen and isinstance(recogniser, JudgesTogether):
             total = np.sum([self._log_evidence(one) for one in seen], axis=0)
             joint = recogniser.together(seen, total, len(seen))
+
         result = Recognition(
             tuple(self._views(thing, joint)),
             system.classes,
@@ -111,6 +112,7 @@ class Judge:
         total: Floats | None = None
         counted = 0
         views = []
+
         for number, seen in enumerate(thing.observations):
             evidence = None
             if seen.seen:
