@@ -275,50 +275,110 @@ def changes(
     Returns:
         The change of each object, and the error of the pose of the new frame.
     """
-    expected = CameraError.before(top.frame, tops, cameras)
-    known = _known(tracks, top, segments, tops, cameras)
-    still = _still(list(known.values()), expected)
-    places = {row: _displaced(one, still) for row, one in known.items()}
-    named = _searched(known, places, still, expected, top)
-    standing, camera = _agreeing(named, expected)
-
-    by_others = {}  # the camera's error, without the object itself
-    for row in range(len(tracks)):
-        rest = [named[other] for other in standing if other != row]
-        by_others[row] = _camera_by(rest, expected)
-
-    def told(row: int, moved: _Moved) -> Change:
-        """Return the change of one object, given which others moved."""
-        track = tracks[row]
-        camera_by_others = by_others[row]
-        one = named.get(row)
-        change = Change()
-        if one is not None:
-            change = _of_name(one, camera_by_others, moved, track, tops)
-            if not change.contradicts:
-                return change
-
-        seen = _last_seen(track, top, segments, tops, cameras)
-        if seen is None:
-            return Change()
-        unnamed = Change(seen.standing(camera_by_others))
-        if not seen.known:  # from elsewhere the frame shows another part
-            way = None if one is None else one.way(camera_by_others)[0][3:]
-            beside = seen.beside(_others(places, row), top)
-            unnamed = _of_part(unnamed, beside, camera_by_others, moved, way)
-        if one is None:
-            return unnamed
-        return _whatever_it_is(change, unnamed, track.confident)
-
-    found = [told(row, _Moved()) for row in range(len(tracks))]
+    compared = _Compared.with_frame(tracks, top, segments, tops, cameras)
+    found = [compared.change(row, _Moved()) for row in range(len(tracks))]
     ways = {
-        row: one.way(by_others[row]) for row, one in named.items() if found[row].found
+        row: one.way(compared.by_others[row])
+        for row, one in compared.named.items()
+        if found[row].found
     }
     for row, change in enumerate(found):
         along = tuple(way for other, way in ways.items() if other != row)
         if along and not change.contradicts:
-            found[row] = told(row, _Moved(along, len(along) / len(named)))
-    return found, camera
+            moved = _Moved(along, len(along) / len(compared.named))
+            found[row] = compared.change(row, moved)
+    return found, compared.camera
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A new frame, and the known objects as it may show them.
+
+    Attributes:
+        tracks: the objects.
+        top: support surfaces of the new frame.
+        segments: pixels of each object in it, (H, W) bool each.
+        tops: support surfaces of the earlier frames.
+        cameras: errors of their poses.
+        places: surfaces of the objects with a geometry if none moved, by row.
+        named: these objects beside each other, with their likeliest motions, by row.
+        camera: error of the frame's pose.
+        by_others: the same without the object itself, for each object.
+    """
+
+    tracks: Sequence[Track]
+    top: TableTop
+    segments: Sequence[Mask]
+    tops: Sequence[TableTop]
+    cameras: Sequence[CameraError]
+    places: dict[int, PoseCandidate]
+    named: dict[int, _Object]
+    camera: CameraError
+    by_others: list[CameraError]
+
+    @classmethod
+    def with_frame(
+        cls,
+        tracks: Sequence[Track],
+        top: TableTop,
+        segments: Sequence[Mask],
+        tops: Sequence[TableTop],
+        cameras: Sequence[CameraError],
+    ) -> _Compared:
+        """Find the likeliest motion of each object, and the error of the frame's pose."""
+        expected = CameraError.before(top.frame, tops, cameras)
+        known = _known(tracks, top, segments, tops, cameras)
+        still = _still(list(known.values()), expected)
+        places = {row: _displaced(one, still) for row, one in known.items()}
+        named = _searched(known, places, still, expected, top)
+        standing, camera = _agreeing(named, expected)
+        by_others = [
+            _camera_by([named[other] for other in standing if other != row], expected)
+            for row in range(len(tracks))
+        ]
+        return cls(
+            tracks, top, segments, tops, cameras, places, named, camera, by_others
+        )
+
+    def change(self, row: int, moved: _Moved) -> Change:
+        """Return the change of one object, given which others moved."""
+        track = self.tracks[row]
+        one = self.named.get(row)
+        by_name = Change()
+        if one is not None:
+            by_name = _of_name(one, self.by_others[row], moved, track, self.tops)
+            if not by_name.contradicts:
+                return by_name
+
+        by_part = self._of_last_seen(row, moved)
+        if by_part is None:
+            return Change()
+        if one is None:
+            return by_part
+        return _whatever_it_is(by_name, by_part, track.confident)
+
+    def _of_last_seen(self, row: int, moved: _Moved) -> Change | None:
+        """Return the change of the part of an object that was seen last.
+
+        None if the frame cannot show this part.
+        """
+        camera = self.by_others[row]
+        one = self.named.get(row)
+        seen = _last_seen(
+            self.tracks[row], self.top, self.segments, self.tops, self.cameras
+        )
+        if seen is None:
+            return None
+        if one is not None:
+            weighed = seen.surface.weighed_like(one.surface)
+            seen = replace(seen, surface=weighed)
+
+        change = Change(seen.standing(camera))
+        if seen.known:  # from elsewhere the frame shows another part
+            return change
+        way = None if one is None else one.way(camera)[0][3:]
+        beside = seen.beside(_others(self.places, row), self.top)
+        return _of_part(change, beside, camera, moved, way)
 
 
 def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
@@ -522,14 +582,14 @@ def _in_one_place(
 def _own_covariance(track: Track, posed: PoseCandidate, same: bool) -> Float:
     """Covariance of the error of the pose of an object, (6, 6): rotation vector and shift.
 
-    Errors of the scan are a part of it, and other candidates, which may be other things. In the
-    same view these err as before.
+    Errors of the scan are a part of it, and other candidates, which may be other things. The same
+    view shows both as before, so that they displace nothing between its frames.
     """
     assert track.result is not None
     every = [] if same else track.result.pose_candidates
     off = uncertainty_of([posed, *(one for one in every if one is not posed)])
     radius = track.thing.object_frame.radius
-    error = float(scan_errors(radius))
+    error = 0.0 if same else float(scan_errors(radius))
     turn = np.hypot(np.radians(off.degrees), error / radius)
     shift = np.hypot(off.millimetres / 1000, error)
     return np.diag(np.repeat([turn**2, shift**2], 3) / 3)

@@ -80,6 +80,7 @@ class PlacedSurface:
         without: log-density of the depth without the object, (P,).
         others: depth of other known objects, (K, P), metres, infinity beside them.
         weight: of each pixel, as neighbours err alike.
+        area: pixels of the image for each one here.
     """
 
     frame: Frame
@@ -92,6 +93,7 @@ class PlacedSurface:
     without: Float
     others: Float
     weight: float = 1.0
+    area: int = 1
 
     @classmethod
     def of(
@@ -131,7 +133,17 @@ class PlacedSurface:
         count = int(np.isfinite(alone.shown()).sum())
         independent = float(np.prod(np.minimum(1.0, np.array(step) / top.noise.grain)))
         weight = min(independent, INDEPENDENT_PIXELS / max(count, 1))
-        return replace(alone, weight=weight)
+        return replace(alone, weight=weight, area=int(np.prod(step)))
+
+    def weighed_like(self, other: PlacedSurface) -> PlacedSurface:
+        """Return the same with the weights of another surface of the object.
+
+        The likelihoods of two surfaces can be compared only if each pixel counts alike in both.
+
+        Args:
+            other: the other surface, in the same frame.
+        """
+        return replace(self, weight=other.weight * self.area / other.area)
 
     def beside(self, others: Sequence[PoseCandidate], top: TableTop) -> PlacedSurface:
         """Return the same among other known objects, which may hide it.
