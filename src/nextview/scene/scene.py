@@ -41,14 +41,13 @@ from nextview.scene.view_policies import (
 )
 from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.reach import cost_of, truth_of
-from nextview.session.repeated import REPEATED
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
 
@@ -400,7 +399,7 @@ class Scene:
         """Update the scene with one frame."""
         known = self._known_frames
         known.refuse(frame)
-        if known.repeats(frame):
+        if repeated(frame, known.frames) is not None:
             return Look(False, warnings=(REPEATED,))
 
         before = self._state

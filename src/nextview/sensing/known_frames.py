@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,11 @@ from nextview.sensing.plausibility import (
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
+
+REPEATED = ViewWarning(
+    "repeated",
+    "this picture was handed in before, to the last bit, and counts once: does the camera hang?",
+)
 
 
 @dataclass(frozen=True)
@@ -103,17 +109,6 @@ class KnownFrames:
         named = frame.camera != "" and bool(own)
         return named and all(one_stand(one, frame) for one in own)
 
-    def repeats(self, frame: Frame) -> bool:
-        """Return True if a frame is bitwise identical to an earlier one.
-
-        Args:
-            frame: new frame.
-        """
-        return any(
-            np.array_equal(one.depth, frame.depth) and _same_mask(one, frame)
-            for one in self.frames
-        )
-
     def _check_cameras(self, frame: Frame) -> list[ViewWarning]:
         """Warn if the pose of a camera has an error relative to the first camera with a name."""
         named = [one for one in self.frames if one.camera]
@@ -156,6 +151,30 @@ class KnownFrames:
             for one, height in zip(shown, below, strict=True)
             if height > max(below) - POSE_SHIFT
         ]
+
+
+def repeated(
+    frame: Frame, earlier: Sequence[Frame], any_mask: bool = False
+) -> int | None:
+    """Return which earlier frame a frame repeats, as from a camera that hangs.
+
+    No two images of a depth camera are bitwise identical, so such a frame was not captured at its
+    stated pose.
+
+    Args:
+        frame: new frame.
+        earlier: used frames, in order.
+        any_mask: whether it repeats one with another mask, too, as all frames show one object.
+
+    Returns:
+        Its position in ``earlier``; None if the frame is new.
+    """
+    for number, one in enumerate(earlier):
+        if np.array_equal(one.depth, frame.depth) and (
+            any_mask or _same_mask(one, frame)
+        ):
+            return number
+    return None
 
 
 def _same_mask(one: Frame, other: Frame) -> bool:

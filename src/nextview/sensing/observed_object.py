@@ -19,7 +19,7 @@ from nextview.sensing import plausibility
 from nextview.sensing.choosing import Parting, choose_instance
 from nextview.sensing.displacement import displacement
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.known_frames import REPEATED, KnownFrames
 from nextview.sensing.masks import (
     SPHERE_MARGIN,
     above_plane,
@@ -182,6 +182,25 @@ class ObservedObject:
         """
         self.state = self._after(frame)
         return self.state.observations[-1]
+
+    def add_again(self, frame: Frame, number: int) -> None:
+        """Process a frame that repeats an earlier one, whose sighting is used again.
+
+        An ObservationError is raised if the frame has no pose.
+
+        Args:
+            frame: of a depth camera.
+            number: of the earlier frame, from 0.
+        """
+        self._known_frames.refuse(frame)
+        state = self.state
+        self.state = replace(
+            state,
+            sightings=(*state.sightings, state.sightings[number]),
+            observations=(*state.observations, state.observations[number]),
+            warnings=(REPEATED,),
+            partings=(),
+        )
 
     def part_otherwise(
         self,

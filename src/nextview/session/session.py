@@ -43,6 +43,7 @@ from nextview.recognition.protocol import (
     classes_of_other_size,
 )
 from nextview.sensing.frame import Frame
+from nextview.sensing.known_frames import REPEATED, repeated
 from nextview.sensing.plausibility import (
     check_last_view,
     check_observation,
@@ -59,7 +60,7 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.repeated import REPEATED, after_repeated, is_repeated
+from nextview.session.repeated import is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
@@ -699,12 +700,14 @@ class Session:
 
         before = object.state
         try:
-            if (repeated := after_repeated(before, frame, self._before)) is not None:
-                object.state = repeated
-            else:
+            known = [one.frame for one in object.sightings[self._before :]]
+            number = repeated(frame, known, any_mask=True)
+            if number is None:
                 object.add(frame)
-                if self.unknown and object.state.partings:
-                    self._part(object)
+            else:
+                object.add_again(frame, self._before + number)
+            if self.unknown and object.state.partings:
+                self._part(object)
 
             self._refuse_disagreement(object)
             self._check_distance(object)
