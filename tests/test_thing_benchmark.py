@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from msgspec.structs import replace as replace_record
@@ -787,12 +788,23 @@ def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsy
 
     joined_things.main([results, again])
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(" | ")[1] for line in lines[2:]] == ["random", "geometry"] * 2
-    record = json.loads((again / "benchmark.json").read_text())
-    (again / "benchmark.json").write_text(
-        json.dumps(record | {"reference": "spread", "compared_with": "spread"})
-    )
-    with pytest.raises(UsageError, match="is compared with spread"):
-        joined_things.read_runs([results, again])
+    rows = [line.split(" | ")[1] for line in lines if line.startswith("| ")]
+    assert rows[1:] == ["random, the reference", "geometry"] * 2
     with pytest.raises(UsageError, match="holds no results"):
         joined_things.main([tmp_path / "nothing"])
+
+
+def test_runs_that_agree_tell_more_together_than_each_alone():
+    rows = [
+        {"run": run, "policy": policy, "measure": "accuracy", "views": 2}
+        | {"difference": gain, "p": p, "families": 50}
+        for run, p in (("one", 0.05), ("two", 0.05))
+        for policy, gain in (
+            ("better", 0.06),
+            ("mixed", 0.06 if run == "one" else -0.06),
+        )
+    ]
+    better, mixed = joined_things.over_all(pd.DataFrame(rows)).splitlines()
+    # two normal deviates of 1.96: their sum over sqrt(2) is 2.77
+    assert better == "better: +6.0 points after 2 views, mean of 2 runs, p = 0.0056"
+    assert mixed == "mixed: +0.0 points after 2 views, mean of 2 runs, p = 1"
