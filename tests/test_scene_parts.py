@@ -7,7 +7,6 @@ import numpy as np
 from small_tables import camera_over, view
 
 import nextview
-from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround, outline_of
 from nextview.scene.parting import (
     MOST_CUT,
@@ -23,6 +22,7 @@ from nextview.scene.tracks import Track
 from nextview.segmentation.instances import instances_of
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
+from nextview.session.judging import Judge
 
 UP = np.array([0, 0, 1.0])
 
@@ -33,7 +33,7 @@ def top_of(frame):
 
 
 def judged_by(ycb):
-    judge = Judge(ycb, 1)
+    judge = Judge(ycb.models, ycb.sphere, ycb.stopping, ycb.unknown, 1)
 
     def judged(tracks):
         results = judge([track.thing for track in tracks])

@@ -263,7 +263,7 @@ class SceneSight:
             self._found[key] = expected_visibility(
                 scene,
                 self.store.sphere.poses[:, :3, 3],
-            ).expected.astype(np.float32)
+            ).astype(np.float32)
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
     def _frame(

@@ -26,7 +26,6 @@ from nextview.scene.grasps import (
     free_grasps,
     within_reach,
 )
-from nextview.scene.judging import Judge
 from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint
@@ -41,12 +40,14 @@ from nextview.scene.view_policies import (
 )
 from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
+from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
+from nextview.session.judging import Judge
 from nextview.session.reach import cost_of, truth_of
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
@@ -177,7 +178,13 @@ class Scene:
         self.system = system.in_any_orientation() if any_orientation else system
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
-        self._judge = Judge(self.system, CORES)
+        self._judge = Judge(
+            self.system.models,
+            self.system.sphere,
+            self.system.stopping,
+            self.system.unknown,
+            CORES,
+        )
         self._widest = self._judge.widest
         self._state = SceneState(region=region)
 
@@ -521,7 +528,7 @@ class Scene:
             up,
             () if earlier is None else earlier.seen.levels,
         )
-        warnings = tuple(self._known_frames.check_mistakes(seen))
+        warnings = tuple(check_mistakes(seen, self._known_frames))
         top = TableTop.of(seen, self.up, earlier, inside, self._widest)
         return replace(top, warnings=warnings)
 

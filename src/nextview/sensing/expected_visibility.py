@@ -214,7 +214,7 @@ class SeenScene:
         floor: height below which nothing belongs to the target; infinity at first.
 
     >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
-    >>> expected_visibility(seen, sphere.poses[:, :3, 3]).expected              # doctest: +SKIP
+    >>> expected_visibility(seen, sphere.poses[:, :3, 3])                       # doctest: +SKIP
     """
 
     occupancy: Occupancy
@@ -272,27 +272,12 @@ class SeenScene:
         )
 
 
-@dataclass(frozen=True)
-class Visibility:
-    """Visible share of an object from V positions, (V,) float64, under three assumptions.
-
-    Attributes:
-        least: all unseen space is solid.
-        expected: unseen space is filled at the average density.
-        most: all unseen space is free.
-    """
-
-    least: Float
-    expected: Float
-    most: Float
-
-
 def expected_visibility(
     seen: SeenScene,
     positions: Floats,
     density: float = DENSITY,
     unseen_part: float = UNSEEN_PART,
-) -> Visibility:
+) -> Float:
     """Return the expected visible share of the object from each position.
 
     The object consists of its observed voxels and, with a lower weight, the unseen voxels of its
@@ -306,7 +291,7 @@ def expected_visibility(
         unseen_part: weight of unseen voxels that may belong to the object.
 
     Returns:
-        Shares of the object with a free line of sight.
+        Share of the object with a free line of sight, (V,) float64.
     """
     lines = sight_lines(
         seen.occupancy.grid,
@@ -408,7 +393,7 @@ class SightLines:
         seen: SeenScene,
         density: float,
         unseen_part: float,
-    ) -> Visibility:
+    ) -> Float:
         """Return the expected visibility; see ``expected_visibility``.
 
         Args:
@@ -417,7 +402,7 @@ class SightLines:
             unseen_part: weight of unseen voxels that may belong to the object.
 
         Returns:
-            The visibility from each position.
+            The visible share from each position, (V,) float64.
         """
         cells = seen.occupancy.cells
         own = self.own
@@ -431,7 +416,7 @@ class SightLines:
         # expected share of the object in each part
         weights = (known + unseen_part * maybe)[self.parts]
         if not weights.any():
-            return Visibility(*np.ones((3, len(self.positions))))
+            return np.ones(len(self.positions))
         cost = ((cells == UNSEEN) & ~own).astype(np.float32)
         cost[cells == OCCLUDER] = SOLID
         # multiples of SOLID come from occluders, the remainder from unseen space
@@ -439,4 +424,4 @@ class SightLines:
         free = passed < SOLID
         share = weights / weights.sum()
         veil = np.exp(-density * self.grid.pitch * np.where(free, passed, 0)) * free
-        return Visibility(share @ (passed == 0), share @ veil, share @ free)
+        return np.asarray(share @ veil, np.float64)

@@ -16,6 +16,7 @@ import numpy as np
 from nextview.errors import ObservationError
 from nextview.sensing.agreement import compare, quick_view
 from nextview.sensing.frame import Frame
+from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.mistakes import (
     Mistake,
     PosedViews,
@@ -85,23 +86,6 @@ class Fact:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What a new frame is compared with.
-
-    Attributes:
-        last: the last frame; None for a first one.
-        up: direction against gravity, (3,), world; None if it is not known.
-        target: expected position of an object, (3,), world, metres; None if it is not known.
-        radius: of the object, metres.
-    """
-
-    last: Frame | None = None
-    up: Float | None = None
-    target: Float | None = None
-    radius: float = 0.0
-
-
-@dataclass(frozen=True)
 class FrameReading:
     """One reading of a frame.
 
@@ -118,7 +102,7 @@ class FrameReading:
     """
 
     frame: Frame
-    known: Known
+    known: KnownFrames
     plane: Plane | None
     depths: Float
     pose: Float
@@ -311,7 +295,7 @@ class Explained:
         return float(np.log(self.prior)) + sum(fact.nats for fact in self.facts)
 
 
-def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
+def check_mistakes(seen: SegmentedFrame, known: KnownFrames) -> list[ViewWarning]:
     """Warn if a frame was probably read with a mistake, or shows what few right frames do.
 
     Args:
@@ -322,6 +306,7 @@ def check_mistakes(seen: SegmentedFrame, known: Known) -> list[ViewWarning]:
         ObservationError: it was certainly read with a mistake, which is named.
     """
     frame = seen.frame
+    known = replace(known, up=None if frame.pose is None else known.upwards)
     views = [] if known.last is None else [quick_view(f) for f in (known.last, frame)]
     last_pose = (known.last or frame).camera_to_world
     poses = np.stack([last_pose, frame.camera_to_world])
@@ -419,7 +404,7 @@ def _other_worlds(read: FrameReading) -> list[Explained]:
         words = "target and pose are of different worlds"
         found.append(Explained(words, _facts(other), OTHER_WORLD))
     if known.last is not None:
-        other = replace(read, known=replace(known, last=None), agreement=0.0)
+        other = replace(read, known=replace(known, frames=()), agreement=0.0)
         words = "the pose is of another world than the last one"
         found.append(Explained(words, _facts(other), OTHER_WORLD))
     return found

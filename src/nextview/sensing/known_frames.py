@@ -1,4 +1,4 @@
-"""Check a new frame against the known world, for sessions and scenes."""
+"""The known world before a new frame, and what is checked of the frame itself."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.frame import Frame, one_stand
-from nextview.sensing.frame_mistakes import Known, check_mistakes
 from nextview.sensing.lean import lean_of
 from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
@@ -20,7 +19,6 @@ from nextview.sensing.plausibility import (
     check_lean,
     check_pose_moved,
 )
-from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
@@ -48,6 +46,17 @@ class KnownFrames:
     target: Float | None = None
     radius: float = 0.0
 
+    @property
+    def last(self) -> Frame | None:
+        """The last frame; None for a first one."""
+        return self.frames[-1] if self.frames else None
+
+    @property
+    def upwards(self) -> Float | None:
+        """Direction against gravity, (3,); the normal of the first visible plane without ``up``."""
+        shown = [plane for plane in self.planes if plane is not None]
+        return shown[0].normal if self.up is None and shown else self.up
+
     def refuse(self, frame: Frame) -> None:
         """Reject input that cannot be another frame of the same world, whatever it shows.
 
@@ -65,23 +74,6 @@ class KnownFrames:
             raise ObservationError(
                 "a second frame needs a pose, and the first one too: how else do they fit together?"
             )
-
-    def check_mistakes(self, seen: SegmentedFrame) -> list[ViewWarning]:
-        """Warn if a frame was probably read with a mistake, see ``frame_mistakes``.
-
-        Args:
-            seen: new frame with its surfaces.
-
-        Raises:
-            ObservationError: it certainly was.
-        """
-        last = self.frames[-1] if self.frames else None
-        up = self.up
-        if up is None and self.frames:
-            shown = [plane for plane in self.planes if plane is not None]
-            up = shown[0].normal if shown else None
-        up = None if seen.frame.pose is None else up
-        return check_mistakes(seen, Known(last, up, self.target, self.radius))
 
     def check(self, frame: Frame, plane: Plane | None) -> list[ViewWarning]:
         """Return likely problems of a frame that was not rejected; usually empty.

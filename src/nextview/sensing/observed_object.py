@@ -19,6 +19,7 @@ from nextview.sensing import plausibility
 from nextview.sensing.choosing import Parting, choose_instance
 from nextview.sensing.displacement import displacement
 from nextview.sensing.frame import Frame
+from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames
 from nextview.sensing.masks import (
     SPHERE_MARGIN,
@@ -204,16 +205,16 @@ class ObservedObject:
 
     def part_otherwise(
         self,
-        p_value: Callable[[Sequence[Observation]], float],
+        p_value: Callable[[ObservedObject], float],
     ) -> None:
         """Choose the part of the segmentation that is the object by the best-explained views.
 
         Candidates are an instance, an instance with everything that touches it, or a piece of one.
 
         Args:
-            p_value: function from views to their p-value as views of a known thing.
+            p_value: function from an object to its p-value as a known thing.
         """
-        found = [self.state]
+        found = [self]
         for parting in self.state.partings:
             other = copy(self)
             revision = self.revision + 1
@@ -221,10 +222,10 @@ class ObservedObject:
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame_as_given)
-                found.append(other.state)
+                found.append(other)
         if len(found) > 1:
-            values = [p_value(state.observations) for state in found]
-            self.state = found[int(np.argmax(values))]
+            values = [p_value(thing) for thing in found]
+            self.state = found[int(np.argmax(values))].state
 
     def _after(self, frame: Frame) -> ObjectState:
         """Return the state after a frame, running all stages from frame to observation."""
@@ -234,7 +235,7 @@ class ObservedObject:
 
         up = self._up(frame)
         segmented = self._segmented(frame, up)
-        warnings = known.check_mistakes(segmented)
+        warnings = check_mistakes(segmented, known)
         parting = before.parting
         pixels = self._pixels(segmented, parting)
         partings: tuple[Parting, ...] = ()

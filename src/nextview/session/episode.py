@@ -42,8 +42,7 @@ class Step:
         stopped: whether the episode ended with this view, (A,).
         next_views: next view of each episode, (A,); -1 if it ended.
         total: sum of the log-evidence up to this view, (A, D), see ``belief.log_evidence_of``.
-        seen: weighted number of views so far in which the object was visible, (A,), see
-            ``Calibration.weights``.
+        seen: number of views so far in which the object was visible, (A,).
         state: state that was passed to the policy for the episodes that continue; None if all
             ended.
         joint: joint belief from all views so far, one for each of the A episodes, None before the
@@ -499,7 +498,7 @@ class Episodes:
                 expected_visibility(
                     self._seen_scene(int(episode), scenes),
                     positions,
-                ).expected
+                )
             )
 
         return np.stack(found)

@@ -1,6 +1,9 @@
 """The result of an episode: answer, confidence, pose and figure."""
 
+from __future__ import annotations
+
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +21,7 @@ from nextview.recognition.poses import (
     place_in_words,
     uncertainty_of,
 )
-from nextview.recognition.protocol import JointBelief
+from nextview.recognition.protocol import JointBelief, classes_of_other_size
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View, is_doubtful
@@ -26,6 +29,9 @@ from nextview.types import Float
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from nextview.recognition.inference import Models
+    from nextview.sensing.observed_object import ObservedObject
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +81,39 @@ class Recognition:
     unknown_rate: float = 0.0
     impossible: tuple[str, ...] = ()
     poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        views: Sequence[View],
+        models: Models,
+        sphere: Viewpoints,
+        stopping: Stopping,
+        unknown: float,
+        thing: ObservedObject | None,
+    ) -> Recognition:
+        """Return the result of some views, not confident yet.
+
+        Args:
+            views: in order.
+            models: that judged them.
+            sphere: the candidate views.
+            stopping: the stopping rule.
+            unknown: significance level of the test for unknown objects.
+            thing: the object in the views; None if observations were passed in.
+        """
+        radius = views[-1].observation.radius if views else None
+        return cls(
+            tuple(views),
+            models.classes,
+            False,
+            sphere,
+            stopping,
+            score=models.recogniser.novelty,
+            unknown_rate=unknown,
+            impossible=classes_of_other_size(models.recogniser, radius),
+            poses_in=PoseFrame.of(thing),
+        )
 
     @property
     def seen(self) -> bool:
@@ -386,7 +425,7 @@ class Recognition:
             return ""
         return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
 
-    def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
+    def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
         """Draw the episode: images, values of the views, beliefs, and the camera path.
 
         The outline of the named thing's scan is drawn over the images in its pose, corrected for

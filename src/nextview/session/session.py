@@ -26,21 +26,18 @@ from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import (
     Viewpoints,
     angle_between,
-    azimuth_of,
     direction_of,
 )
 from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
-from nextview.recognition.belief import Stopping, log_evidence_of
+from nextview.recognition.belief import Stopping
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
-from nextview.recognition.novelty import values_of
 from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import (
     JudgesTogether,
     LooksAhead,
-    classes_of_other_size,
 )
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated
@@ -50,8 +47,8 @@ from nextview.sensing.plausibility import (
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
+from nextview.session.judging import Judge
 from nextview.session.limits import Limits, in_words
-from nextview.session.pose_frame import PoseFrame
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
     Reach,
@@ -723,24 +720,14 @@ class Session:
 
     def _part(self, object: ObservedObject) -> None:
         """Try other segmentations of an object that is suspiciously novel."""
-        if self._p_value(object.observations) < SUSPICIOUS * self.unknown:
-            object.part_otherwise(self._p_value)
+        judge = Judge(self.models, self.sphere, self.stopping, self.unknown, 1)
 
-    def _p_value(self, observations: Sequence[Observation]) -> float:
-        """Return the p-value of some views as views of a known thing; 1 without a novelty score."""
-        seen = [one for one in observations if one.seen]
-        if not seen:
-            return 1.0
-        found = self.models.evidence(seen)
-        recogniser = self.models.recogniser
-        if isinstance(recogniser, JudgesTogether):
-            azimuths = azimuth_of(np.stack([direction_of(one.pose) for one in seen]))
-            total = log_evidence_of(found.logits, found.azimuth_bins, azimuths).sum(0)
-            p_value = recogniser.together(seen, total, len(seen)).p_value
-            return 1.0 if p_value is None else p_value
-        if recogniser.novelty is None or found.novelty is None:
-            return 1.0
-        return recogniser.novelty.of_views(values_of(found.novelty))
+        def p_value(thing: ObservedObject) -> float:
+            novelty = judge([thing])[0].novelty
+            return 1.0 if novelty is None else novelty
+
+        if p_value(object) < SUSPICIOUS * self.unknown:
+            object.part_otherwise(p_value)
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Reject frames whose object is as large as the camera distance only in combination.
@@ -1001,18 +988,8 @@ class Session:
         self, views: Sequence[View], object: ObservedObject | None
     ) -> Recognition:
         """Return what some views of the object say, not confident yet."""
-        recogniser = self.models.recogniser
-        radius = views[-1].observation.radius if views else None
-        return Recognition(
-            tuple(views),
-            self.models.classes,
-            False,
-            self.sphere,
-            self.stopping,
-            score=recogniser.novelty,
-            unknown_rate=self.unknown,
-            impossible=classes_of_other_size(recogniser, radius),
-            poses_in=PoseFrame.of(object),
+        return Recognition.of(
+            views, self.models, self.sphere, self.stopping, self.unknown, object
         )
 
     def _why_stranded(self) -> str:

@@ -89,7 +89,7 @@ class View:
             evidence: of this view alone, one row; None if nothing is visible.
             total: sum of the log-evidence up to this view, (D,), see ``belief.log_evidence_of``;
                 None before anything was visible.
-            counted: weighted number of views in the sum, see ``Calibration.weights``.
+            counted: number of views in the sum.
             sphere: the candidate views.
             recogniser: source of the evidence.
             joint: joint belief from all views up to this one; None if views are judged separately.

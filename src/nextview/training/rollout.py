@@ -82,7 +82,7 @@ class DecisionState:
         state: input of the policy.
         total: sum of the log-evidence so far, (N, D).
         travel: so far, grid cells, (N,).
-        seen: weighted number of views with a visible object, (N,).
+        seen: number of views with a visible object, (N,).
     """
 
     state: EpisodeState

@@ -11,18 +11,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import azimuth_of, direction_of
-from nextview.recognition.belief import log_evidence_of
+from nextview.geometry.viewsphere import Viewpoints, azimuth_of, direction_of
+from nextview.recognition.belief import Stopping, log_evidence_of
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.protocol import (
-    JointBelief,
-    JudgesTogether,
-    classes_of_other_size,
-)
+from nextview.recognition.inference import Models
+from nextview.recognition.protocol import JointBelief, JudgesTogether
 from nextview.sensing.observed_object import ObservedObject
-from nextview.session.pose_frame import PoseFrame
 from nextview.session.result import Recognition
-from nextview.session.system import System
 from nextview.session.view import View
 from nextview.types import Floats
 
@@ -33,15 +28,27 @@ class Judge:
     It caches the network outputs of an observation as long as the observation is in use.
     """
 
-    def __init__(self, system: System, threads: int) -> None:
-        """Use the recogniser and the rules of a system.
+    def __init__(
+        self,
+        models: Models,
+        sphere: Viewpoints,
+        stopping: Stopping,
+        unknown: float,
+        threads: int,
+    ) -> None:
+        """Use the models and rules of a system or of a session.
 
         Args:
-            system: with the models, the stopping rule, and the significance level for unknown
-                objects.
+            models: recogniser and map networks.
+            sphere: the candidate views.
+            stopping: the stopping rule.
+            unknown: significance level of the test for unknown objects; 0 disables it.
             threads: number of objects that are judged in parallel.
         """
-        self.system = system
+        self.models = models
+        self.sphere = sphere
+        self.stopping = stopping
+        self.unknown = unknown
         self._threads = threads
         self._said: WeakKeyDictionary[Observation, Evidence] = WeakKeyDictionary()
 
@@ -72,32 +79,24 @@ class Judge:
         new = [seen for seen in observations if seen.seen and seen not in self._said]
         if not new:
             return
-        found = self.system.models.recogniser(new)
+        found = self.models.recogniser(new)
         for row, seen in enumerate(new):
             self._said[seen] = found.select([row])
 
     def _judged(self, thing: ObservedObject) -> Recognition:
         """Recognise one object from all of its views."""
-        system = self.system
-        recogniser = system.models.recogniser
+        recogniser = self.models.recogniser
         seen = [one for one in thing.observations if one.seen]
         joint = None
         if seen and isinstance(recogniser, JudgesTogether):
             total = np.sum([self._log_evidence(one) for one in seen], axis=0)
             joint = recogniser.together(seen, total, len(seen))
 
-        result = Recognition(
-            tuple(self._views(thing, joint)),
-            system.classes,
-            False,
-            system.sphere,
-            system.stopping,
-            score=recogniser.novelty,
-            unknown_rate=system.unknown,
-            impossible=classes_of_other_size(recogniser, thing.observations[-1].radius),
-            poses_in=PoseFrame.of(thing),
+        views = self._views(thing, joint)
+        result = Recognition.of(
+            views, self.models, self.sphere, self.stopping, self.unknown, thing
         )
-        enough = result.seen and self._reached(result.views)
+        enough = result.seen and self._reached(views)
         return replace(result, confident=enough and not result.refused)
 
     def _log_evidence(self, seen: Observation) -> Floats:
@@ -108,7 +107,6 @@ class Judge:
 
     def _views(self, thing: ObservedObject, joint: JointBelief | None) -> list[View]:
         """Return the views of an object; the joint belief is that after the last one."""
-        system = self.system
         total: Floats | None = None
         counted = 0
         views = []
@@ -126,8 +124,8 @@ class Judge:
                 evidence,
                 total,
                 counted,
-                system.sphere,
-                system.models.recogniser,
+                self.sphere,
+                self.models.recogniser,
                 joint if last else None,
             )
             views.append(replace(view, warnings=thing.warnings_of_view(number)))
@@ -137,13 +135,13 @@ class Judge:
         """Return True if the belief is high enough."""
         counted = np.cumsum([view.observation.seen for view in views])
         beliefs = np.stack([view.belief for view in views])
-        along = self.system.stopping.reached_along(beliefs, np.maximum(counted, 1))
+        along = self.stopping.reached_along(beliefs, np.maximum(counted, 1))
         return bool(along[-1])
 
     @property
     def widest(self) -> float | None:
         """Diameter of the largest taught thing, metres; None if no sizes are known."""
-        card = getattr(self.system.models.recogniser, "card", None)
+        card = getattr(self.models.recogniser, "card", None)
         if card is None or card.size is None:
             return None
         return 2 * float(card.size.largest)
