@@ -8,7 +8,7 @@ what it is and where it lies. Only ``truth`` reads the latter.
 
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,7 +33,6 @@ EPISODE_FILE = "episode.json"
 FROZEN_FORMAT = 1
 LARGEST_FROZEN_VIEWS = 400  # of an episode
 
-NumberText = Annotated[str, msgspec.Meta(pattern="^[0-9]{4,8}$")]
 Matrix = tuple[tuple[float, ...], ...]
 
 

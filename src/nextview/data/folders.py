@@ -25,7 +25,6 @@ from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
 from nextview.recognition.model_card import find_card
 
-SPLITS = ("train", "test", "val")
 SPLIT_NAMES = {  # names of folders, in lower case, and their splits
     "train": "train",
     "training": "train",
@@ -101,7 +100,7 @@ class Entry:
         path: its file.
         name: unique in the dataset.
         label: its class.
-        split: one of SPLITS, or "".
+        split: "train", "test" or "val"; "" for none.
         layout: of the folder, such as "CLASS/MESH".
     """
 

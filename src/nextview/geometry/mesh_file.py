@@ -39,7 +39,6 @@ OFF_HEADER = re.compile(
 OFF_COUNTS = re.compile(rb"\s*(\d+)\s+(\d+)(?:\s+\d+(?=[ \t]*(?:\n|$)))?[ \t]*(?=\n|$)")
 MeshArrays = tuple[Float, Index]  # vertices, (V, 3), and triangles, (F, 3)
 GLB_TRIANGLES = 4
-GLB_STRIP = 5
 GLB_FAN = 6
 GLB_NODES = 20_000  # Trimesh takes some seconds to place so many
 

@@ -170,7 +170,7 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
                     changed |= {row, other}
 
     rows = [row for row in sorted(changed) if found[row].frames]
-    judged = bench_judged([found[row] for row in rows], benches)
+    judged = benches[-1].judge([found[row] for row in rows])
     for row, track in zip(rows, judged, strict=True):
         found[row] = track
     return [
@@ -196,7 +196,7 @@ def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
                     (one, other, _union([tracks[one], tracks[other]], benches[-1]))
                 )
 
-    judged = bench_judged([union for _, _, union in pairs], benches)
+    judged = benches[-1].judge([union for _, _, union in pairs])
     found: dict[int, Track | None] = dict(enumerate(tracks))
     changed: set[int] = set()
     for (one, other, _), union in zip(pairs, judged, strict=True):
@@ -238,16 +238,6 @@ def _explained(tracks: Sequence[Track], benches: Sequence[Bench]) -> float:
         if track.mask_in(bench.number) is not None
     ]
     return sum(one for one, _ in fits) / max(sum(every for _, every in fits), 1)
-
-
-def bench_judged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
-    """Judge objects with the recogniser of the first frame, if there is one.
-
-    Args:
-        tracks: objects, not judged yet.
-        benches: the frames.
-    """
-    return benches[-1].judge(tracks) if tracks else []
 
 
 def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | None:

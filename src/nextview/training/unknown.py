@@ -29,16 +29,12 @@ from nextview.types import Float, Float32, Index
 REMEMBERED_VIEWS = 3
 """Stored views of each known object in its original shape, and as many of a stretched copy."""
 CALIBRATION_VIEWS = 5
-"""Views of each held-out object, for each of ``CONDITIONS``."""
+"""Views of each held-out object, for each deformation, through the sensor and without one."""
 MAX_ELEVATION = np.radians(75.0)
 """Views are drawn between the horizontal plane and this elevation."""
 DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
 """Real objects are not aligned with the axes of a dataset, and few have the proportions of one of
 its meshes.
-"""
-CONDITIONS = 2 * len(DEFORMATIONS)
-"""Conditions of the views of a held-out object: all deformations through the sensor, then all
-without one.
 """
 QUANTILES_FITTED = 201  # number of quantiles
 
@@ -144,8 +140,8 @@ def _looked_at(
 ) -> Float32 | str:
     """Return embeddings of views of a mesh, or the reason why there are none.
 
-    For a held-out object, (CONDITIONS, views, F). For any other, noise-free views of each
-    deformation, (deformations, views, F).
+    For a held-out object, of each deformation through the sensor, then of each without one,
+    (2 deformations, views, F). For any other, noise-free views, (deformations, views, F).
     """
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     try:
