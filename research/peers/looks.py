@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,9 +22,14 @@ from scipy.spatial import cKDTree
 
 Float = NDArray[np.float64]
 
-SAMPLES = 2000  # points on each scan
+DENSE = 20_000  # points of a scan, and of what is seen, that points of the other may be nearest to
+SAMPLES = 2000  # points of a scan that are matched
 JUDGED = 500  # points of the scan, and of what is seen, that judge a pose
-ENOUGH = 100  # points that are matched at all
+ENOUGH = 100  # pixels of a view that is matched at all
+STEPS = (
+    20  # of a grid over what is seen, in whose cells the points of a view are averaged
+)
+FINEST = 0.001  # metres: the smallest step of that grid
 FARTHEST = 0.01  # metres: what is farther from its nearest point counts as so far
 SURE = 0.5  # confidence that a robot acts on
 
@@ -43,31 +48,70 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class Seen:
+    """What all views so far show of the thing.
+
+    Attributes:
+        views: with the points of each averaged in the cells of a grid.
+        points: of all these views, (N, 3), metres, world.
+        step: side of a cell, metres.
+        judged: points that judge a pose, (at most JUDGED, 3), metres, world.
+        tree: of at most DENSE points as they were measured.
+    """
+
+    views: tuple[View, ...]
+    points: Float
+    step: float
+    judged: Float
+    tree: cKDTree
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> Seen:
+        """What some views show.
+
+        Args:
+            views: at least one, with a point or more each.
+        """
+        measured = np.concatenate([view.points for view in views])
+        low, high = np.percentile(measured, (2, 98), axis=0)
+        step = max(float(np.linalg.norm(high - low)) / STEPS, FINEST)
+        even = tuple(View(averaged(view.points, step), view.camera) for view in views)
+        points = np.concatenate([view.points for view in even])
+        some = np.random.default_rng(0).permutation(measured)[:DENSE]
+        return cls(even, points, step, some[:JUDGED], cKDTree(some))
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Points that are spread evenly over a scan, in its own frame.
 
     Attributes:
-        points: (SAMPLES, 3), metres.
+        points: (SAMPLES, 3), metres, in random order.
         normals: outward unit vectors, (SAMPLES, 3).
-        tree: of the points.
+        tree: of DENSE points.
     """
 
     points: Float
     normals: Float
     tree: cKDTree
 
-    def facing(self, turn: Float, views: Sequence[View]) -> NDArray[np.bool_]:
-        """Which points face a camera when the scan is turned and lies where the views look.
+    def facing(self, turn: Float, seen: Seen) -> Float:
+        """The judging points that face a camera if the scan is turned and lies where it is seen;
+        all where none does.
 
         Args:
             turn: from the scan's frame to the world, (3, 3).
-            views: at least one.
-        """
-        centre = np.concatenate([view.points for view in views]).mean(0)
-        cameras = np.stack([view.camera for view in views]) - centre
-        return (self.normals @ turn.T @ cameras.T > 0).any(1)
+            seen: where it lies.
 
-    def misfit(self, pose: Float, views: Sequence[View]) -> float:
+        Returns:
+            (at most JUDGED, 3), metres, in the scan's frame.
+        """
+        cameras = np.stack([view.camera for view in seen.views])
+        towards = (cameras - seen.points.mean(0)) @ turn
+        faces = (self.normals[:JUDGED] @ towards.T > 0).any(1)
+        return self.points[:JUDGED][faces | ~faces.any()]
+
+    def misfit(self, pose: Float, seen: Seen) -> float:
         """How far what is seen is from the scan, and the scan from what is seen, metres.
 
         The sum of two means of clipped distances. Of the points of the scan that face a camera
@@ -75,21 +119,34 @@ class Scan:
 
         Args:
             pose: from the scan's frame to the world, (4, 4).
-            views: at least one.
+            seen: where it lies.
         """
-        seen = thinned(views, JUDGED)
         turn, shift = pose[:3, :3], pose[:3, 3]
-        there, _ = self.tree.query((seen - shift) @ turn)
-        faces = self.facing(turn, views)[:JUDGED]
-        back, _ = cKDTree(seen).query(self.points[:JUDGED][faces] @ turn.T + shift)
+        there, _ = self.tree.query(
+            (seen.judged - shift) @ turn, distance_upper_bound=FARTHEST
+        )
+        back, _ = seen.tree.query(
+            self.facing(turn, seen) @ turn.T + shift, distance_upper_bound=FARTHEST
+        )
         nearer = np.sort(back)[: (np.size(back) + 1) // 2]
         means = [np.minimum(each, FARTHEST).mean() for each in (there, nearer)]
         return float(sum(means))
 
+    def best(self, poses: Iterable[Float], seen: Seen) -> Fit | None:
+        """The pose with the least misfit; None without one.
+
+        Args:
+            poses: from the scan's frame to the world, (4, 4) each. Those that are not finite are
+                left out.
+            seen: where it lies.
+        """
+        fits = [Fit(self.misfit(p, seen), p) for p in poses if np.isfinite(p).all()]
+        return min(fits, key=lambda fit: fit.misfit, default=None)
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The best pose of a scan.
+    """A pose of a scan.
 
     Attributes:
         misfit: of the scan at it, metres.
@@ -104,15 +161,22 @@ class Fit:
 def scan_of(name: str) -> Scan:
     """The scan NAME.ply in the folder that the command line names."""
     mesh = trimesh.load(Path(sys.argv[1]) / f"{name}.ply")
-    points, faces = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
-    points = np.asarray(points)
-    return Scan(points, mesh.face_normals[faces], cKDTree(points))
+    points, faces = trimesh.sample.sample_surface(mesh, DENSE, seed=0)
+    normals = mesh.face_normals[faces[:SAMPLES]]
+    return Scan(np.asarray(points)[:SAMPLES], normals, cKDTree(points))
 
 
-def thinned(views: Sequence[View], count: int) -> Float:
-    """So many points of all views, always the same ones, (at most COUNT, 3)."""
-    points = np.concatenate([view.points for view in views])
-    return np.random.default_rng(0).permutation(points)[:count]
+def averaged(points: Float, step: float) -> Float:
+    """Means of the points in each cell of a grid, (M, 3), metres.
+
+    Args:
+        points: (N, 3), metres.
+        step: side of a cell, metres.
+    """
+    cells = np.floor(points / step)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell.ravel(), weights=column) for column in points.T]
+    return np.stack(sums, 1) / count[:, None]
 
 
 def view_of(look: dict[str, Any]) -> View:
@@ -127,13 +191,29 @@ def view_of(look: dict[str, Any]) -> View:
     )
 
 
-def answer_looks(fitted: Callable[[Scan, Sequence[View]], Fit]) -> None:
+def said_of(fits: dict[str, Fit]) -> dict[str, Any]:
+    """The answer that names the scan that fits best; unknown without one.
+
+    Args:
+        fits: of the scans that fit anywhere, by name.
+    """
+    if not fits:
+        return {"name": None, "confidence": 0.0, "confident": False}
+    name, *others = sorted(fits, key=lambda each: fits[each].misfit)
+    second = fits[others[0]].misfit if others else 2 * FARTHEST
+    sure = 1 - fits[name].misfit / second if second > 0 else 0.0
+    pose = fits[name].pose.tolist()
+    return {"name": name, "confidence": sure, "confident": sure > SURE, "pose": pose}
+
+
+def answer_looks(matcher: Callable[[Seen], Callable[[Scan], Fit | None]]) -> None:
     """Answer each line of the standard input, until it ends.
 
     The thing is named whose scan fits best, and the next view is the farthest from those so far.
 
     Args:
-        fitted: finds the best pose of a scan in all views so far.
+        matcher: takes what is seen, and returns what finds the best pose of a scan in it; None
+            where it finds none.
     """
     views: list[View] = []
     taken: list[int] = []
@@ -143,14 +223,13 @@ def answer_looks(fitted: Callable[[Scan, Sequence[View]], Fit]) -> None:
         taken.append(look["view"])
         views.append(view_of(look))
 
-        answer: dict[str, Any] = {"name": None, "confidence": 0.0, "confident": False}
         shown = [view for view in views if len(view.points) >= ENOUGH]
+        fits: dict[str, Fit] = {}
         if shown:
-            fits = {name: fitted(scan_of(name), shown) for name in look["things"]}
-            name, second = sorted(fits, key=lambda each: fits[each].misfit)[:2]
-            sure = 1 - fits[name].misfit / fits[second].misfit
-            answer = {"name": name, "confidence": sure, "confident": sure > SURE}
-            answer["pose"] = fits[name].pose.tolist()
+            fitted = matcher(Seen.of(shown))
+            found = {name: fitted(scan_of(name)) for name in look["things"]}
+            fits = {name: fit for name, fit in found.items() if fit is not None}
+        answer = said_of(fits)
         if look["free"]:
             places = np.array(look["poses"])[:, :3, 3]
             gaps = np.linalg.norm(places[look["free"], None] - places[taken], axis=2)

@@ -13,7 +13,9 @@ from nextview.checks import plugins
 
 ROOT = Path(__file__).parents[2]
 PIPELINE = runpy.run_path(str(ROOT / "tests/conftest.py"))
-shared, furniture, views = (PIPELINE[name] for name in ("shared", "furniture", "views"))
+shared, furniture, views, archive = (
+    PIPELINE[name] for name in ("shared", "furniture", "views", "archive")
+)
 
 
 @pytest.fixture(scope="package", autouse=True)
