@@ -235,7 +235,7 @@ class ObservedObject:
 
         up = self._up(frame)
         segmented = self._segmented(frame, up)
-        warnings = check_mistakes(segmented, known)
+        warnings = tuple(check_mistakes(segmented, known))
         parting = before.parting
         pixels = self._pixels(segmented, parting)
         partings: tuple[Parting, ...] = ()
@@ -251,10 +251,11 @@ class ObservedObject:
                 "no support plane is seen, so there is no telling where up is: give it, and the"
                 " camera's pose"
             )
-        warnings += known.check(frame, plane)
+        warnings += tuple(known.check(frame, plane))
 
         mask = self._without_plane(pixels, segmented, plane)
         seen = sighting_of(frame, mask, plane, segmented.noise, self.denoise)
+        seen = replace(seen, warnings=warnings)
         displaced = None
         if before.sightings and self.known is None:
             displaced = displacement(seen, before.sightings)
@@ -265,11 +266,9 @@ class ObservedObject:
             assert plane is not None
             up = plane.normal
         after = self._known_by([*before.sightings, seen], up)
-        warnings += self._check(after, plane)
-        if not any(warning.holds for warning in warnings):
-            warnings += plausibility.check_last_view(after.observations)
-        warnings += plausibility.check_place(displaced)
-        return replace(after, warnings=tuple(warnings), partings=partings)
+        warnings = self._warnings_of_view(after, -1, self._check(after, plane))
+        warnings += tuple(plausibility.check_place(displaced))
+        return replace(after, warnings=warnings, partings=partings)
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
         """Replace the state of the object by some sightings.
@@ -292,28 +291,39 @@ class ObservedObject:
         Args:
             number: of the view, from 0, or backwards from -1.
         """
-        observations = self.state.observations
-        warnings = list(self.state.sightings[number].warnings)
+        return self._warnings_of_view(self.state, number)
+
+    def _warnings_of_view(
+        self, state: ObjectState, number: int, more: Sequence[ViewWarning] = ()
+    ) -> tuple[ViewWarning, ...]:
+        """Return likely problems of a view in a state of the object, after some known ones."""
+        observations = state.observations
+        warnings = [*state.sightings[number].warnings]
         warnings += plausibility.check_observation(observations[number])
+        warnings += more
         if not any(warning.holds for warning in warnings):
             last = range(len(observations))[number]
             found = plausibility.check_last_view(observations[: last + 1])
-            if found:  # pose errors alone are no contradiction
-                found = plausibility.check_last_view(self._without_displacements(last))
+            if found and self.known is None:  # pose errors are no contradiction
+                found = plausibility.check_last_view(
+                    self._without_displacements(state, last)
+                )
             warnings += found
         return tuple(warnings)
 
-    def _without_displacements(self, last: int) -> list[Observation]:
+    def _without_displacements(
+        self, state: ObjectState, last: int
+    ) -> list[Observation]:
         """Return the observations up to one, without the displacements caused by pose errors."""
-        first, *others = self.state.sightings[: last + 1]
+        assert state.frame is not None
+        first, *others = state.sightings[: last + 1]
         mended = [first]
         for sighting in others:
             displaced = displacement(sighting, mended)
             if displaced is not None and displaced.mended:
                 sighting = sighting.shifted(-displaced.shift)
             mended.append(sighting)
-        frame = self.object_frame
-        return [observation_of(one, frame, self.life_size) for one in mended]
+        return [observation_of(one, state.frame, self.life_size) for one in mended]
 
     @property
     def _known_frames(self) -> KnownFrames:
@@ -446,10 +456,10 @@ class ObservedObject:
         return object_frame_of(sightings, upright_axes(up, front))
 
     def _check(self, after: ObjectState, plane: Plane | None) -> list[ViewWarning]:
-        """Return likely problems of a frame of the object."""
+        """Return likely problems of the size and the place of the object after a frame."""
         before = self.state
         assert after.frame is not None
-        warnings = plausibility.check_observation(after.observations[-1])
+        warnings = []
         if before.frame is not None:
             radius = after.frame.radius
             warnings += plausibility.check_size(radius, before.frame.radius)
