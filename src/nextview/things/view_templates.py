@@ -263,8 +263,8 @@ def templates_of(caster: SurfaceCaster, threads: int = 1) -> ViewTemplates:
     """
     digest = sha256()
     for surface in caster.surfaces:
-        digest.update(np.ascontiguousarray(surface.vertices))
-        digest.update(np.ascontiguousarray(surface.faces))
+        digest.update(surface.vertices.tobytes())
+        digest.update(surface.faces.tobytes())
     templates = _IN_USE.get(digest.digest())
     if templates is None:
         templates = ViewTemplates(caster, threads)
