@@ -24,7 +24,9 @@ import nextview
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
+from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
+from nextview.things import view_templates
 from nextview.things.memory import open_memory
 
 LONG = (
@@ -75,6 +77,25 @@ def shared(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
         return root / name
 
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_episodes():
+    """Let ``learn`` test its things in fewer episodes, which take most of its time; what it
+    otherwise tests at least is the value.
+    """
+    usual = verification_fit.ENOUGH_EPISODES
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(verification_fit, "ENOUGH_EPISODES", 6)
+        yield usual
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_templates():
+    """Keep the templates of each memory for the whole run, not only while they are in use."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(view_templates, "_IN_USE", {})
+        yield
 
 
 @pytest.fixture(scope="session")

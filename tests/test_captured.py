@@ -362,8 +362,18 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("layout", WRITERS)
-@pytest.mark.parametrize("what", MISTAKES)
+OF_LAYOUT = ("quaternions", "inverse", "unit")
+"""These are other mistakes in the files of each layout; the rest is the same once it is read."""
+
+
+@pytest.mark.parametrize(
+    ("what", "layout"),
+    [
+        (what, layout)
+        for what in MISTAKES
+        for layout in (WRITERS if what in OF_LAYOUT else ["7scenes"])
+    ],
+)
 def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
     depths, poses = nine
     change, options, said = MISTAKES[what]

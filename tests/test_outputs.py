@@ -4,16 +4,19 @@ is left beside it.
 Commands that write into what they are given (measure, fit into a card) and download are not here.
 """
 
+import json
 import os
 import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from pipeline import refused, run_python
+from small_tables import camera_over, meshes_of, view
 
 from nextview.benchmark.submit import SubmitOptions, submit
-from nextview.captured.bundled_table import BUNDLED_TABLE
 from nextview.captured.writing import write_capture
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
@@ -98,6 +101,20 @@ OWN_ONLY = {
 """They go on with an unfinished output of their own, and replace no folder of anything else."""
 
 
+def write_frame(folder):
+    """One frame of a mug, in the layout of the bundled table."""
+    frame = camera_over(list(meshes_of(["mug"]).values())).frame(view(20))
+    for kind in ("depth", "poses"):
+        (folder / kind).mkdir(parents=True)
+    steps = np.rint(1000 * frame.depth).astype(np.uint16)
+    Image.fromarray(steps).save(folder / "depth/000000.png")
+    np.savetxt(folder / "poses/000000.txt", frame.pose)
+    k = frame.intrinsics
+    camera = {"fx": k[0, 0], "fy": k[1, 1], "depth_scale": 0.001}
+    camera |= {"ppx": k[0, 2] - 0.5, "ppy": k[1, 2] - 0.5}
+    (folder / "intrinsics.json").write_text(json.dumps(camera))
+
+
 @pytest.fixture(scope="session")
 def made(
     furniture,
@@ -127,12 +144,9 @@ def made(
         archive, folder / "submitted/fixed.json", SubmitOptions("fixed", max_views=1)
     )
     shutil.copy(SAMPLE, folder / "scan")
-    shutil.copytree(BUNDLED_TABLE, folder / "first_frame")
-    for kind in ("depth", "poses"):
-        for later in sorted((folder / "first_frame" / kind).iterdir())[1:]:
-            later.unlink()
+    write_frame(folder / "mug_frame")
     return {
-        "first_frame": folder / "first_frame",
+        "mug_frame": folder / "mug_frame",
         "capture": folder / "capture",
         "scan": folder / "scan",
         "furniture": furniture,
@@ -198,7 +212,7 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
     if name.startswith("train"):
         pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nextview.cli.demo.BUNDLED_TABLE", made["first_frame"])
+    monkeypatch.setattr("nextview.cli.demo.BUNDLED_TABLE", made["mug_frame"])
     before, out, *after = WRITES[name]
     command = [
         *before.format(**made).split(),

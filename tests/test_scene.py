@@ -1,6 +1,7 @@
 """All things on a table: found, named and placed in one frame or several, and what goes wrong."""
 
 import json
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -23,10 +24,24 @@ def by_name(scene) -> dict:
     return {thing.name: thing for thing in scene.objects}
 
 
-def test_all_things_are_found_named_and_placed_in_one_frame(ycb, ycb_meshes):
+@pytest.fixture(scope="module")
+def first_look(ycb, ycb_meshes):
+    """A camera over the things, a scene that has taken one frame of it, and what that changed."""
     camera = camera_over(list(ycb_meshes.values()))
     scene = nextview.Scene(ycb)
-    look = scene.update(camera.frame(view(20)))
+    return camera, scene, scene.update(camera.frame(view(20)))
+
+
+@pytest.fixture
+def seen_once(first_look, ycb_meshes):
+    """The camera and the scene after that frame, for one test."""
+    camera = camera_over(list(ycb_meshes.values()))
+    camera.frame(view(20))
+    return camera, copy(first_look[1])
+
+
+def test_all_things_are_found_named_and_placed_in_one_frame(first_look, ycb_meshes):
+    camera, scene, look = first_look
     assert look.taken
     assert len(look.appeared) == len(ycb_meshes)
 
@@ -115,10 +130,8 @@ def test_strangers_are_unknown_and_have_a_size(ycb):
     )
 
 
-def test_a_thing_that_was_taken_away_is_gone(ycb, ycb_meshes):
-    camera = camera_over(list(ycb_meshes.values()))
-    scene = nextview.Scene(ycb)
-    scene.update(camera.frame(view(20)))
+def test_a_thing_that_was_taken_away_is_gone(seen_once, ycb_meshes):
+    camera, scene = seen_once
     mug = by_name(scene)["mug"].number
     camera.change(without(camera.table, "mug"))
     look = scene.update(camera.frame(view(80)))
@@ -147,24 +160,18 @@ def test_a_thing_that_was_moved_stays_itself(ycb, ycb_meshes):
     assert np.allclose(after.place - before.place, shift[:3, 3], atol=0.01)
 
 
-@pytest.mark.parametrize("wrong", ["shifted", "turned"])
-def test_a_frame_with_a_wrong_pose_is_left_out(ycb, ycb_meshes, wrong):
-    camera = camera_over(list(ycb_meshes.values()))
-    scene = nextview.Scene(ycb)
-    scene.update(camera.frame(view(20)))
-    before = {thing.number: thing.place for thing in scene.objects}
+def test_a_frame_with_a_wrong_pose_is_left_out(seen_once, ycb_meshes):
+    camera, scene = seen_once
+    before = {thing.number for thing in scene.objects}
     frame = camera.frame(view(80))
-    pose = frame.pose.copy()
-    if wrong == "shifted":
-        pose[:2, 3] += 0.15
-    else:
-        pose = view(130) @ np.linalg.inv(view(80)) @ pose
-    look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
-    assert not look.taken
-    assert [warning.name for warning in look.warnings] == ["pose"]
-    assert {
-        thing.number: thing.place for thing in scene.objects
-    }.keys() == before.keys()
+    shifted = frame.pose.copy()
+    shifted[:2, 3] += 0.15
+    turned = view(130) @ np.linalg.inv(view(80)) @ frame.pose
+    for pose in (shifted, turned):
+        look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
+        assert not look.taken
+        assert [warning.name for warning in look.warnings] == ["pose"]
+        assert {thing.number for thing in scene.objects} == before
 
     assert scene.update(frame).taken
     assert set(by_name(scene)) == set(ycb_meshes)
@@ -183,19 +190,21 @@ def test_the_next_view_shows_hidden_areas(ycb, ycb_meshes):
 
 
 def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    camera = camera_over([ycb_meshes["mug"]])
+    frame = camera.frame(view(20))
     scene = nextview.Scene(ycb, reachable=lambda pose: pose[0, 3] > 0.1)
     assert scene.target is None
-    scene.update(camera.frame(view(20)))
-    assert scene.target[0, 3] > 0.1
-    assert scene.target[2, 3] > 0.1
+    scene.update(frame)
+    target = scene.target
+    assert target[0, 3] > 0.1
+    assert target[2, 3] > 0.1
     nowhere = nextview.Scene(ycb, reachable=lambda pose: False)
-    nowhere.update(camera.frame(view(20)))
+    nowhere.update(frame)
     assert nowhere.target is None
 
 
 def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    camera = camera_over([ycb_meshes["mug"]])
     frame = camera.frame(view(20))
     asked = []
 
@@ -220,7 +229,7 @@ def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
 
 
 def test_a_view_that_failed_is_no_target_again(ycb, ycb_meshes):
-    camera = camera_over(list(ycb_meshes.values()))
+    camera = camera_over([ycb_meshes["mug"]])
     scene = nextview.Scene(ycb, distance=0.65)
     with pytest.raises(SessionError, match="no view was asked for"):
         scene.failed()
@@ -257,8 +266,7 @@ def test_a_table_full_of_unknown_things(ycb):
         rings.append(make_mesh(ring.vertices, ring.faces, f"ring {number}", "m"))
     camera = camera_over(rings, gap=0.1)
     scene = nextview.Scene(ycb)
-    for degrees in (20, 110):
-        scene.update(camera.frame(view(degrees)))
+    scene.update(camera.frame(view(20)))
     assert len(scene.objects) >= 3
     assert not any(
         thing.confident and thing.pose is not None for thing in scene.objects

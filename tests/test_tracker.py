@@ -1,5 +1,6 @@
 """Things are followed from frame to frame: moved, hidden, taken away and found again."""
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,11 +19,32 @@ NAMES = ("mustard_bottle", "tuna_fish_can", "banana")
 STEP = np.array([0.004, -0.003])  # metres a frame, 0.15 m/s at 30 Hz
 
 
-@pytest.fixture
-def watched(ycb):
-    camera = camera_over(list(meshes_of(NAMES).values()), seed=8)
+@pytest.fixture(scope="module")
+def meshes():
+    return list(meshes_of(NAMES).values())
+
+
+def first_frame(meshes):
+    """A camera over the things, and its first frame."""
+    camera = camera_over(meshes, seed=8)
+    return camera, camera.frame(view(20))
+
+
+@pytest.fixture(scope="module")
+def first_look(ycb, meshes):
+    """A scene after this frame."""
+    camera, frame = first_frame(meshes)
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
-    scene.update(camera.frame(view(20)))
+    scene.update(frame)
+    return scene
+
+
+@pytest.fixture
+def watched(first_look, meshes):
+    """The camera and the scene for one test."""
+    camera, _ = first_frame(meshes)
+    scene = copy(first_look)
+    scene.segmentation = lambda frame: camera.owner + 1
     assert {thing.name for thing in scene.objects if thing.confident} == set(NAMES)
     return camera, scene
 

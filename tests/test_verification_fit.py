@@ -11,6 +11,7 @@ import trimesh
 import nextview
 from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry, read_card
+from nextview.teaching import verification_fit
 from nextview.teaching.verification_fit import (
     DEFAULT_THINGS,
     Shown,
@@ -174,7 +175,10 @@ def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_thei
     ("things", "of", "each"),
     [(1, 1, 20), (3, 3, 6), (1, 78, 1), (78, 78, 1), (1000, 1000, 1)],
 )
-def test_a_bounded_number_of_episodes_is_shown(things, of, each):
+def test_a_bounded_number_of_episodes_is_shown(
+    things, of, each, few_episodes, monkeypatch
+):
+    monkeypatch.setattr(verification_fit, "ENOUGH_EPISODES", few_episodes)
     items = to_be_shown(range(things), of, np.random.default_rng(0))
     assert len(items) == min(things, 150) * each
     assert len(set(items)) == len(items)

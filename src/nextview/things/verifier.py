@@ -31,7 +31,7 @@ from nextview.things.stability import Stability, carried, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
-from nextview.things.view_templates import ViewTemplates, rank_within
+from nextview.things.view_templates import ViewTemplates, rank_within, templates_of
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Index, Mask
 
@@ -370,7 +370,7 @@ class Verifier:
     @cached_property
     def templates(self) -> ViewTemplates:
         """Templates of the things from all directions, which propose orientations."""
-        return ViewTemplates(self.caster)
+        return templates_of(self.caster)
 
     def prepare(self, threads: int = 0) -> None:
         """Render the templates now, so that they do not delay the first frame.
@@ -379,7 +379,7 @@ class Verifier:
             threads: number of threads; 0 for one on each core.
         """
         if "templates" not in vars(self):
-            self.templates = ViewTemplates(self.caster, threads)
+            self.templates = templates_of(self.caster, threads)
 
     def _started(
         self,

@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
+from weakref import WeakValueDictionary
 
 import numpy as np
 from scipy import ndimage
@@ -247,6 +249,27 @@ class ViewTemplates:
         centres = middles @ view.pose[:3, :3].T + view.pose[:3, 3]
         centres += np.einsum("nij,nj->ni", looks, self.offsets[rows])
         return looks @ self.rotations[rows], centres
+
+
+_IN_USE: WeakValueDictionary[bytes, ViewTemplates] = WeakValueDictionary()
+
+
+def templates_of(caster: SurfaceCaster, threads: int = 1) -> ViewTemplates:
+    """Templates of surfaces; those of the same surfaces are shared while they are in use.
+
+    Args:
+        caster: surfaces of the things.
+        threads: number of threads; 0 for one on each core.
+    """
+    digest = sha256()
+    for surface in caster.surfaces:
+        digest.update(surface.vertices.tobytes())
+        digest.update(surface.faces.tobytes())
+    templates = _IN_USE.get(digest.digest())
+    if templates is None:
+        templates = ViewTemplates(caster, threads)
+        _IN_USE[digest.digest()] = templates
+    return templates
 
 
 @dataclass(frozen=True, eq=False)
