@@ -211,15 +211,23 @@ def _contracted(
                 heapq.heappush(heap, (-total, one, third))
         beside[other] = {}
 
-    for region in range(count):  # follow who was joined to whom
-        root = region
-        while owner[root] != root:
-            root = int(owner[root])
-        owner[region] = root
-    roots = np.unique(owner[1:]) if count > 1 else np.zeros(0, int)
+    return _numbered(owner)
+
+
+def _numbered(owner: Index) -> Index:
+    """Number the groups of regions from 1 on; region 0 is none and keeps 0.
+
+    Args:
+        owner: region to which each region was joined, itself if to none, (R,).
+    """
+    count = len(owner)
+    roots_of = owner.copy()
+    while (roots_of != roots_of[roots_of]).any():
+        roots_of = roots_of[roots_of]
+    roots = np.unique(roots_of[1:])
     number = np.zeros(count, np.int64)
     number[roots] = np.arange(1, len(roots) + 1)
-    return number[owner]
+    return number[roots_of]
 
 
 def sharpen(

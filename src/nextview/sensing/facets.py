@@ -208,20 +208,19 @@ def fit_facets(
     focal = np.array([camera.fx, camera.fy])
     h, w = depth.shape
     usable = mask & (depth > 0)
+    wanted = usable
     noise = 0.0
     grain = 1
-    wanted = usable
     if denoise:
         if usable.any():
             noise, grain = _typical_noise(depth, usable, frame_noise)
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
-        near = ndimage.maximum_filter(usable, 5, mode="constant")
-        closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
-        # includes pixels without depth and dropped pixels
-        wanted = usable | (closed & (mask | (depth == 0)))
+        wanted = _without_holes(usable, mask | (depth == 0))
     if not usable.any():
         none = np.zeros(0, np.int64)
         return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
+
+    # moments of the pixels, centred for their precision
     x, y = camera.slopes(corner[0] + np.arange(h), corner[1] + np.arange(w))
     inverse = np.where(usable, 1 / np.where(usable, depth, 1), 0).astype(np.float64)
     weight = usable.astype(np.float64)
@@ -236,12 +235,9 @@ def fit_facets(
     if coarse > 1:
         sums = _blocks(sums, coarse)
         wanted = _blocks(wanted[None].astype(np.float64), coarse)[0] >= coarse**2 / 2
-        x, y = (
-            (v[0] + coarse * np.arange(-(-len(v) // coarse)) * (v[1] - v[0]))
-            for v in (x, y)
-        )
-        x = x + (coarse - 1) / 2 / focal[0]
-        y = y + (coarse - 1) / 2 / focal[1]
+        x, y = (_middles(slopes, coarse) for slopes in (x, y))
+
+    # a plane of inverse depth for each square
     rows, columns = np.divmod(np.flatnonzero(wanted), wanted.shape[1])
     here = np.stack([x[columns] - middle[0], y[rows] - middle[1]], 1)
     count = sums[0, rows, columns]
@@ -253,7 +249,8 @@ def fit_facets(
     else:
         planes = _fit(sums, 1, 1)[rows * sums.shape[2] + columns, :3]
         planes[:, 2] = own - (planes[:, :2] * here).sum(1)
-    # Convert back from centred coordinates.
+
+    # back from centred coordinates
     planes[:, 2] += middle[2] - planes[:, 0] * middle[0] - planes[:, 1] * middle[1]
     rays = np.stack([x[columns], y[rows], np.ones(len(rows))], 1)
     # inverse depth; NaN where there is no plane
@@ -264,6 +261,20 @@ def fit_facets(
     columns = corner[1] + coarse * columns + half
     facets = Facets(planes, rays, rows, columns, pitch)
     return facets if good.all() else facets.some(np.flatnonzero(good))
+
+
+def _without_holes(usable: Mask, fillable: Mask) -> Mask:
+    """Return the usable pixels, and those between them that may be filled, (H, W) bool."""
+    near = ndimage.maximum_filter(usable, 5, mode="constant")
+    closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
+    return usable | (closed & fillable)
+
+
+def _middles(slopes: Float, side: int) -> Float:
+    """Return the middles of groups of equally spaced slopes; the last group may be incomplete."""
+    spacing = slopes[1] - slopes[0]
+    first = np.arange(0, len(slopes), side)
+    return slopes[0] + spacing * (first + (side - 1) / 2)
 
 
 def _typical_noise(

@@ -389,45 +389,27 @@ class Episodes:
                 f"evidence of {len(evidence.logits)} views for {len(now)} running episodes"
             )
         evidence, seen = _without_unseen(evidence)
-        visited = np.zeros((len(now), len(self.sphere)), bool)
-        earlier = []
-        before = np.zeros((len(now), 1))
-        counted = np.zeros(len(now))
-        if self._last is not None:
-            last = self._last
-            going = ~self.steps[-1].stopped
-            visited = last.visited[going]
-            before = last.step.total[going]
-            counted = last.step.seen[going]
-            earlier = [] if last.places is None else [last.places[going]]
-            if (directions is None) != (last.places is None):
-                raise UsageError(
-                    "where the cameras stood is told of all views or of none"
-                )
+        total, counted, visited, earlier = self._before(directions is not None)
         views = self.current[now]
-        azimuth = self.sphere.azimuth[self.current[now]]
+        azimuth = self.sphere.azimuth[views]
         places = None
         if directions is not None:
             arc = angle_between(directions[:, None], self.sphere.directions[None])
             views = arc.argmin(1)
             there = arc.min(1) < SNAP
             azimuth = np.where(
-                there,
-                self.sphere.azimuth[views],
-                azimuth_of(directions),
+                there, self.sphere.azimuth[views], azimuth_of(directions)
             )
-            place = np.where(there[:, None], self.sphere.directions[views], directions)[
-                :,
-                None,
-            ]
-            places = np.concatenate([*earlier, place], 1)
+            place = np.where(there[:, None], self.sphere.directions[views], directions)
+            places = np.concatenate([*earlier, place[:, None]], 1)
             visited |= arc <= VISITED_ANGLE
         visited[np.arange(len(now)), views] = True
+
         said = np.asarray(
             log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth),
             np.float64,
         )
-        total = before + seen[:, None] * said
+        total = total + seen[:, None] * said
         counted = counted + seen
         # Before the object is visible the total is zero, so the divisor does not matter.
         belief = self.calibration.belief(
@@ -441,6 +423,36 @@ class Episodes:
         if self.together is not None:
             step = self._judged(step, seen, joint or (None,) * len(now))
         return Taken(step, seen, visited, azimuth, places)
+
+    def _before(self, placed: bool) -> tuple[Float, Float, Mask, list[Float]]:
+        """Return what is known of the running episodes before a step.
+
+        Args:
+            placed: whether the positions of the cameras are given.
+
+        Returns:
+            Sum of the log-evidence, (A, D) or (A, 1) before the first step; number of views in
+            which the object was visible, (A,); visited views, (A, V); and the camera positions,
+            (A, step, 3), in a list that is empty before the first step.
+
+        Raises:
+            UsageError: the positions are given in some steps only.
+        """
+        now = self.running
+        last = self._last
+        if last is None:
+            visited = np.zeros((len(now), len(self.sphere)), bool)
+            return np.zeros((len(now), 1)), np.zeros(len(now)), visited, []
+        if placed != (last.places is not None):
+            raise UsageError("where the cameras stood is told of all views or of none")
+        going = ~self.steps[-1].stopped
+        earlier = [] if last.places is None else [last.places[going]]
+        return (
+            last.step.total[going],
+            last.step.seen[going],
+            last.visited[going],
+            earlier,
+        )
 
     def _judged(
         self,
