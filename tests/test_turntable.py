@@ -3,10 +3,12 @@ thing is taught.
 """
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from pipeline import write_off
 
 import nextview
 from nextview.captured.turntable import read_turntable
@@ -102,17 +104,22 @@ def test_a_wrong_or_uneven_rotation_is_reported(tmp_path):
         )
 
 
-def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_path):
+def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, tmp_path):
     shutil.copytree(frames, tmp_path / "things/chair")
     with pytest.raises(
         DatasetError,
         match=r"chair: its frames have no poses; --turntable ccw or cw says",
     ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
-    shutil.copy(scans / "table.off", tmp_path / "things")
+    for name in ("chair", "table"):
+        mesh = sample_mesh(name)
+        metric = replace(mesh, vertices=RADIUS * mesh.vertices)
+        write_off(tmp_path / f"{name}.off", metric)
+    shutil.copy(tmp_path / "table.off", tmp_path / "things")
     found = learn(
         tmp_path / "things",
         tmp_path / "mine",
+        unit="m",
         upright=True,
         turntable="ccw",
         workers=0,
@@ -122,7 +129,8 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_p
     for name in ("chair", "table"):
         assert (
             system.recognise(
-                scans / f"{name}.off",
+                tmp_path / f"{name}.off",
+                unit="m",
                 start=17,
                 sensor="wrist",
                 seed=1,
