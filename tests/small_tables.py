@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nextview.geometry.mesh import Mesh
+from nextview.geometry.resting import resting_poses
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import (
     PlacedThing,
@@ -23,6 +24,17 @@ def meshes_of(names: Sequence[str]) -> dict[str, Mesh]:
     return dict(zip(names, taught_meshes("ycb", names), strict=True))
 
 
+_RESTING: dict[tuple[bytes, bytes], np.ndarray] = {}
+
+
+def resting_of(mesh: Mesh) -> np.ndarray:
+    """Its resting poses, found once for all tables."""
+    key = mesh.vertices.tobytes(), mesh.faces.tobytes()
+    if key not in _RESTING:
+        _RESTING[key] = resting_poses(mesh)
+    return _RESTING[key]
+
+
 def camera_over(
     meshes: Sequence[Mesh],
     seed: int = 5,
@@ -31,7 +43,8 @@ def camera_over(
 ) -> TableCamera:
     """A camera over a table on which some things are put down at random."""
     rng = np.random.default_rng(seed)
-    return TableCamera(SimulatedTable.draw(meshes, rng, gap), SENSORS[sensor], rng)
+    table = SimulatedTable.draw(meshes, rng, gap, resting_of)
+    return TableCamera(table, SENSORS[sensor], rng)
 
 
 def leaning(mesh: Mesh, degrees: float, place: Sequence[float]) -> PlacedThing:

@@ -1,6 +1,7 @@
 """The command line: its table of commands, how they end, and what they show."""
 
 import inspect
+import io
 import json
 import re
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -359,8 +361,10 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
 def completions_for_bash(tmp_path_factory):
     pytest.importorskip("torch")
     path = tmp_path_factory.mktemp("bash") / "nextview.sh"
-    code = "from nextview.cli.main import main; main(['completion', 'bash'])"
-    path.write_text(run_python(code).stdout)
+    said = io.StringIO()
+    with redirect_stdout(said), suppress(SystemExit):
+        main(["completion", "bash"])
+    path.write_text(said.getvalue())
     return path
 
 

@@ -325,9 +325,10 @@ def test_the_visible_share_of_a_ball_behind_a_wall():
 
 
 def test_a_mix_is_another_sensor_for_every_object():
-    drawn = [SensedCamera(BALL, "mix", rng(26, i)).sensor for i in range(300)]
+    ball = meshed(trimesh.creation.icosphere(1))
+    drawn = [SensedCamera(ball, "mix", rng(26, i)).sensor for i in range(300)]
     assert drawn == [
-        SensedCamera(BALL, SensorMix(), rng(26, i)).sensor for i in range(300)
+        SensedCamera(ball, SensorMix(), rng(26, i)).sensor for i in range(300)
     ]
     assert {sensor.name.partition(":")[0] for sensor in drawn} == {
         "render",

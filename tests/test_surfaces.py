@@ -141,7 +141,7 @@ def test_objects_without_a_visible_support_are_ignored(ycb, table_and_distant_bo
 def test_further_views_keep_to_the_ground(ycb, small_table):
     camera = LabelledCamera(small_table)
     scene = Scene(ycb, segmentation=camera.truth)
-    for degrees in (20, 80, 140):
+    for degrees in (20, 140):
         pose = looking_at((0, 0, 0.45), degrees, distance=1.0)
         look = scene.update(camera.frame(pose))
         assert look.taken

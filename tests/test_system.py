@@ -29,7 +29,7 @@ def test_python_and_command_line_stop_alike(options, capsys):
         nextview.load(**options),
         [word for name in options for word in (f"--{name}", str(options[name]))],
     )
-    for start in range(0, 40, 7):
+    for start in range(0, 40, 14):
         main(
             [
                 "recognise",
@@ -131,7 +131,7 @@ def test_the_bundled_models_keep_their_accuracy():
 def test_the_sample_meshes_are_told_apart_from_any_view():
     """Falls where the bundled models do."""
     system = nextview.load()
-    both = itertools.product(SAMPLE_MESHES, range(0, 40, 3))
+    both = itertools.product(SAMPLE_MESHES, range(0, 40, 5))
     assert (
         np.mean(
             [

@@ -3,10 +3,12 @@ thing is taught.
 """
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from pipeline import write_off
 
 import nextview
 from nextview.captured.turntable import read_turntable
@@ -19,29 +21,26 @@ from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
 
 RADIUS, N, SHAPE = 0.3, 24, (240, 320)
-# first pixel's centre at 0
-K = np.array([[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]])
+# first pixel's corner at 0
+K = np.array([[262.5, 0, 160], [0, 262.5, 120], [0, 0, 1]])
 POSE = look_at_origin(np.radians(35), np.radians(20), 4.2 * RADIUS)
 POSE[2, 3] += 0.4 * RADIUS
 
 
-def write_frames(folder, angles):
+def write_frames(folder, angles, coarser=1):
     """Frames of the sample chair, which stands beside the axis, the world's z, and turns by some
-    angles.
+    angles; of fewer pixels where that is enough.
     """
     folder.mkdir(parents=True)
-    np.savetxt(folder / "camera-intrinsics.txt", K)
+    shape = SHAPE[0] // coarser, SHAPE[1] // coarser
+    k = K / [[coarser], [coarser], [1]]
+    half_a_pixel = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    np.savetxt(folder / "camera-intrinsics.txt", k - half_a_pixel)
     mesh = sample_mesh("chair")
     vertices = RADIUS * (
         mesh.vertices + np.array([0.2, -0.1, -mesh.vertices[:, 2].min()])
     )
-    rays = (
-        PinholeCamera.of(
-            K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
-            SHAPE,
-        ).rays.reshape(-1, 3)
-        @ POSE[:3, :3].T
-    )
+    rays = PinholeCamera.of(k, shape).rays.reshape(-1, 3) @ POSE[:3, :3].T
     for i, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
@@ -52,7 +51,7 @@ def write_frames(folder, angles):
         millimetres = (
             np.rint(1000 * np.where(which < 0, 0, depth))
             .astype(np.uint16)
-            .reshape(SHAPE)
+            .reshape(shape)
         )
         Image.fromarray(millimetres).save(folder / f"{i:02d}.png")
     return folder
@@ -83,13 +82,14 @@ def test_the_poses_are_those_of_the_camera_around_the_axis(frames):
         )
 
 
-def test_a_wrong_or_uneven_rotation_is_reported(frames, tmp_path):
+def test_a_wrong_or_uneven_rotation_is_reported(tmp_path):
+    right = write_frames(tmp_path / "right", 2 * np.pi * np.arange(N) / N, 2)
     with pytest.raises(
         DatasetError,
         match="agree if the thing turned the other way, not cw",
     ):
-        read_turntable(frames, "cw")
-    half = write_frames(tmp_path / "half", np.pi * np.arange(N) / N)
+        read_turntable(right, "cw")
+    half = write_frames(tmp_path / "half", np.pi * np.arange(N) / N, 2)
     with pytest.raises(DatasetError, match="equal steps through a full circle"):
         read_turntable(half, "ccw")
     steps = np.random.default_rng(0).uniform(0.3, 1.7, N)
@@ -98,22 +98,28 @@ def test_a_wrong_or_uneven_rotation_is_reported(frames, tmp_path):
             write_frames(
                 tmp_path / "uneven",
                 2 * np.pi * np.cumsum(steps) / steps.sum(),
+                2,
             ),
             "ccw",
         )
 
 
-def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_path):
+def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, tmp_path):
     shutil.copytree(frames, tmp_path / "things/chair")
     with pytest.raises(
         DatasetError,
         match=r"chair: its frames have no poses; --turntable ccw or cw says",
     ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
-    shutil.copy(scans / "table.off", tmp_path / "things")
+    for name in ("chair", "table"):
+        mesh = sample_mesh(name)
+        metric = replace(mesh, vertices=RADIUS * mesh.vertices)
+        write_off(tmp_path / f"{name}.off", metric)
+    shutil.copy(tmp_path / "table.off", tmp_path / "things")
     found = learn(
         tmp_path / "things",
         tmp_path / "mine",
+        unit="m",
         upright=True,
         turntable="ccw",
         workers=0,
@@ -123,7 +129,8 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_p
     for name in ("chair", "table"):
         assert (
             system.recognise(
-                scans / f"{name}.off",
+                tmp_path / f"{name}.off",
+                unit="m",
                 start=17,
                 sensor="wrist",
                 seed=1,

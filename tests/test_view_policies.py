@@ -153,7 +153,7 @@ def test_own_rules_are_functions_classes_and_names(seen):
 
 
 def test_a_scene_goes_where_its_policy_says(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    camera = camera_over([ycb_meshes["mug"]])
     targets = []
     for policy in ("rules_of_mine:lowest", "random", "random"):
         scene = nextview.Scene(
