@@ -30,6 +30,7 @@ from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncert
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.episode_figure import draw_episode, without_specks
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
@@ -64,11 +65,13 @@ def metric_scans(shared):
 
 
 @pytest.fixture(scope="session")
-def known(shared, metric_scans):
-    """The models that know them."""
+def known(shared, metric_scans, few_episodes):
+    """The models that know them, taught with as many episodes as usual."""
 
     def make(folder):
-        learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(verification_fit, "ENOUGH_EPISODES", few_episodes)
+            learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
 
     return shared("known", make) / "mine"
 

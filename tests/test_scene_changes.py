@@ -164,7 +164,7 @@ def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, me
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     start = camera.table
     belt = np.eye(4)
-    for number in range(3):
+    for number in range(4):
         belt[0, 3] = number * metres
         things = [replace(one, pose=belt @ one.pose) for one in start.things]
         camera.change(SimulatedTable(tuple(things)))
