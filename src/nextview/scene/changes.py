@@ -24,7 +24,7 @@ from nextview.scene.placing import (
 )
 from nextview.scene.tracks import Track
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
-from nextview.sensing.frame import Frame, one_stand
+from nextview.sensing.frame import Frame, stands_still
 from nextview.sensing.tabletop import TableTop
 from nextview.things.registration import scan_errors
 from nextview.types import Float, Mask
@@ -81,7 +81,7 @@ class CameraError:
             cameras: errors of their poses.
         """
         for top, camera in zip(reversed(tops), reversed(cameras), strict=True):
-            if frame.camera and one_stand(top.frame, frame):
+            if stands_still(frame, [top.frame]):
                 return camera
         return cls.expected(frame, first=not tops)
 
@@ -406,7 +406,7 @@ def _known(
         posed = track.posed
         if posed is None or posed.vertices is None:
             continue
-        same = _in_one_place(track.frames, top, tops)
+        same = stands_still(top.frame, [tops[k].frame for k in track.frames])
         own = _own_covariance(track, posed, same)
         known = [] if same else [cameras[number] for number in track.frames]
         one = _object_at(posed, own, known, top, segments)
@@ -512,7 +512,8 @@ def _last_seen(
     if posed is None:
         return None
     last = track.frames[-1]
-    known = [] if _in_one_place([last], top, tops) else [cameras[last]]
+    same = stands_still(top.frame, [tops[last].frame])
+    known = [] if same else [cameras[last]]
     radius = track.thing.object_frame.radius
     camera = top.frame.camera_to_world[:3, 3]
     away = float(np.linalg.norm(track.thing.object_frame.centre - camera))
@@ -568,15 +569,6 @@ def _displaced(one: _Object, camera: CameraError) -> PoseCandidate:
     """Return an object that stands as a frame with an error of its pose shows it."""
     mean, _ = one.expected(camera)
     return replace(one.surface.posed, pose=one.surface.pose(mean))
-
-
-def _in_one_place(
-    frames: Sequence[int], top: TableTop, tops: Sequence[TableTop]
-) -> bool:
-    """Return True if a camera with a name took a frame, and earlier ones, from one place."""
-    if not top.frame.camera:
-        return False
-    return all(one_stand(tops[number].frame, top.frame) for number in frames)
 
 
 def _own_covariance(track: Track, posed: PoseCandidate, same: bool) -> Float:

@@ -19,6 +19,7 @@ from scipy import ndimage
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import RenderedObject, Track, render_track
+from nextview.sensing.masks import touching
 from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
@@ -428,7 +429,7 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
         linked[one, other] = linked[other, one] = (
             (
                 (one, other) in near
-                and bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
+                and touching(bench.top.frame, first, second, NEAR_GAP, NEAR_STEP)
             )
             or _shares(tracks[one], second, bench)
             or _shares(tracks[other], first, bench)

@@ -10,7 +10,7 @@ import numpy as np
 from nextview.recognition.poses import place_in_words
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Look, Scene
-from nextview.session.pose_json import pose_as_json
+from nextview.session.result_json import pose_as_json
 from nextview.types import Mask
 
 REPORT_COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")

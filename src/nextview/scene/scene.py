@@ -42,7 +42,7 @@ from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
-from nextview.sensing.masks import inside_box
+from nextview.sensing.masks import inside_box, touching
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
@@ -750,7 +750,7 @@ def _touching(
         one, other = masks[row], masks[beside]
         assert one is not None
         assert other is not None
-        if top.touching(one, other):
+        if touching(top.frame, one, other):
             pair = tracks[row].number, tracks[beside].number
             found.add((min(pair), max(pair)))
     return found

@@ -1,5 +1,6 @@
 """One frame of a depth camera, validated and converted to the units and axes of nextview."""
 
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from typing import Protocol
@@ -252,6 +253,11 @@ def one_stand(one: PosedCamera, other: PosedCamera) -> bool:
     if one.camera != other.camera or one.pose is None or other.pose is None:
         return False
     return float(np.abs(one.pose - other.pose).max()) <= SAME_POSE
+
+
+def stands_still(frame: PosedCamera, earlier: Iterable[PosedCamera]) -> bool:
+    """Return True if a camera with a name took a frame and all earlier ones from one place."""
+    return frame.camera != "" and all(one_stand(one, frame) for one in earlier)
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:

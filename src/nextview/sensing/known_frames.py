@@ -11,7 +11,7 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.sensing.camera_offsets import camera_offsets
-from nextview.sensing.frame import Frame, one_stand
+from nextview.sensing.frame import Frame, stands_still
 from nextview.sensing.lean import lean_of
 from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
@@ -98,8 +98,7 @@ class KnownFrames:
             frame: new frame.
         """
         own = [one for one in self.frames if one.camera == frame.camera]
-        named = frame.camera != "" and bool(own)
-        return named and all(one_stand(one, frame) for one in own)
+        return bool(own) and stands_still(frame, own)
 
     def _check_cameras(self, frame: Frame) -> list[ViewWarning]:
         """Warn if the pose of a camera has an error relative to the first camera with a name."""

@@ -11,12 +11,7 @@ from scipy import ndimage
 from nextview.errors import ObservationError
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
-from nextview.sensing.masks import (
-    TOUCHING_GAP,
-    TOUCHING_STEP,
-    above_plane,
-    touching,
-)
+from nextview.sensing.masks import TOUCHING_GAP, above_plane
 from nextview.sensing.planes import Plane
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
@@ -191,16 +186,6 @@ class TableTop:
         apart = np.maximum(low[:, None] - high, low - high[:, None]).max(-1)
         pairs = np.argwhere(np.triu(apart <= reach, 1))
         return [(shown[one], shown[other]) for one, other in pairs]
-
-    def touching(
-        self,
-        one: Mask,
-        other: Mask,
-        gap: float = TOUCHING_GAP,
-        step: float = TOUCHING_STEP,
-    ) -> bool:
-        """Return True if two objects touch in the image and in depth, see ``masks.touching``."""
-        return touching(self.frame, one, other, gap, step)
 
 
 def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:
