@@ -8,10 +8,10 @@ physics of ``benchmarks/staged_things.py``, and a stereo camera takes all candid
 a grid of azimuths and elevations over where a camera can stand. Nothing of nextview's own
 simulation is used. docs/submit.md describes the files and how methods are compared on them.
 
-The same scans, seed and versions of the libraries give the same bytes. A run that was stopped goes
-on when the same command is given again: the manifest is written last, and a folder without it is no
-archive. SCANS holds NAME.ply, metres. It runs from the folder of the repository and needs
-``mujoco`` (``research[arm]``).
+On one machine the same scans, seed and versions of the libraries give the same bytes. A run that
+was stopped goes on when the same command is given again: the manifest is written last, and a folder
+without it is no archive. SCANS holds NAME.ply, metres. It runs from the folder of the repository
+and needs ``mujoco`` (``research[arm]``).
 """
 
 from __future__ import annotations
