@@ -95,8 +95,8 @@ def named(pair: Sequence[Frame], stated: Float) -> list[Frame]:
     """Return the frames of two cameras with their names, and a stated pose of the second one."""
     left, right = pair
     return [
-        replace(left, camera="left", pixel_centre=0.5, axes="opencv"),
-        replace(right, camera="right", pose=stated, pixel_centre=0.5, axes="opencv"),
+        replace(left, camera="left"),
+        replace(right, camera="right", pose=stated),
     ]
 
 

@@ -162,7 +162,7 @@ class Watched:
             # the error of its pose remains what it is
             self.stands_at = self.camera.lean @ self.camera.true_pose
             self.camera.sensor = replace(self.camera.sensor, turned=0.0, moved=0.0)
-        named = replace(frame, pose=pose, camera="fixed", pixel_centre=0.5)
+        named = replace(frame, pose=pose, camera="fixed")
         return self.scene.update(named)
 
     def go_on(self) -> None:

@@ -1,4 +1,4 @@
-"""The rooms of the package: each imports only from rooms above it in CONTRIBUTING.md's table."""
+"""The layers of the package: each imports only from layers above it in CONTRIBUTING.md's table."""
 
 import ast
 import re
@@ -8,18 +8,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "nextview"
-SHELL = {"__init__", "__main__"}  # the package's own doors, which open onto every room
+SHELL = {"__init__", "__main__"}  # the package's own doors, which open onto every layer
 
 
-def rooms_of_the_table() -> list[str]:
-    """The rooms in the order of the table; names that share a row have the same height."""
+def layers_of_the_table() -> list[str]:
+    """The layers in the order of the table; names that share a row have the same height."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.split("| room | what is in it |")[1].split("\n\n")[0]
+    table = text.split("| layer | what is in it |")[1].split("\n\n")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     return [name for row in rows for name in re.findall(r"`(\w+)`", row)]
 
 
-ROOMS = rooms_of_the_table()
+LAYERS = layers_of_the_table()
 
 
 def modules_imported(path: Path) -> set[str]:
@@ -39,27 +39,27 @@ def room_of(module: str) -> str:
     return module.split(".")[1]
 
 
-def test_the_table_names_every_room() -> None:
+def test_the_table_names_every_layer() -> None:
     entries = {
         path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()
     }
     assert {entry for entry in entries if entry.isidentifier()} - SHELL - {
         "__pycache__"
-    } == set(ROOMS)
+    } == set(LAYERS)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_imports_from_rooms_above_it(room: str) -> None:
-    single = PACKAGE / f"{room}.py"
-    files = [single] if single.exists() else sorted((PACKAGE / room).rglob("*.py"))
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_layer_imports_from_layers_above_it(layer: str) -> None:
+    single = PACKAGE / f"{layer}.py"
+    files = [single] if single.exists() else sorted((PACKAGE / layer).rglob("*.py"))
     assert files
 
-    height = ROOMS.index(room)
+    height = LAYERS.index(layer)
     for path in files:
         for module in modules_imported(path):
             other = room_of(module)
-            if other in ROOMS:
-                assert ROOMS.index(other) <= height, f"{path} imports {module}"
+            if other in LAYERS:
+                assert LAYERS.index(other) <= height, f"{path} imports {module}"
 
 
 def test_no_two_modules_import_each_other_in_a_circle() -> None:

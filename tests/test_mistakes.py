@@ -14,7 +14,7 @@ from nextview.sensing.frame import Frame
 
 
 def posed(frame: Frame, pose: np.ndarray) -> Frame:
-    return replace(frame, pose=pose, pixel_centre=0.5)
+    return replace(frame, pose=pose)
 
 
 def moved(frame: Frame, shift) -> Frame:
@@ -48,7 +48,7 @@ MISTAKES = {
         "refused",
     ),
     "a first pose with OpenGL's axes": (
-        lambda first, second: [replace(first, axes="opengl", pixel_centre=0.5)],
+        lambda first, second: [replace(first, axes="opengl")],
         "refused",
     ),
     "first steps of a fifth of a millimetre": (
@@ -64,13 +64,13 @@ MISTAKES = {
         "refused",
     ),
     "a second pose with the axes of ROS": (
-        lambda first, second: [first, replace(second, axes="ros", pixel_centre=0.5)],
+        lambda first, second: [first, replace(second, axes="ros")],
         "refused",
     ),
     "no second pose": (
         lambda first, second: [
             first,
-            replace(second, pose=None, pixel_centre=0.5),
+            replace(second, pose=None),
         ],
         "refused",
     ),
@@ -204,7 +204,7 @@ def test_a_frame_that_was_handed_in_before_counts_once(ycb, two_frames):
     assert not any(look.taken for look in looks)
     assert len(again.result.views) == 1
     assert again.confidence == once.confidence
-    masked = replace(two_frames[0], mask=again.pixels[0], pixel_centre=0.5)
+    masked = replace(two_frames[0], mask=again.pixels[0])
     assert scene.update(masked).taken  # another part of the picture is asked for
 
 

@@ -378,7 +378,7 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
                 )[1],
                 0,
             )
-            session.update(replace(shown, pose=believed, mask=seen, pixel_centre=0.5))
+            session.update(replace(shown, pose=believed, mask=seen))
         result = session.result
         degrees, millimetres = off_by(result.pose, true, name)
         turns.append(degrees / result.pose_uncertainty.degrees)

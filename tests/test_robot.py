@@ -477,7 +477,7 @@ def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
     session.update(first)
     where = session.object.object_frame
     while not session.done:
-        session.update(replace(first, pose=session.target, pixel_centre=0.5))
+        session.update(replace(first, pose=session.target))
     assert [[w.name for w in view.warnings] for view in session.views] == [
         [],
         *[["repeated"]] * 3,

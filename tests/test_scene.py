@@ -106,7 +106,7 @@ def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"]])
     scene = nextview.Scene(ycb)
     frame = camera.frame(view(20))
-    scene.update(replace(frame, pose=None, pixel_centre=0.5))
+    scene.update(replace(frame, pose=None))
     assert by_name(scene)["mug"].result.pose_frame == "camera"
     with pytest.raises(ObservationError, match="needs a pose"):
         scene.update(frame)
@@ -168,7 +168,7 @@ def test_a_frame_with_a_wrong_pose_is_left_out(seen_once, ycb_meshes):
     shifted[:2, 3] += 0.15
     turned = view(130) @ np.linalg.inv(view(80)) @ frame.pose
     for pose in (shifted, turned):
-        look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
+        look = scene.update(replace(frame, pose=pose))
         assert not look.taken
         assert [warning.name for warning in look.warnings] == ["pose"]
         assert {thing.number for thing in scene.objects} == before

@@ -169,7 +169,7 @@ def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, me
         things = [replace(one, pose=belt @ one.pose) for one in start.things]
         camera.change(SimulatedTable(tuple(things)))
         frame = camera.frame(view(20))
-        look = scene.update(replace(frame, camera="belt", pixel_centre=0.5))
+        look = scene.update(replace(frame, camera="belt"))
         assert look.taken
         assert look.gone == ()
         if number:
@@ -196,7 +196,7 @@ def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, meshes):
 
     def look():
         frame = camera.frame(view(20))
-        return scene.update(replace(frame, camera="fixed", pixel_centre=0.5))
+        return scene.update(replace(frame, camera="fixed"))
 
     def shown():
         """The object that shows most of the chair."""

@@ -172,7 +172,7 @@ def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(ycb, ycb_meshes):
     frame = camera.frame(view(60))
     pose = frame.pose.copy()
     pose[:2, 3] += 0.2
-    look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
+    look = scene.update(replace(frame, pose=pose))
     assert [move.number for move in look.moved] == [1]
     assert [warning.name for warning in look.warnings] == ["pose"]
 

@@ -26,7 +26,8 @@ from nextview.sensing import (
     check_views,
 )
 from nextview.sensing.facets import fit_facets
-from nextview.sensing.frame_mistakes import Known, check_mistakes
+from nextview.sensing.frame_mistakes import check_mistakes
+from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.plausibility import check_frame
 from nextview.sensing.resampling import look_again, virtual_pose
 from nextview.sensing.segmented_frame import without_surfaces
@@ -305,9 +306,7 @@ def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, 
         believed = pose.copy()
         believed[:3, :3] = np.linalg.matrix_power(turn, sign) @ pose[:3, :3]
         believed[:3, 3] += sign * np.array([0, 0.003, raised])
-        seen.add(
-            replace(frame([TABLE, made], pose, seed=k), pose=believed, pixel_centre=0.5)
-        )
+        seen.add(replace(frame([TABLE, made], pose, seed=k), pose=believed))
 
         plane = seen.sightings[-1].plane
         # a point of it, as the camera sees it
@@ -343,7 +342,7 @@ def small_box_and_a_raised_frame(raised):
     seen = frame([TABLE, small], pose_at(40, 70, 0.6))
     wrong = seen.camera_to_world.copy()
     wrong[2, 3] += raised
-    return thing, replace(seen, pose=wrong, axes="opencv", pixel_centre=0.5)
+    return thing, replace(seen, pose=wrong)
 
 
 def test_a_pose_that_contradicts_the_frames_before_is_warned_of():
@@ -386,16 +385,14 @@ def test_a_wrong_first_pose_is_named(said, wrong):
     pose = pose_at(40, 20, 0.7)
     seen = frame([TABLE, WEDGE], pose)
     with pytest.raises(ObservationError, match=said):
-        ObservedObject().add(
-            replace(seen, pose=wrong(pose), axes="opencv", pixel_centre=0.5)
-        )
+        ObservedObject().add(replace(seen, pose=wrong(pose)))
 
 
 def in_millimetres(seen) -> Frame:
     """The frame with its position in millimetres."""
     moved = seen.pose.copy()
     moved[:3, 3] *= 1000
-    return replace(seen, pose=moved, axes="opencv", pixel_centre=0.5)
+    return replace(seen, pose=moved)
 
 
 def test_poses_in_millimetres_are_rejected_by_the_target_or_another_frame():
@@ -460,8 +457,9 @@ def test_a_wrong_unit_of_sixteen_bit_depth_is_rejected_with_the_depth_scale(step
     for target in ({"point": (0, 0, 0.1)}, {"known": true_frame(WEDGE)}):
         with pytest.raises(ObservationError, match=said):
             ObservedObject(**target).add(counted(25, steps))
+    known = KnownFrames((counted(25, steps),), (None,))
     with pytest.raises(ObservationError, match=said):
-        check_mistakes(without_surfaces(counted(60, steps)), Known(counted(25, steps)))
+        check_mistakes(without_surfaces(counted(60, steps)), known)
     alone = ObservedObject()
     alone.add(counted(25, steps))
     assert [warning.name for warning in alone.warnings] == ["unit"]
@@ -491,7 +489,7 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
     thing = ObservedObject(point=(0, 0, 0.1))
     thing.add(first)
     assert thing.warnings == []
-    thing.add(replace(second, pose=first.pose, axes="opencv", pixel_centre=0.5))
+    thing.add(replace(second, pose=first.pose))
     assert "stale pose" in [warning.name for warning in thing.warnings]
     pose = pose_at(40, 25, 0.7)
     depth, seen = cast([WEDGE, TABLE], pose)
@@ -743,3 +741,13 @@ def test_the_code_of_the_guide_runs(monkeypatch):
     assert simulated
     for block in simulated:
         exec(block, {})
+
+
+def test_a_frame_with_one_part_replaced_keeps_the_others():
+    depth = np.full((480, 640), 1000, np.uint16)
+    given = Frame(depth, INTRINSICS, np.eye(4), axes="ros", camera="left")
+    other = replace(given, camera="right")
+    assert other.camera == "right"
+    np.testing.assert_array_equal(other.intrinsics, given.intrinsics)
+    np.testing.assert_array_equal(other.pose, given.pose)
+    np.testing.assert_array_equal(other.depth, given.depth)

@@ -103,5 +103,5 @@ def _why(track: Track) -> str:
     if track.lately_named:
         return "it had a name before the last frame that shows it"
     if len(track.frames) < ENOUGH_VIEWS:
-        return "it fits none of the things, in a single view"
+        return "no taught thing fits it; it is seen in one view only"
     return "its name is not confident"

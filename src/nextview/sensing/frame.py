@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -48,7 +48,9 @@ LUMA = np.array([0.299, 0.587, 0.114])
 class Frame:
     """One frame of a depth camera; only depth and intrinsics are required.
 
-    An ObservationError names the likely mistake in invalid input.
+    An ObservationError names the likely mistake in invalid input. ``with_pose``, ``with_mask`` and
+    ``with_depth`` change one of its parts; ``dataclasses.replace`` loses ``colour``, as ``image``
+    is stored in grey, and ``counted``.
 
     Attributes:
         depth: along the optical axis, (H, W). Input is either float metres, where NaN, infinity,
@@ -63,9 +65,9 @@ class Frame:
         image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; stored as grey.
         colour: the original image, (H, W, 3) uint8, RGB; None if it is grey.
         counted: whether the input depth is uint16, whose unit may differ from millimetres.
-        axes: of the input pose: "opencv", "opengl" or "ros", see CAMERA_AXES.
+        axes: of the input pose: "opencv", "opengl" or "ros", see CAMERA_AXES. Stored as "opencv".
         pixel_centre: coordinate of the first pixel's centre in the input intrinsics: 0 for OpenCV
-            and ROS, 0.5 for OpenGL and for nextview's own ``Observation``.
+            and ROS, 0.5 for OpenGL and for nextview's own ``Observation``. Stored as 0.5.
         camera: name of the camera, where there are several, or where one stands still; "" for the
             one camera.
     """
@@ -77,11 +79,13 @@ class Frame:
     image: NDArray[np.uint8] | None = None
     counted: bool = field(init=False, default=False)
     colour: NDArray[np.uint8] | None = field(init=False, default=None)
-    axes: InitVar[str] = "opencv"
-    pixel_centre: InitVar[float] = 0.0
+    axes: str = "opencv"
+    pixel_centre: float = 0.0
     camera: str = ""
 
-    def __post_init__(self, axes: str, pixel_centre: float) -> None:
+    def __post_init__(self) -> None:
+        axes = self.axes
+        pixel_centre = self.pixel_centre
         values = numbers(self.depth, "the depth")
         object.__setattr__(self, "counted", values.dtype == np.uint16)
         depth, source = fill_regular_gaps(_metres(values))
@@ -140,6 +144,9 @@ class Frame:
                 object.__setattr__(self, "colour", image.copy())
                 image = np.rint(image @ LUMA).astype(np.uint8)
             object.__setattr__(self, "image", image)
+        # of what is stored, so that dataclasses.replace changes nothing else
+        object.__setattr__(self, "axes", "opencv")
+        object.__setattr__(self, "pixel_centre", 0.5)
 
     @property
     def shape(self) -> tuple[int, int]:

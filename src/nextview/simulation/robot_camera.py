@@ -137,7 +137,7 @@ class RobotCamera:
                 return (
                     frame
                     if self.named in ("known", "mask")
-                    else replace(frame, mask=None, pixel_centre=0.5)
+                    else replace(frame, mask=None)
                 )
             self._refused.append(direction)
         raise NoViewLeftError(

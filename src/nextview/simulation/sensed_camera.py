@@ -177,7 +177,7 @@ class SensedCamera:
         )
 
         return (
-            replace(frame, mask=mask, pixel_centre=0.5)
+            replace(frame, mask=mask)
             if np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
             else None
         )
