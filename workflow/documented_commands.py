@@ -511,7 +511,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/add_a_recogniser.md": (
         "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear"
     ),
-    "docs/scenes.md": "python own_recogniser.py recogniser",
+    "docs/cluttered_scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
     # Predictions name their store: those that are planned for have to be of the one in this folder.
     "research/README.md": (

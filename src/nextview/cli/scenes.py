@@ -33,7 +33,7 @@ def scenes(
 
     With --room a scene is a room as seen by a mobile robot: floor, walls, background furniture,
     life-size objects on the floor or on a table, and a level camera. A RoomCamera renders its
-    frames (docs/scenes.md).
+    frames (docs/cluttered_scenes.md).
 
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
@@ -109,5 +109,5 @@ def _draw_rooms(
         )
 
     console.print(
-        f"{out}: {total - len(failed)} rooms; next: frames of them, docs/scenes.md#rooms"
+        f"{out}: {total - len(failed)} rooms; next: frames of them, docs/cluttered_scenes.md#rooms"
     )
