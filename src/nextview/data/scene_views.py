@@ -253,6 +253,7 @@ class SceneSight:
             for key, row in zip(keys, visited, strict=True)
             if key not in self._found
         }
+
         read = lru_cache(maxsize=1)(partial(scene_views, self.store))
         for key in sorted(new):  # scene by scene, each read once
             frames = (
@@ -264,6 +265,7 @@ class SceneSight:
                 scene,
                 self.store.sphere.poses[:, :3, 3],
             ).astype(np.float32)
+
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
     def _frame(

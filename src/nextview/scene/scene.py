@@ -170,6 +170,7 @@ class Scene:
         self._target_rows: list[int] = []
         self._failed: set[int] = set()
         self._lock = RLock()
+
         self.distance = distance
         self.reachable = reachable
         self.travel_cost = travel_cost
@@ -178,6 +179,7 @@ class Scene:
         self.system = system.in_any_orientation() if any_orientation else system
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
+
         self._judge = Judge(
             self.system.models,
             self.system.sphere,
@@ -334,10 +336,12 @@ class Scene:
             free = views.free.copy()
             free[list(self._failed)] = False
             travel = views.travel.copy()
+
             rows = np.flatnonzero(free)
             if self.reachable is not None:
                 free[rows] = [truth_of(self.reachable(views.poses[k])) for k in rows]
                 rows = np.flatnonzero(free)
+
             if self.travel_cost is not None:
                 here = self._state.tops[-1].frame.camera_to_world
                 costs = [cost_of(self.travel_cost(here, views.poses[k])) for k in rows]
@@ -455,6 +459,7 @@ class Scene:
             if name not in known:
                 what = f"grasps of {one_line(name)}, which is none of the taught things"
                 raise UsageError(f"{what}{did_you_mean(name, known)}")
+
         with self._lock:
             found = free_grasps(
                 self.objects,
@@ -518,6 +523,7 @@ class Scene:
             inside = inside & inside_box(frame, self.region)
         instances = instances_of(self.segmentation, frame, self.up)
         masks = tuple(mask & inside for mask in instances.masks)
+
         earlier = before[-1] if before else None
         up = None if frame.pose is None else self.up
         if up is None and earlier is not None:

@@ -84,69 +84,52 @@ class Frame:
     camera: str = ""
 
     def __post_init__(self) -> None:
-        axes = self.axes
-        pixel_centre = self.pixel_centre
         values = numbers(self.depth, "the depth")
-        object.__setattr__(self, "counted", values.dtype == np.uint16)
         depth, source = fill_regular_gaps(_metres(values))
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
-        if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
+        centre = self.pixel_centre
+        if not isinstance(centre, int | float) or not abs(centre) <= 1:
             raise ObservationError(
                 f"the first pixel's centre has the coordinate 0 or 0.5, not"
-                f" {one_line(repr(pixel_centre))}"
+                f" {one_line(repr(centre))}"
             )
+        intrinsics[:2, 2] += 0.5 - centre
 
         if not isinstance(self.camera, str):
             raise ObservationError(
                 f"the name of a camera is text, not {one_line(repr(self.camera))}"
             )
-
-        intrinsics[:2, 2] += 0.5 - pixel_centre
-        object.__setattr__(self, "depth", depth)
-        object.__setattr__(self, "intrinsics", intrinsics)
-        if not isinstance(axes, str) or axes not in CAMERA_AXES:
+        if not isinstance(self.axes, str) or self.axes not in CAMERA_AXES:
             raise ObservationError(
-                f"the axes of a pose are {', '.join(CAMERA_AXES)}, not {one_line(repr(axes))}"
+                f"the axes of a pose are {', '.join(CAMERA_AXES)}, not"
+                f" {one_line(repr(self.axes))}"
             )
+
+        # axes and centre are those of what is stored, so that dataclasses.replace keeps both
+        stored: dict[str, object] = {
+            "depth": depth,
+            "intrinsics": intrinsics,
+            "counted": values.dtype == np.uint16,
+            "axes": "opencv",
+            "pixel_centre": 0.5,
+        }
         if self.pose is not None:
             pose = check_pose(self.pose)
-            pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[axes]
-            object.__setattr__(self, "pose", pose)
+            pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[self.axes]
+            stored["pose"] = pose
         if self.mask is not None:
-            mask = array_of(self.mask, "the mask")
-            if mask.shape != depth.shape or mask.dtype != bool:
-                given = f"{mask.shape} {mask.dtype}"
-                raise ObservationError(
-                    f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}"
-                )
-            if not (mask & (depth > 0)).any():
-                raise ObservationError(
-                    "no pixel of the mask has a depth: a mask of another image, or empty"
-                )
-            object.__setattr__(
-                self,
-                "mask",
-                mask.copy() if source is None else filled_mask(mask, source),
+            mask = _check_mask(self.mask, depth)
+            stored["mask"] = (
+                mask.copy() if source is None else filled_mask(mask, source)
             )
         if self.image is not None:
-            image = array_of(self.image, "the image")
-            if image.dtype != np.uint8 or image.shape not in (
-                depth.shape,
-                (*depth.shape, 3),
-            ):
-                wanted = (
-                    f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
-                )
-                raise ObservationError(
-                    f"an image is {wanted}, not {image.shape} {image.dtype}"
-                )
+            image = _check_image(self.image, depth.shape)
             if image.ndim == 3:
-                object.__setattr__(self, "colour", image.copy())
+                stored["colour"] = image.copy()
                 image = np.rint(image @ LUMA).astype(np.uint8)
-            object.__setattr__(self, "image", image)
-        # of what is stored, so that dataclasses.replace changes nothing else
-        object.__setattr__(self, "axes", "opencv")
-        object.__setattr__(self, "pixel_centre", 0.5)
+            stored["image"] = image
+        for name, value in stored.items():
+            object.__setattr__(self, name, value)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -358,6 +341,30 @@ def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> Float:
             f"{what} is a {shape} matrix of finite numbers, not one {given}"
         )
     return matrix
+
+
+def _check_mask(given: object, depth: Float32) -> Mask:
+    """Return a mask of a depth image; ObservationError if it is none."""
+    mask = array_of(given, "the mask")
+    if mask.shape != depth.shape or mask.dtype != bool:
+        found = f"{mask.shape} {mask.dtype}"
+        raise ObservationError(
+            f"a mask is (H, W) bool as the depth, {depth.shape}, not {found}"
+        )
+    if not (mask & (depth > 0)).any():
+        raise ObservationError(
+            "no pixel of the mask has a depth: a mask of another image, or empty"
+        )
+    return mask
+
+
+def _check_image(given: object, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return an image that is registered to a depth image; ObservationError if it is none."""
+    image = array_of(given, "the image")
+    if image.dtype != np.uint8 or image.shape not in (shape, (*shape, 3)):
+        wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {shape}"
+        raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
+    return image
 
 
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:

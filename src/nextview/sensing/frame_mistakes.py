@@ -437,6 +437,7 @@ def _surfaces(seen: SegmentedFrame, up: Float | None) -> tuple[Plane | None, flo
     shares = [float(level.plane.holds(flat).mean()) for level in seen.levels]
     share = max(shares, default=0.0)
     plane = seen.levels[int(np.argmax(shares))].plane if shares else None
+
     flatter = gain_as_range(frame, plane, flat, rng, up)
     if up is not None and share < LARGE_SHARE:
         largest = find_plane(samples, rng)
@@ -444,6 +445,7 @@ def _surfaces(seen: SegmentedFrame, up: Float | None) -> tuple[Plane | None, flo
             plane = largest
     if plane is None:
         return None, flatter
+
     pose = frame.camera_to_world
     normal = pose[:3, :3].T @ plane.normal
     return Plane(normal, float(plane.height(pose[:3, 3]))), flatter
