@@ -45,6 +45,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
 from nextview.things.verifier import Verified, Verifier, rival_turns
+from nextview.things.view_templates import SeenOutline
 from nextview.things.weighing import (
     VIEW_CORRELATIONS,
     EvidenceWeights,
@@ -312,6 +313,47 @@ def test_a_thing_is_found_upright_on_a_table_that_leans():
     assert found.things[0] == 0
     assert turn < 1
     assert moved < 1.5
+
+
+def behind_a_box(mesh: Mesh, box: Mesh) -> Observation:
+    """A view of a thing on a table, behind a box; both in the same coordinates."""
+    observation = SimulatedCamera(mesh).observe(look_at_origin(np.radians(35.0), 0.0))
+    rows, columns = np.indices(observation.depth.shape)
+    k = observation.intrinsics
+    x, y = (columns + 0.5 - k[0, 2]) / k[0, 0], (rows + 0.5 - k[1, 2]) / k[1, 1]
+    rays = np.stack([x, y, np.ones(x.shape)], -1) @ observation.pose[:3, :3].T
+    rays = np.ascontiguousarray(rays.reshape(-1, 3), np.float32)
+    bottom = mesh.vertices[:, 2].min()
+    square = np.array(
+        [[-9, -9, bottom], [9, -9, bottom], [9, 9, bottom], [-9, 9, bottom]]
+    )
+    obstacle = (box.vertices * box.radius + box.centre - mesh.centre) / mesh.radius
+    scene = embree_scene(
+        [
+            (mesh.vertices, mesh.faces),
+            (obstacle, box.faces),
+            (square, np.array([[0, 1, 2], [0, 2, 3]])),
+        ]
+    )
+    start_of = np.tile(observation.pose[:3, 3].astype(np.float32), (len(rays), 1))
+    hits = scene.run(start_of, rays, output=1)
+    depth = hits["tfar"].reshape(x.shape)
+    depth += 0.002 * np.random.default_rng(0).normal(size=depth.shape)
+    return with_scene(observation, depth, hits["geomID"].reshape(x.shape) == 0)
+
+
+def test_the_top_of_a_box_before_a_thing_is_not_its_floor():
+    """Its hidden part extends below the top, where the camera sees the table beside the box."""
+    thing = mesh_of(((0.08, 0.06, 0.12), (0, 0, 0.06)))
+    box = mesh_of(((0.06, 0.16, 0.05), (0.09, 0, 0.025)))
+    image = MetricImage.of(behind_a_box(thing, box))
+    assert image.ground.height == pytest.approx(0.05 - 0.06, abs=0.002)
+    assert image.floor.height == pytest.approx(-0.06, abs=0.002)
+    assert SeenOutline.of(image).hidden
+    other = mesh_of(((0.08, 0.06, 0.07), (0, 0, 0)))
+    found = verifier_of(thing, other)([behind_a_box(thing, box)])
+    assert found.things[0] == 0
+    assert found.below[0] == 0
 
 
 def test_poses_do_not_extend_below_the_ground():

@@ -12,7 +12,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.facets import Noise, estimate_noise
 from nextview.sensing.masks import PLANE_NOISE, PLANE_SHARE
-from nextview.things.ground import Ground, find_ground, floor_under
+from nextview.things.ground import Ground, find_planes, floor_under
 from nextview.types import Float, Float32, Index, Mask
 
 NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
@@ -183,8 +183,8 @@ class MetricImage:
         )
         return replace(self, pose=pose, ground=ground, floor=floor)
 
-    def find_ground(self) -> Ground | None:
-        """Find the plane that supports the thing; None if none is visible."""
+    def find_planes(self) -> tuple[Ground | None, Ground | None]:
+        """Find the ground and the floor of the thing: see ``ground.find_planes``."""
         rows, columns = _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
         chosen = np.ix_(rows, columns)
         depth = self.depth[chosen].ravel()
@@ -195,12 +195,12 @@ class MetricImage:
             np.float64
         )
         thing = kind[some] == THING
-        return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
+        return find_planes(points[~thing], points[thing], origin, self.pose[:3, 2])
 
     def find_hiding(self) -> Mask:
         """Find the pixels around the thing that show an occluder in front of it.
 
-        The ground is no occluder.
+        The floor is no occluder.
 
         Returns:
             Mask of the occluders, (H, W) bool.
@@ -220,17 +220,15 @@ class MetricImage:
         apart = np.hypot(HIDING, HIDING_NOISE * np.minimum(noise, NOISIEST * beside))
         hiding = (kind == ELSEWHERE) & (depth < beside - apart)
 
-        if self.ground is not None and hiding.any():
+        if self.floor is not None and hiding.any():
             at = np.nonzero(hiding)
             x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(
                 at[0] + rows.start, at[1] + columns.start
             )
             rays = np.stack([x, y, np.ones(len(x))], -1) @ self.pose[:3, :3].T
             points = self.pose[:3, 3] + rays * depth[at][:, None].astype(np.float64)
-            heights = self.ground.heights(points)
-            allowed = np.hypot(
-                HIDING, HIDING_NOISE * self.ground.noise * depth[at] ** 2
-            )
+            heights = self.floor.heights(points)
+            allowed = np.hypot(HIDING, HIDING_NOISE * self.floor.noise * depth[at] ** 2)
             hiding[at] = heights > allowed
 
         every = np.zeros(self.kind.shape, bool)
@@ -321,11 +319,11 @@ def _metric_image(observation: Observation, metres: float) -> MetricImage | None
     image = MetricImage(
         depth, kind, pose, intrinsics, noise, None, None, nowhere, camera
     )
-    ground = image.find_ground()
-    if ground is not None:
-        known = None if observation.scene is None else observation.scene.support
-        support = None if known is None else known * (1, 1, 1, metres)
-        image = replace(image, ground=ground, floor=floor_under(ground, support))
+    ground, floor = image.find_planes()
+    support = None if observation.scene is None else observation.scene.support
+    if ground is not None and support is not None:
+        floor = floor_under(ground, support * (1, 1, 1, metres))
+    image = replace(image, ground=ground, floor=floor)
     return replace(image, hiding=image.find_hiding())
 
 

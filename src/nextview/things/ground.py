@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.types import Float, Floats
+from nextview.types import Float, Floats, Mask
 
 FEWEST_PLANE_POINTS = 50  # fewest points on the plane
 LEAST_PLANE_SHARE = 0.1  # smallest share of the points beside the thing
@@ -15,6 +15,9 @@ THINNEST_LAYER = 0.006  # metres
 # smallest vertical component of the normal: the vertical is known to 15 degrees
 LEAST_VERTICAL = np.cos(np.radians(15.0))
 FITS = 4
+NEAR_THING = 2.0  # reach of what is near a thing, half sizes of its visible part
+# largest share of the rays through a plane that noise explains, of those that reach it
+LEAST_BELOW = 0.02
 NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
 
 
@@ -38,6 +41,29 @@ class Ground:
         """Height of the plane at the origin of the object frame, metres; negative below it."""
         return -self.offset / float(self.normal[2])
 
+    def crossed(
+        self,
+        origin: Float,
+        points: Float,
+        centre: Float,
+        reach: float,
+    ) -> Mask:
+        """Find the rays that cross the plane near a place.
+
+        Args:
+            origin: start of the rays, (3,), metres.
+            points: points on the rays, (N, 3), metres; those above the plane count, too.
+            centre: the place, (3,), metres.
+            reach: largest horizontal distance from it, metres.
+
+        Returns:
+            Mask, (N,) bool.
+        """
+        above = float(self.heights(origin))
+        along = above / np.maximum(above - self.heights(points), 1e-9)
+        at = origin + along[:, None] * (points - origin)
+        return np.linalg.norm((at - centre)[:, :2], axis=1) < reach
+
     def heights(self, points: Floats) -> Floats:
         """Heights of points above the plane.
 
@@ -51,17 +77,18 @@ class Ground:
         return points @ normal + points.dtype.type(self.offset)
 
 
-def find_ground(
+def find_planes(
     beside: Float,
     thing: Float,
     origin: Float,
     axis: Float,
-) -> Ground | None:
-    """Find the support plane of a thing in the depth beside it.
+) -> tuple[Ground | None, Ground | None]:
+    """Find the level planes below the visible part of a thing, in the depth beside it.
 
-    It is the highest level plane at or below the bottom of the visible part of the thing that
-    contains a sufficient share of the points: the floor below a small table may fill more of the
-    image.
+    The ground is the highest plane that contains a sufficient share of the points: the floor below
+    a small table may fill more of the image. It may also be the top of a box in front of the thing,
+    and then the hidden part of the thing reaches below it. The camera sees below such a plane
+    beside its edges. The floor is the highest plane below which it sees nothing near the thing.
 
     Args:
         beside: measured points beside the thing, object frame, (N, 3), metres.
@@ -70,17 +97,56 @@ def find_ground(
         axis: optical axis of the camera, (3,).
 
     Returns:
+        Ground and floor, often the same plane; None if too few of the points lie on one.
+    """
+    if not len(thing):
+        return None, None
+    half_size = float(np.linalg.norm(np.ptp(thing, axis=0))) / 2
+    layer = max(PLANE_LAYER * half_size, THINNEST_LAYER)
+    middle = np.median(thing, axis=0)
+
+    highest = float(np.quantile(thing[:, 2], 0.1)) + layer
+    ground = floor = _highest_plane(beside, thing, origin, axis, layer, highest)
+    while floor is not None:
+        near = floor.crossed(origin, beside, middle, NEAR_THING * half_size)
+        heights = floor.heights(beside[near])
+        below = np.count_nonzero(heights < -layer)
+        if below <= LEAST_BELOW * np.count_nonzero(heights < layer):
+            break
+        under = float(middle[2] - floor.heights(middle) / floor.normal[2])
+        highest = min(under, highest) - layer
+        floor = _highest_plane(beside, thing, origin, axis, layer, highest)
+    return ground, floor
+
+
+def _highest_plane(
+    beside: Float,
+    thing: Float,
+    origin: Float,
+    axis: Float,
+    layer: float,
+    highest: float,
+) -> Ground | None:
+    """Find the highest level plane that contains a sufficient share of the points.
+
+    Args:
+        beside: measured points beside the thing, object frame, (N, 3), metres.
+        thing: measured points of the thing, (M, 3).
+        origin: position of the camera, (3,).
+        axis: optical axis of the camera, (3,).
+        layer: thickness of a plane in the search, metres.
+        highest: upper limit of its height, metres.
+
+    Returns:
         The plane; None if too few of the points lie on one.
     """
     enough = max(FEWEST_PLANE_POINTS, LEAST_PLANE_SHARE * len(beside))
-    if len(beside) < enough or not len(thing):
+    if len(beside) < enough:
         return None
 
-    half_size = float(np.linalg.norm(np.ptp(thing, axis=0))) / 2
-    layer = max(PLANE_LAYER * half_size, THINNEST_LAYER)
     heights = np.sort(beside[:, 2])
     inside = np.searchsorted(heights, heights + layer) - np.arange(len(heights))
-    below = (inside >= enough) & (heights <= np.quantile(thing[:, 2], 0.1) + layer)
+    below = (inside >= enough) & (heights <= highest)
     if not below.any():
         return None
     highest = heights[below].max()
@@ -113,8 +179,8 @@ def find_ground(
     return ground
 
 
-def floor_under(ground: Ground, support: Float | None) -> Ground:
-    """Return the plane below which nothing can be.
+def floor_under(ground: Ground, support: Float) -> Ground:
+    """Return the plane below which nothing can be, given what supports the thing.
 
     It is the ground, unless that is the top of other things: a thing beside them reaches below
     their tops, but not below what carries them all.
@@ -122,10 +188,8 @@ def floor_under(ground: Ground, support: Float | None) -> Ground:
     Args:
         ground: highest level plane under the visible part of the thing.
         support: the plane that supports the thing by the segmentation of the whole frame, (4,):
-            normal and height of the origin, metres; None if it is not known.
+            normal and height of the origin, metres.
     """
-    if support is None:
-        return ground
     lower = replace(ground, normal=support[:3], offset=float(support[3]))
     return lower if ground.height - lower.height > THINNEST_LAYER else ground
 

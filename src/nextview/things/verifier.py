@@ -50,7 +50,8 @@ class Stage:
     Attributes:
         side: rows and columns of pixels.
         levels: steps of the registration.
-        most: largest number of survivors, at most half of them of one thing.
+        most: largest number of survivors, at most half of them of one thing; more of many
+            hypotheses: see SHARE_KEPT.
         hopeless: log-likelihood below the best hypothesis at which a hypothesis is rejected.
         rivals: whether the likeliest hypotheses of RIVAL_THINGS things are also tried in the poses
             of their near symmetries.
@@ -63,6 +64,7 @@ class Stage:
     rivals: bool = False
 
 
+SHARE_KEPT = 0.12  # share of many hypotheses that survive each stage
 FINE_SIDE = 40  # rows and columns of pixels in the last stage
 STAGES = (
     Stage(16, FIRST, 32, 100.0, rivals=True),
@@ -434,9 +436,9 @@ class Verifier:
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
             rows = order[different_poses(self.caster, alignment.select(order))]
+            most = max(stage.most, int(SHARE_KEPT * len(alignment)))
             # a thing with many similar poses, such as a round one, does not displace all others
-            rows = rows[rank_within(alignment.things[rows]) < stage.most // 2]
-            rows = rows[: stage.most]
+            rows = rows[rank_within(alignment.things[rows]) < most // 2][:most]
             alignment = alignment.select(rows)
             proposed = proposed.select(rows)
 
