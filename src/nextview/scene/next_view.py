@@ -22,6 +22,9 @@ from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
+from nextview.session.limits import Limits
+from nextview.session.reach import Reach
+from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
 from nextview.types import Float, Index, Mask
 
@@ -31,7 +34,6 @@ HIDDEN_STEP = 0.015  # metres, least distance of an occluder in front of a hidde
 RAY_STEPS = 48  # samples along a ray that is tested for occluders
 FEWEST_HIDDEN = 12  # connected hidden cells; fewer cannot hide an object
 
-LOWEST_SCENE_CAMERA = 0.10  # metres above the plane
 SAME_VIEW_ANGLE = np.radians(15.0)  # between two views with the same information
 UNKNOWN_WORTH = (
     1.0  # nats, information of a view of an unknown object from the far side
@@ -213,8 +215,8 @@ class Candidates:
         poses: camera-to-world, (V, 4, 4), OpenCV axes, metres.
         directions: from the centre of the scene to each view, unit vectors, (V, 3), upright axes
             (z against gravity).
-        free: views that may be chosen: above the plane, within reach, and not close to an earlier
-            view, (V,) bool.
+        free: views that may be chosen: within limits and reach, and not close to an earlier view,
+            (V,) bool.
         travel: straight way from the last camera to each view, (V,), metres; or its cost by
             ``Scene.travel_cost``.
         current: direction from the centre of the scene to the last camera, unit vector, (3,),
@@ -231,33 +233,44 @@ class Candidates:
 def candidates(
     system: System,
     tops: Sequence[TableTop],
-    around: Float,
+    around: ObjectFrame,
     distance: float | None,
+    limits: Limits,
+    surroundings: Sequence[Surroundings],
+    reach: Reach,
 ) -> Candidates:
     """Create candidate views around a scene, all at the same distance from its centre.
 
     Args:
         system: with the directions of the candidates.
         tops: support surfaces of the frames.
-        around: corners of the region of interest, (N, 3), world, metres.
+        around: what the cameras look at, world, metres.
         distance: of the cameras from the centre, metres; None for that of the last camera.
+        limits: on the positions of the cameras.
+        surroundings: of the scene in each frame.
+        reach: of the camera.
     """
-    axes = upright_axes(tops[0].up)
-    middle = (around.min(0) + around.max(0)) / 2
+    last = tops[-1].frame.camera_to_world
     places = np.stack([top.frame.camera_to_world[:3, 3] for top in tops])
-    away = float(np.linalg.norm(places[-1] - middle)) if distance is None else distance
-    poses = ObjectFrame(middle, away / 3, axes).pose_in_world(system.sphere.poses, away)
+    turned = (places - around.centre) @ around.axes.T
+    ways = np.linalg.norm(turned, axis=1)
+    away = float(ways[-1]) if distance is None else distance
+    poses = around.pose_in_world(system.sphere.poses, away)
+    directions = (poses[:, :3, 3] - around.centre) @ around.axes.T / away
+    towards = turned / ways[:, None]
 
-    directions = (poses[:, :3, 3] - middle) @ axes.T / away
-    free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_SCENE_CAMERA
-    for place in places:
-        towards = (place - middle) @ axes.T
-        towards = towards / np.linalg.norm(towards)  # at the end, of the last camera
-        free &= np.array(
-            [angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions]
-        )
+    free = limits.reasons(poses, around, surroundings) == ""
+    for earlier in towards:
+        free &= angle_between(directions, earlier) > SAME_VIEW_ANGLE
+
+    start = int(np.argmax(directions @ towards[-1]))
+    views, cost = reach.moves(np.flatnonzero(free), start, last, lambda: poses)
+    free = np.isin(np.arange(len(free)), views)
     travel = np.linalg.norm(poses[:, :3, 3] - places[-1], axis=1)
-    return Candidates(poses, directions, free, travel, towards)
+    if cost is not None:
+        travel = np.full(len(free), cost.max(initial=0.0))
+        travel[views] = cost
+    return Candidates(poses, directions, free, travel, towards[-1])
 
 
 def object_value(

@@ -48,7 +48,15 @@ from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.judging import Judge
-from nextview.session.reach import cost_of, truth_of
+from nextview.session.limits import Limits, checked_limits
+from nextview.session.reach import (
+    Reach,
+    Reachable,
+    TravelCost,
+    as_reachable,
+    as_travel_cost,
+)
+from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
 
@@ -129,7 +137,7 @@ class Scene:
         distance: of the camera from the centre of the scene in ``target``, metres; by default that
             of the last frame.
         reachable: function that returns True if the camera can reach a pose, camera-to-world,
-            (4, 4).
+            (4, 4); or a mask of the candidate views, (V,) bool.
         segmentation: your own segmentation: a function from a frame to masks of the objects,
             (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. With None
             the bundled network is used; it also provides the support surfaces if your own
@@ -155,12 +163,12 @@ class Scene:
         up: ArrayLike | None = (0.0, 0.0, 1.0),
         region: Box | None = None,
         distance: float | None = None,
-        reachable: Callable[[Float], bool] | None = None,
+        reachable: ArrayLike | Callable[[Float], bool] | None = None,
         segmentation: Segmenter | None = None,
         policy: str | ScenePolicy | type = INFORMATION_POLICY,
         rng: np.random.Generator | None = None,
         any_orientation: bool = False,
-        travel_cost: Callable[[Float, Float], float] | None = None,
+        travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -168,15 +176,17 @@ class Scene:
         self._open: tuple[OpenPoint, ...] | None = None
         self._targets: Float | None = None
         self._target_rows: list[int] = []
-        self._failed: set[int] = set()
+        self._surroundings: tuple[Surroundings, ...] = ()
+        self._limits = Limits()
         self._lock = RLock()
 
+        system = models if isinstance(models, System) else load(models)
+        self.system = system.in_any_orientation() if any_orientation else system
+        self._reach = Reach(np.zeros(len(system.sphere), bool))
         self.distance = distance
         self.reachable = reachable
         self.travel_cost = travel_cost
         self.segmentation = segmentation
-        system = models if isinstance(models, System) else load(models)
-        self.system = system.in_any_orientation() if any_orientation else system
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
 
@@ -259,30 +269,48 @@ class Scene:
         self._changed()
 
     @property
-    def reachable(self) -> Callable[[Float], bool] | None:
-        """Whether the camera can reach a pose, camera-to-world, (4, 4); None for all poses.
+    def reachable(self) -> Reachable | None:
+        """Views that the camera can reach, see ``session.reach.Reachable``; None for all.
 
-        It is asked once after each frame, for all candidates. A change takes effect immediately.
+        A function is asked once after each frame, for all candidates. A change takes effect
+        immediately.
         """
-        return self._reachable
+        return self._reach.reachable
 
     @reachable.setter
-    def reachable(self, given: Callable[[Float], bool] | None) -> None:
-        self._reachable = given
+    def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
+        checked = as_reachable(given, len(self.system.sphere))
+        self._reach = replace(self._reach, reachable=checked)
         self._changed()
 
     @property
-    def travel_cost(self) -> Callable[[Float, Float], float] | None:
-        """Cost of moving the camera from one pose, (4, 4), to another; None for metres.
+    def travel_cost(self) -> TravelCost | None:
+        """Cost of moving the camera, see ``session.reach.TravelCost``; None for metres.
 
-        It is asked once after each frame, for all candidates that can be reached. The unit is
-        arbitrary. A change takes effect immediately.
+        A function is asked once after each frame, for all candidates that can be reached. The unit
+        is arbitrary. A change takes effect immediately.
         """
-        return self._travel_cost
+        return self._reach.cost
 
     @travel_cost.setter
-    def travel_cost(self, given: Callable[[Float, Float], float] | None) -> None:
-        self._travel_cost = given
+    def travel_cost(
+        self, given: ArrayLike | Callable[[Float, Float], float] | None
+    ) -> None:
+        checked = as_travel_cost(given, len(self.system.sphere))
+        self._reach = replace(self._reach, cost=checked)
+        self._changed()
+
+    @property
+    def limits(self) -> Limits:
+        """Limits on the positions of the camera, see ``session.limits.Limits``.
+
+        A change takes effect immediately.
+        """
+        return self._limits
+
+    @limits.setter
+    def limits(self, given: Limits) -> None:
+        self._limits = checked_limits(given)
         self._changed()
 
     @property
@@ -304,7 +332,7 @@ class Scene:
     def targets(self) -> Float:
         """Candidate views, the best first, camera-to-world, (V, 4, 4); the first is ``target``.
 
-        Only views above the plane, within reach and away from the earlier ones. One view at most if
+        Only views within ``limits`` and reach, and away from the earlier ones. One view at most if
         the ``policy`` chooses one instead of valuing all.
 
         Raises:
@@ -331,25 +359,20 @@ class Scene:
         None before the first frame.
         """
         around = self._state.around
-        if self._views is None and len(around):
-            views = candidates(self.system, self._state.tops, around, self.distance)
-            free = views.free.copy()
-            free[list(self._failed)] = False
-            travel = views.travel.copy()
-
-            rows = np.flatnonzero(free)
-            if self.reachable is not None:
-                free[rows] = [truth_of(self.reachable(views.poses[k])) for k in rows]
-                rows = np.flatnonzero(free)
-
-            if self.travel_cost is not None:
-                here = self._state.tops[-1].frame.camera_to_world
-                costs = [cost_of(self.travel_cost(here, views.poses[k])) for k in rows]
-                travel = np.full(len(free), np.inf)
-                travel[rows] = costs
-                free &= travel < np.inf
-                travel[~free] = travel[free].max(initial=0.0)
-            self._views = replace(views, free=free, travel=travel)
+        if self._views is None and around is not None:
+            tops = self._state.tops
+            self._surroundings = Surroundings.in_frames(
+                tops, around, self._surroundings
+            )
+            self._views = candidates(
+                self.system,
+                tops,
+                around,
+                self.distance,
+                self.limits,
+                self._surroundings,
+                self._reach,
+            )
         return self._views
 
     def _changed(self) -> None:
@@ -369,7 +392,9 @@ class Scene:
         with self._lock:
             if self.target is None:
                 raise SessionError("no view was asked for, so none has failed")
-            self._failed.add(self._target_rows[0])
+            rows = np.arange(len(self._reach.failed))
+            failed = self._reach.failed | (rows == self._target_rows[0])
+            self._reach = replace(self._reach, failed=failed)
             self._changed()
 
     @overload

@@ -48,7 +48,7 @@ from nextview.sensing.plausibility import (
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.judging import Judge
-from nextview.session.limits import Limits, in_words
+from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
     Reach,
@@ -201,7 +201,7 @@ class Session:
         self._rng = rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
         self._limits = Limits()
-        self._surroundings: list[Surroundings] = []
+        self._surroundings: tuple[Surroundings, ...] = ()
         self._lock = RLock()
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
 
@@ -461,13 +461,10 @@ class Session:
 
     @limits.setter
     def limits(self, given: Limits) -> None:
-        if not isinstance(given, Limits):
-            raise UsageError(
-                f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}"
-            )
+        checked = checked_limits(given)
         with self._lock:
             before = self._limits
-            self._limits = given
+            self._limits = checked
             try:
                 self._set_reach(self._reach)
             except BaseException:
@@ -488,16 +485,14 @@ class Session:
         """Return ``Limits.reasons``; all "" without frames and before the first one."""
         if object is None or not object.sightings:
             return np.full(len(self.sphere), "", "<U1")
-        known = {id(shown.frame): shown for shown in self._surroundings}
-        self._surroundings = [
-            known.get(id(sighting.frame))
-            or Surroundings.of(sighting, object.object_frame)
-            for sighting in object.sightings
-        ]
+        self._surroundings = Surroundings.in_frames(
+            object.sightings, object.object_frame, self._surroundings
+        )
         return self._limits.reasons(
             self._poses_around(object),
-            object,
+            object.object_frame,
             self._surroundings,
+            object.support,
         )
 
     def failed(self, view: int | None = None) -> None:
