@@ -30,6 +30,7 @@ from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
+from nextview.scene.rule import Rule, ruled_out_by
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
 from nextview.scene.view_policies import (
@@ -56,6 +57,7 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
+from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
@@ -151,6 +153,7 @@ class Scene:
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
+        rule: rules out names of objects, given all objects, see ``scene.rule.Rule``.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -169,6 +172,7 @@ class Scene:
         rng: np.random.Generator | None = None,
         any_orientation: bool = False,
         travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
+        rule: Rule | None = None,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -187,16 +191,11 @@ class Scene:
         self.reachable = reachable
         self.travel_cost = travel_cost
         self.segmentation = segmentation
+        self.rule = rule
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
 
-        self._judge = Judge(
-            self.system.models,
-            self.system.sphere,
-            self.system.stopping,
-            self.system.unknown,
-            CORES,
-        )
+        self._judge = _judge_of(self.system)
         self._widest = self._judge.widest
         self._state = SceneState(region=region)
 
@@ -585,7 +584,7 @@ class Scene:
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
-        state = replace(state, cameras=(*before.cameras, camera))
+        state = self._ruled(replace(state, cameras=(*before.cameras, camera)))
         if look.moved and not (seen_again or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
@@ -632,6 +631,46 @@ class Scene:
         state = replace(before, tops=tops, left_unknown=of_new.count(False))
         return _numbered(state, [_with_past(one, known, number) for one in every], lost)
 
+    def _ruled(self, state: SceneState) -> SceneState:
+        """Return a scene without the names that the rule rules out."""
+        if self.rule is None:
+            return state
+        earlier = {track.number: track.result for track in state.tracks}
+        tracks = {track.number: track.with_all_names for track in state.tracks}
+        while True:
+            state = replace(state, tracks=tuple(tracks.values()))
+            new = ruled_out_by(self.rule, state.objects)
+            if not new:
+                return state
+            for which, names in new.items():
+                tracks[which] = self._without(tracks[which], names, earlier[which])
+
+    def _without(
+        self,
+        track: Track,
+        names: Mapping[str, str],
+        earlier: Recognition | None,
+    ) -> Track:
+        """Return an object that has none of some names.
+
+        Args:
+            track: the object.
+            names: further names that it cannot have, with the reasons.
+            earlier: its result in the last frame, which is taken again if it still holds.
+        """
+        assert track.result is not None
+        of_all_names = track.result.of_all_names or track.result
+        ruled_out = (*track.result.ruled_out, *names.items())
+        if (
+            earlier is None
+            or earlier.of_all_names is not of_all_names
+            or earlier.ruled_out != ruled_out
+        ):
+            system = self.system.without(*dict(ruled_out))
+            earlier = _judge_of(system)([track.thing])[0]
+        result = replace(earlier, ruled_out=ruled_out, of_all_names=of_all_names)
+        return replace(track, result=result)
+
     def _explained(
         self,
         track: Track,
@@ -663,6 +702,11 @@ class Scene:
             replace(track, result=result)
             for track, result in zip(tracks, results, strict=True)
         ]
+
+
+def _judge_of(system: System) -> Judge:
+    """Return what recognises objects by a system."""
+    return Judge(system.models, system.sphere, system.stopping, system.unknown, CORES)
 
 
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
