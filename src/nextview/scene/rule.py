@@ -8,7 +8,7 @@ from nextview.checks import one_line, plugin_errors
 from nextview.errors import UsageError
 from nextview.scene.objects import SceneObject
 
-Rule = Callable[[Sequence[SceneObject]], Mapping[int, Mapping[str, str]]]
+SceneRule = Callable[[Sequence[SceneObject]], Mapping[int, Mapping[str, str]]]
 """A function of all objects of a scene that returns, by the number of an object, the names that it
 cannot have, each with the reason in words. It is asked after each frame, and again with the names
 that the objects have without these, until it rules out no other name.
@@ -16,7 +16,7 @@ that the objects have without these, until it rules out no other name.
 
 
 def ruled_out_by(
-    rule: Rule,
+    rule: SceneRule,
     objects: Sequence[SceneObject],
 ) -> dict[int, dict[str, str]]:
     """Ask a rule which further names it rules out.

@@ -30,7 +30,7 @@ from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
-from nextview.scene.rule import Rule, ruled_out_by
+from nextview.scene.rule import SceneRule, ruled_out_by
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
 from nextview.scene.view_policies import (
@@ -153,7 +153,7 @@ class Scene:
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
-        rule: rules out names of objects, given all objects, see ``scene.rule.Rule``.
+        rule: rules out names of objects, given all objects, see ``scene.rule.SceneRule``.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -172,7 +172,7 @@ class Scene:
         rng: np.random.Generator | None = None,
         any_orientation: bool = False,
         travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
-        rule: Rule | None = None,
+        rule: SceneRule | None = None,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)

@@ -62,7 +62,7 @@ class Recognition:
         unknown_rate: significance level of the test for unknown objects; 0 disables it.
         impossible: classes that never have the size of this object.
         poses_in: the coordinate frame of the poses.
-        ruled_out: names that the object cannot have by ``scene.rule.Rule``, each with the reason.
+        ruled_out: names that the object cannot have, with reasons, see ``scene.rule.SceneRule``.
         of_all_names: the result without these names ruled out; None if none is.
 
     Example:

@@ -28,7 +28,7 @@ from nextview.types import Float, Floats, Index
 MADE = ("things", "in_any_orientation")
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"
-LEAST_BELIEF = 1e-12  # of a class that is not ruled out, so that some belief is left
+SOME_BELIEF = 1e-12  # of a class that is not ruled out, so that some belief is left
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -167,7 +167,7 @@ class VerifiedRecogniser(TaughtRecogniser):
 
     def _allowed(self, belief: Float) -> Float:
         """A belief, (classes,), without the classes that are ruled out."""
-        left = np.where(self.ruled_out, 0, np.maximum(belief, LEAST_BELIEF))
+        left = np.where(self.ruled_out, 0, np.maximum(belief, SOME_BELIEF))
         return left / left.sum() if self.ruled_out.any() else belief
 
     def _unexplained(self, belief: Float, why: str) -> JointBelief:
