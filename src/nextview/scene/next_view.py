@@ -338,11 +338,13 @@ def elsewhere_value(tops: Sequence[TableTop], views: Candidates) -> Float:
         tops: support surfaces of the frames.
         views: the candidates.
     """
-    turned = np.full(len(views.poses), np.pi)
-    for top in tops:
-        ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
-        turned = np.minimum(turned, np.arccos(np.clip(ahead, -1, 1)))
-    return UNKNOWN_WORTH * turned / np.pi
+    earlier = [top.frame.camera_to_world[:3, 2] for top in tops]
+    return UNKNOWN_WORTH * _turned(views.poses[:, :3, 2], earlier) / np.pi
+
+
+def _turned(towards: Float, earlier: Sequence[Float]) -> Float:
+    """Return the angle from unit vectors, (V, 3), to the nearest of earlier ones, radians, (V,)."""
+    return np.min([angle_between(towards, before) for before in earlier], axis=0)
 
 
 def _information(system: System, track: Track, views: Candidates) -> Float | None:
@@ -364,10 +366,8 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     if outlook is None:
         return None
 
-    frame = track.thing.object_frame
-    inside = frame.pose_in_object(views.poses)
-    inside[:, :3, 3] *= frame.radius
-    return np.asarray(outlook.expect(inside).information("thing"))
+    cameras = track.thing.object_frame.pose_in_metres(views.poses)
+    return outlook.expect(cameras).information("thing")
 
 
 def _from_another_side(
@@ -376,14 +376,16 @@ def _from_another_side(
     views: Candidates,
 ) -> Float:
     """Return the value of each view by its distance from the views of one object, nats, (V,)."""
-    frame = track.thing.object_frame
-    inside = frame.pose_in_object(views.poses)
-    towards = inside[:, :3, 3] / np.linalg.norm(inside[:, :3, 3], axis=1, keepdims=True)
-    turned = np.full(len(towards), np.pi)
-    for number in track.pixels:
-        before = frame.pose_in_object(tops[number].frame.camera_to_world)[:3, 3]
-        before = before / np.linalg.norm(before)
-        turned = np.minimum(turned, np.arccos(np.clip(towards @ before, -1, 1)))
+    centre = track.thing.object_frame.centre
+    places = [tops[number].frame.camera_to_world[:3, 3] for number in track.pixels]
+    earlier = [_towards(place - centre) for place in places]
+    towards = _towards(views.poses[:, :3, 3] - centre)
 
     known = track.result is not None and not track.result.unknown
-    return (SURE_WORTH if known else UNKNOWN_WORTH) * turned / np.pi
+    worth = SURE_WORTH if known else UNKNOWN_WORTH
+    return worth * _turned(towards, earlier) / np.pi
+
+
+def _towards(ways: Float) -> Float:
+    """Return vectors, (..., 3), at unit length."""
+    return np.asarray(ways / np.linalg.norm(ways, axis=-1, keepdims=True))

@@ -40,7 +40,7 @@ from nextview.recognition.protocol import (
     LooksAhead,
 )
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import REPEATED, repeated
+from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
 from nextview.sensing.plausibility import (
     check_last_view,
     check_observation,
@@ -57,7 +57,6 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.repeated import is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
@@ -315,14 +314,14 @@ class Session:
         else:
             given = camera_poses(poses)
             left = np.arange(len(given))
-        inside = (
-            given
-            if self.object is None
-            else self.object.object_frame.pose_in_object(given)
-        )
-        radius = self.views[-1].observation.radius
-        assert radius is not None  # an outlook implies a radius
-        return rank_views(outlook, inside, radius, given, left, goal)
+        if self.object is not None:
+            cameras = self.object.object_frame.pose_in_metres(given)
+        else:
+            radius = self.views[-1].observation.radius
+            assert radius is not None  # an outlook implies a radius
+            cameras = given.copy()
+            cameras[:, :3, 3] *= radius
+        return rank_views(outlook, cameras, given, left, goal)
 
     @property
     def outlook(self) -> Outlook | None:
@@ -673,7 +672,7 @@ class Session:
         if self.object is not None:
             raise SessionError("this session takes frames: it has an observed object")
         earlier = [view.observation for view in self.views]
-        if is_repeated(seen, earlier):
+        if repeated_observation(seen, earlier):
             warnings = [REPEATED]
         else:
             warnings = check_observation(seen) or check_last_view([*earlier, seen])
