@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import did_you_mean, number, one_line
+from nextview.checks import did_you_mean, one_line
 from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import Change, changes, wrong_pose
@@ -28,7 +28,7 @@ from nextview.scene.grasps import (
 )
 from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
-from nextview.scene.open_points import OpenPoint
+from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.rule import SceneRule, ruled_out_by
 from nextview.scene.state import MOST_VERIFIED, SceneState
@@ -54,6 +54,7 @@ from nextview.session.reach import (
     Reach,
     Reachable,
     TravelCost,
+    as_distance,
     as_reachable,
     as_travel_cost,
 )
@@ -248,8 +249,17 @@ class Scene:
         with self._lock:
             if self._open is None:
                 views = self._candidates
-                left = np.zeros((0, 4, 4)) if views is None else views.poses[views.free]
-                self._open = self._state.open_points(left[:, :3, 3])
+                if views is None:
+                    return ()
+                left = views.poses[views.free]
+                state = self._state
+                self._open = open_points(
+                    state.tracks,
+                    state.unexplained,
+                    state.ground,
+                    state.ground_seen,
+                    left[:, :3, 3],
+                )
             return self._open
 
     @property
@@ -262,9 +272,7 @@ class Scene:
 
     @distance.setter
     def distance(self, given: float | None) -> None:
-        self._distance = (
-            None if given is None else number(given, "the distance", above=0)
-        )
+        self._distance = as_distance(given)
         self._changed()
 
     @property

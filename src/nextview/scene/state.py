@@ -12,13 +12,11 @@ from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import CameraError
 from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject
-from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.types import Float
 
 # largest number of objects verified per frame, those with the most pixels first
 MOST_VERIFIED = 20
@@ -71,18 +69,6 @@ class SceneState:
     def ground_seen(self) -> bool:
         """True if enough of the ground is visible to rule out further objects."""
         return ground_seen(self.tops, self.region)
-
-    def open_points(self, cameras: Float) -> tuple[OpenPoint, ...]:
-        """Return what is not settled; empty before the first frame.
-
-        Args:
-            cameras: positions of the views that are left, (K, 3), world.
-        """
-        if not self.tops:
-            return ()
-        return open_points(
-            self.tracks, self.unexplained, self.ground, self.ground_seen, cameras
-        )
 
     @property
     def around(self) -> ObjectFrame | None:

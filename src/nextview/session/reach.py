@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import one_line
+from nextview.checks import number, one_line
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, travel_from
@@ -146,6 +146,15 @@ def truth_of(answer: Any) -> bool:
             f"whether a view can be reached is true or false, not {one_line(repr(answer))}"
         )
     return bool(answer)
+
+
+def as_distance(given: float | None) -> float | None:
+    """Return the distance of a camera passed in by a user, metres, above 0; or None.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
 def as_reachable(

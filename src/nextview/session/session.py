@@ -54,6 +54,7 @@ from nextview.session.reach import (
     Reach,
     Reachable,
     TravelCost,
+    as_distance,
     as_reachable,
     as_travel_cost,
 )
@@ -181,7 +182,7 @@ class Session:
         self.models = models
         self.policy = policy
         self.sphere = sphere
-        self._distance = _checked_distance(distance)
+        self._distance = as_distance(distance)
         self.object = (
             _new_object(segmentation)
             if object is None and distance is not None
@@ -357,7 +358,7 @@ class Session:
     @distance.setter
     def distance(self, given: float | None) -> None:
         with self._lock:
-            checked = _checked_distance(given)
+            checked = as_distance(given)
             before = self._distance
             self._distance = checked
             if self.object is not None and self.object.sightings:
@@ -1017,11 +1018,6 @@ def _half_diagonal(points: Float) -> float:
     if not len(points):
         return 0.0
     return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
-
-
-def _checked_distance(given: float | None) -> float | None:
-    """Return a camera distance, metres, checked to be above 0; or None."""
-    return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
 def _new_object(segmentation: Segmenter | None) -> ObservedObject:
