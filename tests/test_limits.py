@@ -182,6 +182,21 @@ def test_no_target_is_behind_a_wall(tiny, turn):
     assert BEHIND_WALL not in session.left_out
 
 
+def test_limits_hold_for_the_targets_of_a_scene_too(ycb):
+    wall = box((5, 0.1, 3), (0, 0.4, 1.0))
+    scene = nextview.Scene(ycb, distance=0.7)
+    scene.update(look(pose_at(30, -90, 0.8, (0, 0, 0.05)), BRICK, TABLE, wall))
+    assert len(scene.targets)
+    assert (scene.targets[:, 1, 3] < 0.35).all()
+    assert (scene.targets[:, 2, 3] >= 0.08).all()
+
+    scene.limits = Limits(clearance=0, min_height=0.4)
+    assert (scene.targets[:, 1, 3] > 0.35).any()
+    assert (scene.targets[:, 2, 3] >= 0.4).all()
+    with pytest.raises(UsageError, match="limits are a nextview"):
+        scene.limits = 0.4
+
+
 def test_what_ends_is_no_wall_once_a_frame_shows_what_is_behind(tiny):
     screen = box((1.3, 0.02, 1.2), (0, 0.45, 0.6))
     session = begin(tiny, distance=0.7, point=(0, 0, 0.03))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import (
+    VISITED_ANGLE,
     Directions,
     ViewSphere,
     look_at_origin,
@@ -20,7 +21,7 @@ from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.off_grid import OffGrid, anywhere
 from nextview.policies.registry import POLICIES, make_policy, make_policy_anywhere
 from nextview.recognition.belief import Calibration, FixedLength
-from nextview.session.episode import VISITED_ANGLE, Episodes
+from nextview.session.episode import Episodes
 
 SPHERE = ViewSphere.named("40")
 CLASSES = 10

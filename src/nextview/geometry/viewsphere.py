@@ -25,6 +25,8 @@ TRAVEL_CELL = np.radians((18.0, 45.0))
 MOST_VIEWPOINTS = 5_000
 # radians within which a camera stands at a candidate. What is more is a place of its own
 SNAP = 1e-6
+# candidate views within this angle of a camera position count as visited
+VISITED_ANGLE = np.radians(6.0)
 
 
 def rotation_z(angle: ArrayLike) -> Float:

@@ -15,6 +15,8 @@ from nextview.types import Float, Floats, Index, Mask
 if TYPE_CHECKING:
     from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
+# relative to the best value; among views within this range, travel decides
+NEAR_TIE = 0.05
 # candidate views of a policy: all views, or those of the local window
 Scope = Literal["global", "local"]
 
@@ -160,6 +162,20 @@ def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
         Cost in grid cells, (B, V) float64; the robot's own cost if the state has one.
     """
     return sphere.travel[state.current] if state.travel is None else state.travel
+
+
+def nearer_first(values: Float, way: Float, best: float) -> Float:
+    """Return values of views of which, among similar ones, the nearer are higher.
+
+    Args:
+        values: of V views, (V,).
+        way: to each view, in any unit, (V,).
+        best: value relative to which others are similar.
+
+    Returns:
+        The values, less up to NEAR_TIE of the best one for the farthest view, (V,).
+    """
+    return values - NEAR_TIE * best * way / max(float(way.max(initial=0.0)), 1e-9)
 
 
 def visibility_of(state: EpisodeState) -> Float:

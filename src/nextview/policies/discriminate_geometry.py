@@ -6,13 +6,16 @@ import numpy as np
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints
-from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
+from nextview.policies.base import (
+    EpisodeState,
+    best_view,
+    check_weight,
+    nearer_first,
+    travel_from,
+)
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Index, Mask
 
-NEAR_TIE = (
-    0.05  # relative to the best value; among views within this range, travel decides
-)
 LEAST_INFORMATION = 1e-3  # nats; views with less are considered uninformative
 
 
@@ -97,8 +100,8 @@ class DiscriminateGeometry:
             information = found * self._apart(some, visited)
             best = LEAST_INFORMATION
         way = travel[some]
-        share = way / max(way.max(), 1e-12)
-        values[some] = information - NEAR_TIE * best * share - self.travel_weight * way
+        nearer = nearer_first(information, way, best)
+        values[some] = nearer - self.travel_weight * way
         return values
 
     def _apart(self, views: Index, visited: Mask) -> Float:

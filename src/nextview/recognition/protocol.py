@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -128,6 +128,18 @@ class KnowsAnyOrientation(Protocol):
     @property
     def in_any_orientation(self) -> Recogniser:
         """The same for things that are held, lean or fly."""
+
+
+@runtime_checkable
+class RulesOut(Protocol):
+    """A recogniser that can be told that an object is none of some classes."""
+
+    def without(self, names: Collection[str]) -> Recogniser:
+        """The same for an object that is none of some classes; ``classes`` stay as they are.
+
+        Args:
+            names: of the classes.
+        """
 
 
 def tells_unknown(recogniser: Recogniser) -> bool:

@@ -22,6 +22,9 @@ from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
+from nextview.session.limits import Limits
+from nextview.session.reach import Reach
+from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
 from nextview.types import Float, Index, Mask
 
@@ -31,7 +34,6 @@ HIDDEN_STEP = 0.015  # metres, least distance of an occluder in front of a hidde
 RAY_STEPS = 48  # samples along a ray that is tested for occluders
 FEWEST_HIDDEN = 12  # connected hidden cells; fewer cannot hide an object
 
-LOWEST_SCENE_CAMERA = 0.10  # metres above the plane
 SAME_VIEW_ANGLE = np.radians(15.0)  # between two views with the same information
 UNKNOWN_WORTH = (
     1.0  # nats, information of a view of an unknown object from the far side
@@ -213,8 +215,8 @@ class Candidates:
         poses: camera-to-world, (V, 4, 4), OpenCV axes, metres.
         directions: from the centre of the scene to each view, unit vectors, (V, 3), upright axes
             (z against gravity).
-        free: views that may be chosen: above the plane, within reach, and not close to an earlier
-            view, (V,) bool.
+        free: views that may be chosen: within limits and reach, and not close to an earlier view,
+            (V,) bool.
         travel: straight way from the last camera to each view, (V,), metres; or its cost by
             ``Scene.travel_cost``.
         current: direction from the centre of the scene to the last camera, unit vector, (3,),
@@ -231,33 +233,44 @@ class Candidates:
 def candidates(
     system: System,
     tops: Sequence[TableTop],
-    around: Float,
+    around: ObjectFrame,
     distance: float | None,
+    limits: Limits,
+    surroundings: Sequence[Surroundings],
+    reach: Reach,
 ) -> Candidates:
     """Create candidate views around a scene, all at the same distance from its centre.
 
     Args:
         system: with the directions of the candidates.
         tops: support surfaces of the frames.
-        around: corners of the region of interest, (N, 3), world, metres.
+        around: what the cameras look at, world, metres.
         distance: of the cameras from the centre, metres; None for that of the last camera.
+        limits: on the positions of the cameras.
+        surroundings: of the scene in each frame.
+        reach: of the camera.
     """
-    axes = upright_axes(tops[0].up)
-    middle = (around.min(0) + around.max(0)) / 2
+    last = tops[-1].frame.camera_to_world
     places = np.stack([top.frame.camera_to_world[:3, 3] for top in tops])
-    away = float(np.linalg.norm(places[-1] - middle)) if distance is None else distance
-    poses = ObjectFrame(middle, away / 3, axes).pose_in_world(system.sphere.poses, away)
+    turned = (places - around.centre) @ around.axes.T
+    ways = np.linalg.norm(turned, axis=1)
+    away = float(ways[-1]) if distance is None else distance
+    poses = around.pose_in_world(system.sphere.poses, away)
+    directions = (poses[:, :3, 3] - around.centre) @ around.axes.T / away
+    towards = turned / ways[:, None]
 
-    directions = (poses[:, :3, 3] - middle) @ axes.T / away
-    free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_SCENE_CAMERA
-    for place in places:
-        towards = (place - middle) @ axes.T
-        towards = towards / np.linalg.norm(towards)  # at the end, of the last camera
-        free &= np.array(
-            [angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions]
-        )
+    free = limits.reasons(poses, around, surroundings) == ""
+    for earlier in towards:
+        free &= angle_between(directions, earlier) > SAME_VIEW_ANGLE
+
+    start = int(np.argmax(directions @ towards[-1]))
+    views, cost = reach.moves(np.flatnonzero(free), start, last, lambda: poses)
+    free = np.isin(np.arange(len(free)), views)
     travel = np.linalg.norm(poses[:, :3, 3] - places[-1], axis=1)
-    return Candidates(poses, directions, free, travel, towards)
+    if cost is not None:
+        travel = np.full(len(free), cost.max(initial=0.0))
+        travel[views] = cost
+    return Candidates(poses, directions, free, travel, towards[-1])
 
 
 def object_value(
@@ -325,11 +338,13 @@ def elsewhere_value(tops: Sequence[TableTop], views: Candidates) -> Float:
         tops: support surfaces of the frames.
         views: the candidates.
     """
-    turned = np.full(len(views.poses), np.pi)
-    for top in tops:
-        ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
-        turned = np.minimum(turned, np.arccos(np.clip(ahead, -1, 1)))
-    return UNKNOWN_WORTH * turned / np.pi
+    earlier = [top.frame.camera_to_world[:3, 2] for top in tops]
+    return UNKNOWN_WORTH * _turned(views.poses[:, :3, 2], earlier) / np.pi
+
+
+def _turned(towards: Float, earlier: Sequence[Float]) -> Float:
+    """Return the angle from unit vectors, (V, 3), to the nearest of earlier ones, radians, (V,)."""
+    return np.min([angle_between(towards, before) for before in earlier], axis=0)
 
 
 def _information(system: System, track: Track, views: Candidates) -> Float | None:
@@ -351,10 +366,8 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     if outlook is None:
         return None
 
-    frame = track.thing.object_frame
-    inside = frame.pose_in_object(views.poses)
-    inside[:, :3, 3] *= frame.radius
-    return np.asarray(outlook.expect(inside).information("thing"))
+    cameras = track.thing.object_frame.pose_in_metres(views.poses)
+    return outlook.expect(cameras).information("thing")
 
 
 def _from_another_side(
@@ -363,14 +376,16 @@ def _from_another_side(
     views: Candidates,
 ) -> Float:
     """Return the value of each view by its distance from the views of one object, nats, (V,)."""
-    frame = track.thing.object_frame
-    inside = frame.pose_in_object(views.poses)
-    towards = inside[:, :3, 3] / np.linalg.norm(inside[:, :3, 3], axis=1, keepdims=True)
-    turned = np.full(len(towards), np.pi)
-    for number in track.pixels:
-        before = frame.pose_in_object(tops[number].frame.camera_to_world)[:3, 3]
-        before = before / np.linalg.norm(before)
-        turned = np.minimum(turned, np.arccos(np.clip(towards @ before, -1, 1)))
+    centre = track.thing.object_frame.centre
+    places = [tops[number].frame.camera_to_world[:3, 3] for number in track.pixels]
+    earlier = [_towards(place - centre) for place in places]
+    towards = _towards(views.poses[:, :3, 3] - centre)
 
     known = track.result is not None and not track.result.unknown
-    return (SURE_WORTH if known else UNKNOWN_WORTH) * turned / np.pi
+    worth = SURE_WORTH if known else UNKNOWN_WORTH
+    return worth * _turned(towards, earlier) / np.pi
+
+
+def _towards(ways: Float) -> Float:
+    """Return vectors, (..., 3), at unit length."""
+    return np.asarray(ways / np.linalg.norm(ways, axis=-1, keepdims=True))

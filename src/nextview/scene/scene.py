@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import did_you_mean, number, one_line
+from nextview.checks import did_you_mean, one_line
 from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import Change, changes, wrong_pose
@@ -28,8 +28,9 @@ from nextview.scene.grasps import (
 )
 from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
-from nextview.scene.open_points import OpenPoint
+from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
+from nextview.scene.rule import SceneRule, ruled_out_by
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
 from nextview.scene.view_policies import (
@@ -48,7 +49,17 @@ from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.judging import Judge
-from nextview.session.reach import cost_of, truth_of
+from nextview.session.limits import Limits, checked_limits
+from nextview.session.reach import (
+    Reach,
+    Reachable,
+    TravelCost,
+    as_distance,
+    as_reachable,
+    as_travel_cost,
+)
+from nextview.session.result import Recognition
+from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
 
@@ -129,7 +140,7 @@ class Scene:
         distance: of the camera from the centre of the scene in ``target``, metres; by default that
             of the last frame.
         reachable: function that returns True if the camera can reach a pose, camera-to-world,
-            (4, 4).
+            (4, 4); or a mask of the candidate views, (V,) bool.
         segmentation: your own segmentation: a function from a frame to masks of the objects,
             (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. With None
             the bundled network is used; it also provides the support surfaces if your own
@@ -143,6 +154,7 @@ class Scene:
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
+        rule: rules out names of objects, given all objects, see ``scene.rule.SceneRule``.
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
@@ -155,12 +167,13 @@ class Scene:
         up: ArrayLike | None = (0.0, 0.0, 1.0),
         region: Box | None = None,
         distance: float | None = None,
-        reachable: Callable[[Float], bool] | None = None,
+        reachable: ArrayLike | Callable[[Float], bool] | None = None,
         segmentation: Segmenter | None = None,
         policy: str | ScenePolicy | type = INFORMATION_POLICY,
         rng: np.random.Generator | None = None,
         any_orientation: bool = False,
-        travel_cost: Callable[[Float, Float], float] | None = None,
+        travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
+        rule: SceneRule | None = None,
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -168,25 +181,22 @@ class Scene:
         self._open: tuple[OpenPoint, ...] | None = None
         self._targets: Float | None = None
         self._target_rows: list[int] = []
-        self._failed: set[int] = set()
+        self._surroundings: tuple[Surroundings, ...] = ()
+        self._limits = Limits()
         self._lock = RLock()
 
+        system = models if isinstance(models, System) else load(models)
+        self.system = system.in_any_orientation() if any_orientation else system
+        self._reach = Reach(np.zeros(len(system.sphere), bool))
         self.distance = distance
         self.reachable = reachable
         self.travel_cost = travel_cost
         self.segmentation = segmentation
-        system = models if isinstance(models, System) else load(models)
-        self.system = system.in_any_orientation() if any_orientation else system
+        self.rule = rule
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
 
-        self._judge = Judge(
-            self.system.models,
-            self.system.sphere,
-            self.system.stopping,
-            self.system.unknown,
-            CORES,
-        )
+        self._judge = _judge_of(self.system)
         self._widest = self._judge.widest
         self._state = SceneState(region=region)
 
@@ -239,8 +249,17 @@ class Scene:
         with self._lock:
             if self._open is None:
                 views = self._candidates
-                left = np.zeros((0, 4, 4)) if views is None else views.poses[views.free]
-                self._open = self._state.open_points(left[:, :3, 3])
+                if views is None:
+                    return ()
+                left = views.poses[views.free]
+                state = self._state
+                self._open = open_points(
+                    state.tracks,
+                    state.unexplained,
+                    state.ground,
+                    state.ground_seen,
+                    left[:, :3, 3],
+                )
             return self._open
 
     @property
@@ -253,36 +272,52 @@ class Scene:
 
     @distance.setter
     def distance(self, given: float | None) -> None:
-        self._distance = (
-            None if given is None else number(given, "the distance", above=0)
-        )
+        self._distance = as_distance(given)
         self._changed()
 
     @property
-    def reachable(self) -> Callable[[Float], bool] | None:
-        """Whether the camera can reach a pose, camera-to-world, (4, 4); None for all poses.
+    def reachable(self) -> Reachable | None:
+        """Views that the camera can reach, see ``session.reach.Reachable``; None for all.
 
-        It is asked once after each frame, for all candidates. A change takes effect immediately.
+        A function is asked once after each frame, for all candidates. A change takes effect
+        immediately.
         """
-        return self._reachable
+        return self._reach.reachable
 
     @reachable.setter
-    def reachable(self, given: Callable[[Float], bool] | None) -> None:
-        self._reachable = given
+    def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
+        checked = as_reachable(given, len(self.system.sphere))
+        self._reach = replace(self._reach, reachable=checked)
         self._changed()
 
     @property
-    def travel_cost(self) -> Callable[[Float, Float], float] | None:
-        """Cost of moving the camera from one pose, (4, 4), to another; None for metres.
+    def travel_cost(self) -> TravelCost | None:
+        """Cost of moving the camera, see ``session.reach.TravelCost``; None for metres.
 
-        It is asked once after each frame, for all candidates that can be reached. The unit is
-        arbitrary. A change takes effect immediately.
+        A function is asked once after each frame, for all candidates that can be reached. The unit
+        is arbitrary. A change takes effect immediately.
         """
-        return self._travel_cost
+        return self._reach.cost
 
     @travel_cost.setter
-    def travel_cost(self, given: Callable[[Float, Float], float] | None) -> None:
-        self._travel_cost = given
+    def travel_cost(
+        self, given: ArrayLike | Callable[[Float, Float], float] | None
+    ) -> None:
+        checked = as_travel_cost(given, len(self.system.sphere))
+        self._reach = replace(self._reach, cost=checked)
+        self._changed()
+
+    @property
+    def limits(self) -> Limits:
+        """Limits on the positions of the camera, see ``session.limits.Limits``.
+
+        A change takes effect immediately.
+        """
+        return self._limits
+
+    @limits.setter
+    def limits(self, given: Limits) -> None:
+        self._limits = checked_limits(given)
         self._changed()
 
     @property
@@ -304,7 +339,7 @@ class Scene:
     def targets(self) -> Float:
         """Candidate views, the best first, camera-to-world, (V, 4, 4); the first is ``target``.
 
-        Only views above the plane, within reach and away from the earlier ones. One view at most if
+        Only views within ``limits`` and reach, and away from the earlier ones. One view at most if
         the ``policy`` chooses one instead of valuing all.
 
         Raises:
@@ -331,25 +366,20 @@ class Scene:
         None before the first frame.
         """
         around = self._state.around
-        if self._views is None and len(around):
-            views = candidates(self.system, self._state.tops, around, self.distance)
-            free = views.free.copy()
-            free[list(self._failed)] = False
-            travel = views.travel.copy()
-
-            rows = np.flatnonzero(free)
-            if self.reachable is not None:
-                free[rows] = [truth_of(self.reachable(views.poses[k])) for k in rows]
-                rows = np.flatnonzero(free)
-
-            if self.travel_cost is not None:
-                here = self._state.tops[-1].frame.camera_to_world
-                costs = [cost_of(self.travel_cost(here, views.poses[k])) for k in rows]
-                travel = np.full(len(free), np.inf)
-                travel[rows] = costs
-                free &= travel < np.inf
-                travel[~free] = travel[free].max(initial=0.0)
-            self._views = replace(views, free=free, travel=travel)
+        if self._views is None and around is not None:
+            tops = self._state.tops
+            self._surroundings = Surroundings.in_frames(
+                tops, around, self._surroundings
+            )
+            self._views = candidates(
+                self.system,
+                tops,
+                around,
+                self.distance,
+                self.limits,
+                self._surroundings,
+                self._reach,
+            )
         return self._views
 
     def _changed(self) -> None:
@@ -369,7 +399,9 @@ class Scene:
         with self._lock:
             if self.target is None:
                 raise SessionError("no view was asked for, so none has failed")
-            self._failed.add(self._target_rows[0])
+            rows = np.arange(len(self._reach.failed))
+            failed = self._reach.failed | (rows == self._target_rows[0])
+            self._reach = replace(self._reach, failed=failed)
             self._changed()
 
     @overload
@@ -560,7 +592,7 @@ class Scene:
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
-        state = replace(state, cameras=(*before.cameras, camera))
+        state = self._ruled(replace(state, cameras=(*before.cameras, camera)))
         if look.moved and not (seen_again or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
@@ -607,6 +639,46 @@ class Scene:
         state = replace(before, tops=tops, left_unknown=of_new.count(False))
         return _numbered(state, [_with_past(one, known, number) for one in every], lost)
 
+    def _ruled(self, state: SceneState) -> SceneState:
+        """Return a scene without the names that the rule rules out."""
+        if self.rule is None:
+            return state
+        earlier = {track.number: track.result for track in state.tracks}
+        tracks = {track.number: track.with_all_names for track in state.tracks}
+        while True:
+            state = replace(state, tracks=tuple(tracks.values()))
+            new = ruled_out_by(self.rule, state.objects)
+            if not new:
+                return state
+            for which, names in new.items():
+                tracks[which] = self._without(tracks[which], names, earlier[which])
+
+    def _without(
+        self,
+        track: Track,
+        names: Mapping[str, str],
+        earlier: Recognition | None,
+    ) -> Track:
+        """Return an object that has none of some names.
+
+        Args:
+            track: the object.
+            names: further names that it cannot have, with the reasons.
+            earlier: its result in the last frame, which is taken again if it still holds.
+        """
+        assert track.result is not None
+        of_all_names = track.result.of_all_names or track.result
+        ruled_out = (*track.result.ruled_out, *names.items())
+        if (
+            earlier is None
+            or earlier.of_all_names is not of_all_names
+            or earlier.ruled_out != ruled_out
+        ):
+            system = self.system.without(*dict(ruled_out))
+            earlier = _judge_of(system)([track.thing])[0]
+        result = replace(earlier, ruled_out=ruled_out, of_all_names=of_all_names)
+        return replace(track, result=result)
+
     def _explained(
         self,
         track: Track,
@@ -638,6 +710,11 @@ class Scene:
             replace(track, result=result)
             for track, result in zip(tracks, results, strict=True)
         ]
+
+
+def _judge_of(system: System) -> Judge:
+    """Return what recognises objects by a system."""
+    return Judge(system.models, system.sphere, system.stopping, system.unknown, CORES)
 
 
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:

@@ -8,16 +8,15 @@ from functools import cached_property
 import numpy as np
 
 from nextview.checks import number_of
+from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import CameraError
 from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject
-from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
-from nextview.sensing.object_frame import Box
+from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.types import Float
 
 # largest number of objects verified per frame, those with the most pixels first
 MOST_VERIFIED = 20
@@ -71,31 +70,24 @@ class SceneState:
         """True if enough of the ground is visible to rule out further objects."""
         return ground_seen(self.tops, self.region)
 
-    def open_points(self, cameras: Float) -> tuple[OpenPoint, ...]:
-        """Return what is not settled; empty before the first frame.
+    @property
+    def around(self) -> ObjectFrame | None:
+        """What views are taken of; None before the first frame.
 
-        Args:
-            cameras: positions of the views that are left, (K, 3), world.
+        The objects together; or else unexplained points, the region, or the ground.
         """
         if not self.tops:
-            return ()
-        return open_points(
-            self.tracks, self.unexplained, self.ground, self.ground_seen, cameras
-        )
-
-    @property
-    def around(self) -> Float:
-        """What views are taken of, (N, 3), world, metres; empty before the first frame.
-
-        Corners of all objects; or else of unexplained points, the region, or the ground.
-        """
+            return None
         of_objects = [one.hull for each in self.tracks for one in each.thing.sightings]
         corners = of_objects or [patch.points for patch in self.unexplained]
         if not corners and self.region is not None:
             corners = [np.stack([self.region.low, self.region.high]) @ self.region.axes]
         if not corners:
-            corners = [top.seen.surface_samples.points for top in self.tops[-1:]]
-        return np.concatenate([np.zeros((0, 3)), *corners])
+            corners = [self.tops[-1].seen.surface_samples.points]
+        points = np.concatenate(corners)
+        middle = (points.min(0) + points.max(0)) / 2
+        radius = float(np.linalg.norm(points - middle, axis=1).max())
+        return ObjectFrame(middle, radius, upright_axes(self.tops[0].up))
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:

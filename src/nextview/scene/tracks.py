@@ -58,6 +58,13 @@ class Track:
     lately_named: bool = False
 
     @property
+    def with_all_names(self) -> Track:
+        """The object as it is recognised if no name is ruled out."""
+        if self.result is None or self.result.of_all_names is None:
+            return self
+        return replace(self, result=self.result.of_all_names)
+
+    @property
     def confident(self) -> bool:
         """True if its name is confident enough to act on."""
         return self.result is not None and self.result.confident

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import did_you_mean, one_line, plugin, plugin_errors
 from nextview.errors import PolicyError
-from nextview.policies.discriminate_geometry import NEAR_TIE
+from nextview.policies.base import nearer_first
 from nextview.scene.next_view import (
     Candidates,
     TableGround,
@@ -141,9 +141,8 @@ def most_information(choice: SceneChoice, rng: np.random.Generator) -> Float:
         Values, nats, (V,).
     """
     views = choice.views
-    most = float(choice.information[views.free].max())
-    way = views.travel / max(views.travel.max(), 1e-9)
-    return np.asarray(choice.information - NEAR_TIE * most * way)
+    best = float(choice.information[views.free].max())
+    return nearer_first(choice.information, views.travel, best)
 
 
 def random_view(choice: SceneChoice, rng: np.random.Generator) -> int:

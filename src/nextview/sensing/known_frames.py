@@ -10,6 +10,8 @@ import numpy as np
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import VISITED_ANGLE, angle_between, direction_of
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.frame import Frame, stands_still
 from nextview.sensing.lean import lean_of
@@ -18,10 +20,13 @@ from nextview.sensing.plausibility import (
     check_frame,
     check_lean,
     check_pose_moved,
+    check_views,
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
+# tolerance for the third rows of two poses that differ only by a rotation about the vertical
+SAME_THIRD_ROW = 1e-4
 REPEATED = ViewWarning(
     "repeated",
     "this picture was handed in before, to the last bit, and counts once: does the camera hang?",
@@ -173,3 +178,35 @@ def _same_mask(one: Frame, other: Frame) -> bool:
     if one.mask is None or other.mask is None:
         return one.mask is other.mask
     return np.array_equal(one.mask, other.mask)
+
+
+def repeated_observation(seen: Observation, earlier: Sequence[Observation]) -> bool:
+    """Return True if an observation repeats the image of an earlier one.
+
+    Args:
+        seen: the observation.
+        earlier: the earlier observations.
+    """
+    return any(
+        np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen)
+        for one in earlier
+    )
+
+
+def _is_one_picture(first: Observation, second: Observation) -> bool:
+    """Return True if two observations with the same depth are the same image.
+
+    Two renders of a symmetric object may also be identical, but only after a rotation about the
+    vertical.
+    """
+    if not first.seen:
+        return False
+    near = (
+        angle_between(direction_of(first.pose), direction_of(second.pose))
+        <= VISITED_ANGLE
+    )
+    return bool(
+        near
+        or not np.allclose(first.pose[2], second.pose[2], atol=SAME_THIRD_ROW)
+        or check_views(first, second)
+    )

@@ -38,8 +38,14 @@ class ObjectFrame:
 
     def pose_in_object(self, pose: ArrayLike) -> Float:
         """Convert camera-to-world poses, (..., 4, 4), metres, to the object frame, object radii."""
+        pose = self.pose_in_metres(pose)
+        pose[..., :3, 3] /= self.radius
+        return pose
+
+    def pose_in_metres(self, pose: ArrayLike) -> Float:
+        """Convert camera-to-world poses, (..., 4, 4), metres, to the object frame, metres."""
         pose = np.array(pose, np.float64)
-        pose[..., :3, 3] = (pose[..., :3, 3] - self.centre) @ self.axes.T / self.radius
+        pose[..., :3, 3] = (pose[..., :3, 3] - self.centre) @ self.axes.T
         pose[..., :3, :3] = self.axes @ pose[..., :3, :3]
         return pose
 

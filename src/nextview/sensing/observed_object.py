@@ -17,7 +17,7 @@ from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing import plausibility
 from nextview.sensing.choosing import Parting, choose_instance
-from nextview.sensing.displacement import displacement
+from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames
@@ -258,9 +258,7 @@ class ObservedObject:
         seen = replace(seen, warnings=warnings)
         displaced = None
         if before.sightings and self.known is None:
-            displaced = displacement(seen, before.sightings)
-        if displaced is not None and displaced.mended:
-            seen = seen.shifted(-displaced.shift)
+            seen, displaced = _mended(seen, before.sightings)
 
         if up is None:
             assert plane is not None
@@ -319,10 +317,7 @@ class ObservedObject:
         first, *others = state.sightings[: last + 1]
         mended = [first]
         for sighting in others:
-            displaced = displacement(sighting, mended)
-            if displaced is not None and displaced.mended:
-                sighting = sighting.shifted(-displaced.shift)
-            mended.append(sighting)
+            mended.append(_mended(sighting, mended)[0])
         return [observation_of(one, state.frame, self.life_size) for one in mended]
 
     @property
@@ -469,6 +464,16 @@ class ObservedObject:
         if self.support and plane is None and self.known is None:
             warnings.append(NO_PLANE)
         return warnings
+
+
+def _mended(
+    latest: Sighting, earlier: Sequence[Sighting]
+) -> tuple[Sighting, Displacement | None]:
+    """Return a sighting without its displacement from earlier ones, and the displacement."""
+    displaced = displacement(latest, earlier)
+    if displaced is None or not displaced.mended:
+        return latest, displaced
+    return latest.shifted(-displaced.shift), displaced
 
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:

@@ -12,7 +12,13 @@ import numpy as np
 from nextview.checks import plugin_errors
 from nextview.errors import PolicyError, SessionError, UsageError
 from nextview.geometry.observation import Observation, SceneView
-from nextview.geometry.viewsphere import SNAP, Viewpoints, angle_between, azimuth_of
+from nextview.geometry.viewsphere import (
+    SNAP,
+    VISITED_ANGLE,
+    Viewpoints,
+    angle_between,
+    azimuth_of,
+)
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
 from nextview.recognition.belief import (
@@ -24,9 +30,6 @@ from nextview.recognition.belief import (
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.types import Float, Floats, Index, Mask
-
-# candidate views within this angle of a camera position count as visited
-VISITED_ANGLE = np.radians(6.0)
 
 
 @dataclass(frozen=True)

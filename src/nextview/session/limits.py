@@ -3,17 +3,15 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.checks import number
+from nextview.checks import number, one_line
+from nextview.errors import UsageError
+from nextview.sensing.object_frame import ObjectFrame
 from nextview.session.surroundings import Surroundings
 from nextview.types import Float, Mask
-
-if TYPE_CHECKING:
-    from nextview.sensing.observed_object import ObservedObject
 
 LOWEST_VIEW = 0.08
 """Metres above the support plane: clearance for a wrist camera, its mount and the gripper."""
@@ -36,7 +34,7 @@ BEHIND_WALL = "behind a wall"
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on the camera positions, with defaults that suit most robots.
+    """Limits on the camera positions of a session or a scene; the defaults suit most robots.
 
     Heights are measured from the support plane, if it is known. Surfaces in the frames exclude
     views if the object rests on a support plane. In a gripper or on a turntable
@@ -83,15 +81,17 @@ class Limits:
     def reasons(
         self,
         poses: Float,
-        object: "ObservedObject",
+        around: ObjectFrame,
         surroundings: Sequence[Surroundings],
+        rests: bool = True,
     ) -> NDArray[np.str_]:
         """Return the reason why each candidate is excluded.
 
         Args:
             poses: of the candidates, camera-to-world, metres, (V, 4, 4).
-            object: the object.
-            surroundings: of the object in each frame.
+            around: frame of the object, or of all objects of a scene, which the camera looks at.
+            surroundings: of the object in each frame, at least one.
+            rests: whether it rests on a support plane, so that its surroundings rest, too.
 
         Returns:
             (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``BEHIND_SOMETHING``, ``BEHIND_WALL``,
@@ -99,19 +99,15 @@ class Limits:
         """
         places = poses[:, :3, 3]
         found = np.full(len(poses), "", f"<U{len(TOO_NEAR)}")
-        for reason, holds in self._occupied(places, object, surroundings):
+        for reason, holds in self._occupied(places, around, surroundings, rests):
             found[holds] = reason
 
-        planes = [
-            sighting.plane
-            for sighting in object.sightings
-            if sighting.plane is not None
-        ]
+        planes = [shown.plane for shown in surroundings if shown.plane is not None]
         if not planes:
             return found
 
         height = np.median([plane.height(places) for plane in planes], axis=0)
-        away = np.linalg.norm(places - object.object_frame.centre, axis=1)
+        away = np.linalg.norm(places - around.centre, axis=1)
         lowest = (
             np.maximum(LOWEST_VIEW, GRAZING * away)
             if self.min_height is None
@@ -119,9 +115,7 @@ class Limits:
         )
         highest = self.max_height
         if highest is None:
-            stood = [
-                sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings
-            ]
+            stood = [shown.frame.camera_to_world[:3, 3] for shown in surroundings]
             highest = max(HIGHEST, float(np.max(planes[-1].height(np.array(stood)))))
         found[height < lowest] = TOO_LOW
         found[height > highest] = TOO_HIGH
@@ -130,18 +124,18 @@ class Limits:
     def _occupied(
         self,
         places: Float,
-        object: "ObservedObject",
+        around: ObjectFrame,
         surroundings: Sequence[Surroundings],
+        rests: bool,
     ) -> list[tuple[str, Mask]]:
         """Return reasons and excluded positions from the frames; later entries take precedence."""
         clearance = self.clearance
         if clearance is None:
-            clearance = VIEW_CLEARANCE if object.support else 0.0
+            clearance = VIEW_CLEARANCE if rests else 0.0
         if clearance == 0:
             return []
 
         nothing = np.zeros(len(places), bool)
-        around = object.object_frame
         walls = nothing
         near = nothing
         free = nothing
@@ -159,6 +153,19 @@ class Limits:
             (BEHIND_WALL, walls),
             (TOO_NEAR, near),
         ]
+
+
+def checked_limits(given: Limits) -> Limits:
+    """Return limits passed in by a user.
+
+    Raises:
+        UsageError: they are none.
+    """
+    if not isinstance(given, Limits):
+        raise UsageError(
+            f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}"
+        )
+    return given
 
 
 def in_words(reasons: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import checked_pose
 from nextview.geometry.viewsphere import angle_between, direction_of
-from nextview.policies.discriminate_geometry import NEAR_TIE
+from nextview.policies.base import nearer_first
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Index
 
@@ -76,8 +76,7 @@ def camera_poses(given: ArrayLike) -> Float:
 
 def rank_views(
     outlook: Outlook,
-    inside: Float,
-    radius: float,
+    cameras: Float,
     given: Float,
     index: Index,
     goal: Goal,
@@ -86,8 +85,7 @@ def rank_views(
 
     Args:
         outlook: prediction of further views.
-        inside: the poses in the object frame, object radii, (V, 4, 4).
-        radius: of the object, metres.
+        cameras: the poses in the object frame, metres, (V, 4, 4).
         given: the poses to report, (V, 4, 4).
         index: the indices to report, (V,).
         goal: what the views shall determine.
@@ -102,20 +100,18 @@ def rank_views(
         raise UsageError(
             f"the goal is {' or '.join(get_args(Goal))}, not {one_line(repr(goal))}"
         )
-    if not len(inside):
+    if not len(cameras):
         return ()
 
-    cameras = inside.copy()
-    cameras[:, :3, 3] *= radius
     expected = outlook.expect(cameras, goal)
     worth = expected.worth(goal)
     information = expected.information(goal)
     most = expected.entropy(goal)
     names = [surface.name for surface in outlook.caster.surfaces]
 
-    towards = np.stack([direction_of(pose) for pose in inside])
+    towards = np.stack([direction_of(pose) for pose in cameras])
     way = angle_between(towards, outlook.towards)
-    values = worth - NEAR_TIE * worth.max() * way / np.pi
+    values = nearer_first(worth, way, float(worth.max()))
     ranked = []
     for row in np.argsort(-values, kind="stable"):
         told = float(information[row])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import one_line
+from nextview.checks import number, one_line
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, travel_from
@@ -57,6 +57,35 @@ class Reach:
             there &= self.reachable[views]
         return there
 
+    def moves(
+        self,
+        views: Index,
+        start: int,
+        here: Float,
+        poses: Poses,
+    ) -> tuple[Index, Float | None]:
+        """Return which views can be reached, and the cost of moving there.
+
+        Args:
+            views: indices of the views, (N,) int64.
+            start: view nearest to the camera.
+            here: pose of the camera, (4, 4).
+            poses: returns the poses of all views; called only if a function needs them.
+
+        Returns:
+            Indices of the M views that can be reached, (M,) int64; and the finite cost of each,
+            (M,), None without a cost.
+        """
+        views = views[self.can_reach(views, poses)]
+        if self.cost is None:
+            return views, None
+        if callable(self.cost):
+            costs = [cost_of(self.cost(here, pose)) for pose in poses()[views]]
+            cost = np.array(costs, np.float64)
+        else:
+            cost = self.cost[start, views]
+        return views[cost < np.inf], cost[cost < np.inf]
+
     def constrain(
         self,
         state: EpisodeState,
@@ -75,17 +104,10 @@ class Reach:
         Returns:
             The constrained state.
         """
-        views = np.flatnonzero(state.free[0])
-        views = views[self.can_reach(views, poses)]
-        if self.cost is not None:
-            if callable(self.cost):
-                costs = [cost_of(self.cost(here, pose)) for pose in poses()[views]]
-                cost = np.array(costs, np.float64)
-            else:
-                cost = self.cost[state.current[0], views]
-
-            views = views[cost < np.inf]
-            cost = cost[cost < np.inf]
+        views, cost = self.moves(
+            np.flatnonzero(state.free[0]), int(state.current[0]), here, poses
+        )
+        if cost is not None:
             mean = cost.mean() if len(cost) else 0.0
             unit = (
                 travel_from(sphere, state)[0, views].mean() / mean if mean > 0 else 0.0
@@ -96,7 +118,7 @@ class Reach:
 
         reachable = np.zeros(len(sphere), bool)
         reachable[views] = True
-        if reachable[state.free[0]].all() and self.cost is None:
+        if reachable[state.free[0]].all() and cost is None:
             return state
         return replace(state, reachable=reachable[None])
 
@@ -124,6 +146,15 @@ def truth_of(answer: Any) -> bool:
             f"whether a view can be reached is true or false, not {one_line(repr(answer))}"
         )
     return bool(answer)
+
+
+def as_distance(given: float | None) -> float | None:
+    """Return the distance of a camera passed in by a user, metres, above 0; or None.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
 def as_reachable(

@@ -62,6 +62,8 @@ class Recognition:
         unknown_rate: significance level of the test for unknown objects; 0 disables it.
         impossible: classes that never have the size of this object.
         poses_in: the coordinate frame of the poses.
+        ruled_out: names that the object cannot have, with reasons, see ``scene.rule.SceneRule``.
+        of_all_names: the result without these names ruled out; None if none is.
 
     Example:
 
@@ -81,6 +83,8 @@ class Recognition:
     unknown_rate: float = 0.0
     impossible: tuple[str, ...] = ()
     poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)
+    ruled_out: tuple[tuple[str, str], ...] = ()
+    of_all_names: Recognition | None = field(default=None, repr=False)
 
     @classmethod
     def of(
@@ -408,6 +412,7 @@ class Recognition:
             if self.why_stranded:
                 sure += f": {self.why_stranded}"
 
+        sure += "".join(f", no {name}: {why}" for name, why in self.ruled_out)
         names = [warning.name for warning in self.warnings]
         warnings = f", warnings: {', '.join(names)}" if names else ""
         return (

@@ -40,7 +40,7 @@ from nextview.recognition.protocol import (
     LooksAhead,
 )
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import REPEATED, repeated
+from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
 from nextview.sensing.plausibility import (
     check_last_view,
     check_observation,
@@ -48,16 +48,16 @@ from nextview.sensing.plausibility import (
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.judging import Judge
-from nextview.session.limits import Limits, in_words
+from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
     Reach,
     Reachable,
     TravelCost,
+    as_distance,
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.repeated import is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
@@ -182,7 +182,7 @@ class Session:
         self.models = models
         self.policy = policy
         self.sphere = sphere
-        self._distance = _checked_distance(distance)
+        self._distance = as_distance(distance)
         self.object = (
             _new_object(segmentation)
             if object is None and distance is not None
@@ -201,7 +201,7 @@ class Session:
         self._rng = rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
         self._limits = Limits()
-        self._surroundings: list[Surroundings] = []
+        self._surroundings: tuple[Surroundings, ...] = ()
         self._lock = RLock()
         self._episodes = self._begin(whole(start, "the first view", 0, len(sphere) - 1))
 
@@ -315,14 +315,14 @@ class Session:
         else:
             given = camera_poses(poses)
             left = np.arange(len(given))
-        inside = (
-            given
-            if self.object is None
-            else self.object.object_frame.pose_in_object(given)
-        )
-        radius = self.views[-1].observation.radius
-        assert radius is not None  # an outlook implies a radius
-        return rank_views(outlook, inside, radius, given, left, goal)
+        if self.object is not None:
+            cameras = self.object.object_frame.pose_in_metres(given)
+        else:
+            radius = self.views[-1].observation.radius
+            assert radius is not None  # an outlook implies a radius
+            cameras = given.copy()
+            cameras[:, :3, 3] *= radius
+        return rank_views(outlook, cameras, given, left, goal)
 
     @property
     def outlook(self) -> Outlook | None:
@@ -358,7 +358,7 @@ class Session:
     @distance.setter
     def distance(self, given: float | None) -> None:
         with self._lock:
-            checked = _checked_distance(given)
+            checked = as_distance(given)
             before = self._distance
             self._distance = checked
             if self.object is not None and self.object.sightings:
@@ -461,13 +461,10 @@ class Session:
 
     @limits.setter
     def limits(self, given: Limits) -> None:
-        if not isinstance(given, Limits):
-            raise UsageError(
-                f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}"
-            )
+        checked = checked_limits(given)
         with self._lock:
             before = self._limits
-            self._limits = given
+            self._limits = checked
             try:
                 self._set_reach(self._reach)
             except BaseException:
@@ -488,16 +485,14 @@ class Session:
         """Return ``Limits.reasons``; all "" without frames and before the first one."""
         if object is None or not object.sightings:
             return np.full(len(self.sphere), "", "<U1")
-        known = {id(shown.frame): shown for shown in self._surroundings}
-        self._surroundings = [
-            known.get(id(sighting.frame))
-            or Surroundings.of(sighting, object.object_frame)
-            for sighting in object.sightings
-        ]
+        self._surroundings = Surroundings.in_frames(
+            object.sightings, object.object_frame, self._surroundings
+        )
         return self._limits.reasons(
             self._poses_around(object),
-            object,
+            object.object_frame,
             self._surroundings,
+            object.support,
         )
 
     def failed(self, view: int | None = None) -> None:
@@ -678,7 +673,7 @@ class Session:
         if self.object is not None:
             raise SessionError("this session takes frames: it has an observed object")
         earlier = [view.observation for view in self.views]
-        if is_repeated(seen, earlier):
+        if repeated_observation(seen, earlier):
             warnings = [REPEATED]
         else:
             warnings = check_observation(seen) or check_last_view([*earlier, seen])
@@ -1023,11 +1018,6 @@ def _half_diagonal(points: Float) -> float:
     if not len(points):
         return 0.0
     return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
-
-
-def _checked_distance(given: float | None) -> float | None:
-    """Return a camera distance, metres, checked to be above 0; or None."""
-    return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
 def _new_object(segmentation: Segmenter | None) -> ObservedObject:

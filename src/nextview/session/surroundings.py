@@ -1,5 +1,6 @@
-"""Surroundings of the object in a frame: obstacles to keep clear of, and walls of the room."""
+"""Surroundings of objects in a frame: obstacles to keep clear of, and walls of the room."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.planes import Plane, sample
 from nextview.sensing.sighting import Sighting
+from nextview.sensing.tabletop import TableTop
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask
 
@@ -49,20 +51,39 @@ class Surroundings:
     walls: tuple[Plane, ...]
 
     @classmethod
-    def of(cls, sighting: Sighting, around: ObjectFrame) -> "Surroundings":
-        """Compute the surroundings of an object from a sighting.
+    def of(cls, seen: Sighting | TableTop, around: ObjectFrame) -> "Surroundings":
+        """Compute the surroundings of an object, or of all objects of a scene, in a frame.
 
         Args:
-            sighting: the frame, its noise and the support plane.
-            around: the object frame; the object's own surface is not a wall.
+            seen: the frame, its noise and the support plane.
+            around: frame of the object or of the scene, whose own surface is not a wall.
         """
-        frame = sighting.frame
+        frame = seen.frame
         rows, columns = _smooth_pixels(frame)
         points = frame.positions(rows, columns)
         depth = frame.depth[rows, columns].astype(np.float64)
-        tolerance = _tolerance(sighting.noise, depth)
-        walls = _walls(sighting, around)
-        return cls(frame, sighting.noise, sighting.plane, points, tolerance, walls)
+        tolerance = _tolerance(seen.noise, depth)
+        walls = _walls(seen, around)
+        return cls(frame, seen.noise, seen.plane, points, tolerance, walls)
+
+    @classmethod
+    def in_frames(
+        cls,
+        frames: Sequence[Sighting | TableTop],
+        around: ObjectFrame,
+        known: Sequence["Surroundings"] = (),
+    ) -> tuple["Surroundings", ...]:
+        """Return the surroundings in each of some frames.
+
+        Args:
+            frames: what is seen in each of them.
+            around: frame of the object or of the scene.
+            known: surroundings in earlier frames, which are not computed again.
+        """
+        before = {id(shown.frame): shown for shown in known}
+        return tuple(
+            before.get(id(seen.frame)) or cls.of(seen, around) for seen in frames
+        )
 
     def is_near(self, places: Float, around: ObjectFrame, clearance: float) -> Mask:
         """Return which positions are near a measured surface.
@@ -196,13 +217,13 @@ def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     return rows[smooth], columns[smooth]
 
 
-def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
-    """Return the walls of the room in a sighting that do not pass through the object."""
-    frame = sighting.frame
-    samples = sample(frame, frame.depth > 0, sighting.noise)
+def _walls(seen: Sighting | TableTop, around: ObjectFrame) -> tuple[Plane, ...]:
+    """Return the walls of the room in a frame that do not pass through the object."""
+    frame = seen.frame
+    samples = sample(frame, frame.depth > 0, seen.noise)
     away = np.linalg.norm(samples.points - around.centre, axis=1)
     others = samples.some(away > OWN_RADIUS * around.radius)
-    plane = sighting.plane
+    plane = seen.plane
     if plane is None:  # without a plane all points count as above it
         up = around.axes[2]
         plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)

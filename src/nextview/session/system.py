@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number, one_line, whole
+from nextview.checks import did_you_mean, number, one_line, whole
 from nextview.errors import (
     MeshError,
     ModelError,
@@ -37,7 +37,12 @@ from nextview.recognition.map_names import SPHERE_SUFFIX
 from nextview.recognition.model_card import DISCRIMINATE, Collection, find_models
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
-from nextview.recognition.protocol import KnowsAnyOrientation, Recogniser, tells_unknown
+from nextview.recognition.protocol import (
+    KnowsAnyOrientation,
+    Recogniser,
+    RulesOut,
+    tells_unknown,
+)
 from nextview.session.limits import Limits
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
@@ -74,6 +79,7 @@ class System:
         unknown: significance level of the test for unknown objects; 0 disables it.
         loaded: the arguments of ``load``.
         any_orientation: whether objects are taught things that need not be in a resting pose.
+        ruled_out: names of things that the object is not, see ``without``.
 
     Example:
 
@@ -89,6 +95,7 @@ class System:
     unknown: float
     loaded: dict[str, Any] = field(repr=False)
     any_orientation: bool = False
+    ruled_out: tuple[str, ...] = ()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -262,19 +269,48 @@ class System:
         models = replace(self.models, recogniser=recogniser.in_any_orientation)
         return replace(self, models=models, any_orientation=True)
 
+    def without(self, *names: str) -> "System":
+        """Return the same system for an object that is none of some taught things.
+
+        Names, poses, doubts and p-values are those of the likeliest of the other things. It serves
+        for what you know otherwise: for example, that the only mug stands elsewhere.
+
+        Args:
+            names: of things; ``classes`` still contains them, with a belief of 0.
+
+        Raises:
+            UsageError: no thing has such a name.
+            ModelError: things are ruled out by their geometry, and the models have none.
+        """
+        recogniser = self.models.recogniser
+        for name in names:
+            if name not in self.classes:
+                what = f"{one_line(str(name))} is none of the taught things"
+                raise UsageError(f"{what}{did_you_mean(str(name), self.classes)}")
+        if not isinstance(recogniser, RulesOut):
+            what = "only things of known geometry are ruled out, and it knows none"
+            raise ModelError(f"{recogniser.name}: {what}")
+        models = replace(self.models, recogniser=recogniser.without(names))
+        return replace(self, models=models, ruled_out=(*self.ruled_out, *names))
+
     def __repr__(self) -> str:
         name = self.models.recogniser.name
         views = len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
-        return partial(_reloaded, self.loaded, self.any_orientation), ()
+        arguments = self.loaded, self.any_orientation, self.ruled_out
+        return partial(_reloaded, *arguments), ()
 
 
-def _reloaded(loaded: dict[str, Any], any_orientation: bool) -> System:
+def _reloaded(
+    loaded: dict[str, Any], any_orientation: bool, ruled_out: Sequence[str]
+) -> System:
     """Return a system that was pickled as the arguments of ``load``."""
     system = load(**loaded)
-    return system.in_any_orientation() if any_orientation else system
+    if any_orientation:
+        system = system.in_any_orientation()
+    return system.without(*ruled_out) if ruled_out else system
 
 
 def simulated(

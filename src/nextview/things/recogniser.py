@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from copy import copy
 from functools import cached_property, partial
 from pathlib import Path
@@ -27,6 +27,8 @@ from nextview.types import Float, Floats, Index
 # derived attributes that refer back to the recogniser
 MADE = ("things", "in_any_orientation")
 NO_SCALE = "the scale of the views is not known in metres"
+NO_NAME = "every name is ruled out"
+SOME_BELIEF = 1e-12  # of a class that is not ruled out, so that some belief is left
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -48,6 +50,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         """
         super().__init__(model, threads)
         self.prior = RegistrationPrior()
+        self.ruled_out = np.zeros(len(self.classes), bool)
         # prepared now: errors appear when the memory is opened, and the first frame is not delayed
         self.things.verifier.prepare(threads)
 
@@ -66,7 +69,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         if found is None:
             raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
         found.verifier.prior = self.prior
-        return found
+        return found.among(~self.ruled_out[self._labels_of(found)])
 
     def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
         """The same recogniser for cameras with another pose accuracy.
@@ -91,12 +94,32 @@ class VerifiedRecogniser(TaughtRecogniser):
         tilted.things = self.things.in_any_orientation()
         return tilted
 
+    def without(self, names: Collection[str]) -> VerifiedRecogniser:
+        """The same recogniser for an object that is none of some classes.
+
+        Args:
+            names: of the classes.
+
+        Returns:
+            A copy that shares the memory.
+        """
+        other = copy(self)
+        vars(other).pop("in_any_orientation", None)
+        named = np.array([name in names for name in self.classes])
+        other.ruled_out = self.ruled_out | named
+        other.things = self.things.among(~other.ruled_out[self.labels])
+        return other
+
     @cached_property
     def labels(self) -> Index:
         """Class of each thing of known geometry, (T,) int64."""
-        of_hypotheses = np.array(self.calibration.hypotheses)[self.things.rows]
-        labels = np.zeros(len(self.things.names), np.int64)
-        labels[self.things.owners] = of_hypotheses
+        return self._labels_of(self.things)
+
+    def _labels_of(self, things: TaughtThings) -> Index:
+        """Class of each of some things, (T,) int64."""
+        of_hypotheses = np.array(self.calibration.hypotheses)[things.rows]
+        labels = np.zeros(len(things.names), np.int64)
+        labels[things.owners] = of_hypotheses
         return labels
 
     def together(
@@ -117,7 +140,10 @@ class VerifiedRecogniser(TaughtRecogniser):
             likely thing has known geometry, the belief by features alone and the reason.
         """
         classes = len(self.classes)
-        alone = self.calibration.belief(total, counted, classes)
+        if self.ruled_out.all():
+            belief = np.full(classes, 1 / classes)
+            return JointBelief(belief, p_value=0.0, why_no_pose=NO_NAME, doubt=NO_NAME)
+        alone = self._allowed(self.calibration.belief(total, counted, classes))
         if any(observation.radius is None for observation in observations):
             return self._unexplained(alone, NO_SCALE)
 
@@ -126,6 +152,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         if self.memory.has_features:
             joint = self.calibration.joint(total, counted, classes, np.zeros(()))
             of_hypotheses = joint.sum(1)
+            of_hypotheses[self.ruled_out[list(self.calibration.hypotheses)]] = 0
             of_things = self.things.of_things(of_hypotheses)
             of_hypotheses[self.things.rows] = 0
             np.add.at(others, list(self.calibration.hypotheses), of_hypotheses)
@@ -137,6 +164,11 @@ class VerifiedRecogniser(TaughtRecogniser):
         except ObservationError as error:
             return self._unexplained(alone, str(error))
         return self._believed(observations, found, others)
+
+    def _allowed(self, belief: Float) -> Float:
+        """A belief, (classes,), without the classes that are ruled out."""
+        left = np.where(self.ruled_out, 0, np.maximum(belief, SOME_BELIEF))
+        return left / left.sum() if self.ruled_out.any() else belief
 
     def _unexplained(self, belief: Float, why: str) -> JointBelief:
         """A belief by features and size; it is not confident if the memory has no features."""

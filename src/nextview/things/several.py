@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -113,6 +113,33 @@ class SeveralRecognisers:
             else:
                 tilted[name] = member
         return SeveralRecognisers(tilted)
+
+    def without(self, names: Collection[str]) -> SeveralRecognisers:
+        """The same recogniser for an object that is none of some taught things.
+
+        Args:
+            names: of the things, as in ``classes``.
+
+        Raises:
+            ModelError: one is a class of the network.
+        """
+        members: dict[str, NetworkRecogniser] = {}
+        first = 0
+        for name, member in self._collections.items():
+            last = first + len(member.classes)
+            shown = zip(self.classes[first:last], member.classes, strict=True)
+            own = [alone for as_told, alone in shown if as_told in names]
+            first = last
+            if own and not isinstance(member, VerifiedRecogniser):
+                raise ModelError(
+                    f"{own[0]} is a class of a network; only taught things are ruled out"
+                )
+            members[name] = (
+                member.without(own)
+                if isinstance(member, VerifiedRecogniser)
+                else member
+            )
+        return SeveralRecognisers(members)
 
     def for_cameras(self, place: float, aim: float) -> SeveralRecognisers:
         """The same recogniser for cameras with another pose accuracy.

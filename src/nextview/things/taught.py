@@ -24,7 +24,7 @@ from nextview.things.verifier import (
     rival_turns,
 )
 from nextview.things.weighing import EvidenceWeights
-from nextview.types import Float, Floats
+from nextview.types import Float, Floats, Mask
 
 # Smallest object radius relative to that of the thing: a view may contain little of it.
 SMALLEST_SHARE = 0.25
@@ -143,6 +143,20 @@ class TaughtThings:
         other = copy(self)
         other.verifier = copy(self.verifier)
         other.verifier.prior = prior
+        return other
+
+    def among(self, things: Mask) -> "TaughtThings":
+        """The same things, of which an object can only be some.
+
+        Args:
+            things: those that it may be, (T,) bool.
+
+        Returns:
+            A copy that shares the surfaces.
+        """
+        other = copy(self)
+        other.verifier = copy(self.verifier)
+        other.verifier.among = things
         return other
 
     def in_any_orientation(self) -> "TaughtThings":

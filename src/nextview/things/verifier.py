@@ -274,6 +274,7 @@ class Verifier:
         prior: prior of the cameras and the vertical.
         rivals: rotations of each thing about its centroid that hardly change its appearance, (N, 3,
             3) float64; () if unknown.
+        among: things that an object may be, (T,) bool; None for all.
     """
 
     def __init__(
@@ -296,6 +297,7 @@ class Verifier:
         self.pixels = pixels
         self.prior = prior
         self.rivals: tuple[Float, ...] = ()
+        self.among: Mask | None = None
 
     def __call__(
         self,
@@ -322,7 +324,7 @@ class Verifier:
         else:
             images, level = _levelled(observations)
 
-        found = self.templates.propose(images)
+        found = self.templates.propose(images, self.among)
         if not len(found.things):
             raise ObservationError(
                 "no view shows enough of the thing to compare it with the scans"

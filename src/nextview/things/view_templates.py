@@ -143,13 +143,16 @@ class ViewTemplates:
             np.concatenate([one.pictures.depth for one in each]),
         )
 
-    def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
+    def propose(
+        self, images: Sequence[MetricImage], among: Mask | None = None
+    ) -> OrientedProposals:
         """Propose orientations of the likeliest things, given some views.
 
         Each view proposes orientations of the things that match all views.
 
         Args:
             images: views of one thing.
+            among: things that it may be, (T,) bool; None for all.
 
         Returns:
             Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none if too little is
@@ -171,8 +174,11 @@ class ViewTemplates:
         together = of_things.sum(0)
         hidden = all(view.hidden for view in views)
         most = HIDDEN_PROPOSED if hidden else THINGS_PROPOSED
+        if among is not None:
+            together = np.where(among, together, np.inf)
         likely = np.zeros(known, bool)
         likely[np.argsort(together, kind="stable")[:most]] = True
+        likely &= np.isfinite(together)
 
         of_one = max(1, MOST_ORIENTATIONS // len(views))
         proposed = []
