@@ -252,7 +252,8 @@ class PlacedSurface:
             each, (N,).
         """
         depth, normals, turns = self._cast(motions)
-        hits = np.nonzero(np.isfinite(depth))
+        rows, pixels = np.nonzero(np.isfinite(depth))
+        hits = rows, pixels
         directions = (self._directions @ turns)[hits]
         inwards = np.einsum("ni,ni->n", normals[hits], directions)
         cosine = np.clip(np.abs(inwards), LOWEST_COSINE, 1)
