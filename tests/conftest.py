@@ -10,9 +10,11 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import kept_results
 import numpy as np
 import pipeline
 import pytest
+import small_tables
 import trimesh
 from bop_datasets import write_dataset
 from filelock import FileLock
@@ -21,9 +23,11 @@ from hypothesis import settings
 from small_tables import meshes_of
 
 import nextview
+from nextview.benchmark import table_runs
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
+from nextview.teaching import learn as learn_module
 from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
 from nextview.things import view_templates
@@ -99,6 +103,34 @@ def kept_templates():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(view_templates, "_IN_USE", {})
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_things(shared):
+    """Teach each thing, test each memory, and find the resting poses of each thing on a table
+    once in a run, in whichever tests that happens.
+    """
+    folder = shared("kept", lambda folder: None)
+    with pytest.MonkeyPatch.context() as patched:
+        for module, name, given in (
+            (learn_module, "teach", kept_results.of_teach),
+            (learn_module, "features_of", kept_results.of_features),
+            (learn_module, "show", kept_results.of_show),
+            (small_tables, "resting_poses", kept_results.of_mesh),
+            (table_runs, "resting_poses", kept_results.of_mesh),
+        ):
+            function = getattr(module, name)
+            kept = kept_results.Kept(function, folder, given)
+            patched.setattr(module, name, kept)
+        yield
+
+
+@pytest.fixture
+def taught_afresh(monkeypatch):
+    """Teach and test things as if for the first time, where a test asks for the same twice."""
+    for name in ("teach", "features_of", "show"):
+        kept = getattr(learn_module, name)
+        monkeypatch.setattr(learn_module, name, kept.function)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from small_tables import resting_of
 
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera
@@ -34,7 +35,7 @@ def drawn(
         base: middle of the surface that they stand on, metres.
         first: number of the first thing.
     """
-    table = SimulatedTable.draw(meshes, np.random.default_rng(seed), gap)
+    table = SimulatedTable.draw(meshes, np.random.default_rng(seed), gap, resting_of)
     return [
         ((thing.placed + np.array(base), thing.faces), first + number)
         for number, thing in enumerate(table.things)

@@ -152,6 +152,7 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
     tmp_path,
     knobs,
     knobs_memory,
+    taught_afresh,
 ):
     again = []
 

@@ -469,9 +469,8 @@ def drawn_overlaps(figure, views) -> list[float]:
     return overlaps
 
 
-@pytest.mark.parametrize("name", ["block", "mug"])
-def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes, name):
-    camera = nextview.SimulatedCamera(meshes[name])
+def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes):
+    camera = nextview.SimulatedCamera(meshes["mug"])
     session = session_of(system, 4, start=12)
     errors = {
         12: (0.006, 0, 0),
@@ -487,7 +486,7 @@ def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes
         session.update(replace(observation, depth=depth, pose=pose, exact=False))
 
     result = session.result
-    assert result.answer == name
+    assert result.answer == "mug"
     # The view that shows nothing has none; an error common to all of them is the pose's.
     found = result.pose_candidates[0].displacements
     true = np.array([error for error in errors.values() if error])

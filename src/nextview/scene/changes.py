@@ -291,6 +291,26 @@ def changes(
 
 
 @dataclass(frozen=True, eq=False)
+class _Part:
+    """The part of an object that was seen last, compared with a frame.
+
+    Attributes:
+        stands: log-likelihood that it stands.
+        seen: the part, with its likeliest motion; None if the frame shows another part of the
+            object.
+    """
+
+    stands: float
+    seen: _Object | None = None
+
+    def change(self, camera: CameraError, moved: _Moved) -> Change:
+        """Return its change, given the error of the frame's pose, and which others moved."""
+        if self.seen is None:
+            return Change(self.stands)
+        return Change(self.stands, self.seen.elsewhere(camera, moved), self.seen.there)
+
+
+@dataclass(frozen=True, eq=False)
 class _Compared:
     """A new frame, and the known objects as it may show them.
 
@@ -304,6 +324,8 @@ class _Compared:
         named: these objects beside each other, with their likeliest motions, by row.
         camera: error of the frame's pose.
         by_others: the same without the object itself, for each object.
+        stands: log-likelihood that each of ``named`` stands, once it was asked for, by row.
+        parts: what was seen last of each object, once it was asked for, by row.
     """
 
     tracks: Sequence[Track]
@@ -315,6 +337,8 @@ class _Compared:
     named: dict[int, _Object]
     camera: CameraError
     by_others: list[CameraError]
+    stands: dict[int, float] = field(default_factory=dict)
+    parts: dict[int, _Part | None] = field(default_factory=dict)
 
     @classmethod
     def with_frame(
@@ -341,24 +365,33 @@ class _Compared:
         )
 
     def change(self, row: int, moved: _Moved) -> Change:
-        """Return the change of one object, given which others moved."""
+        """Return the change of one object, given which others moved.
+
+        What does not depend on the others is found once.
+        """
         track = self.tracks[row]
+        camera = self.by_others[row]
         one = self.named.get(row)
         by_name = Change()
         if one is not None:
-            by_name = _of_name(one, self.by_others[row], moved, track, self.tops)
+            if row not in self.stands:
+                self.stands[row] = one.standing(camera)
+            by_name = _of_name(one, self.stands[row], camera, moved, track, self.tops)
             if not by_name.contradicts:
                 return by_name
 
-        by_part = self._of_last_seen(row, moved)
-        if by_part is None:
+        if row not in self.parts:
+            self.parts[row] = self._last_seen(row)
+        part = self.parts[row]
+        if part is None:
             return Change()
+        by_part = part.change(camera, moved)
         if one is None:
             return by_part
         return _whatever_it_is(by_name, by_part, track.confident)
 
-    def _of_last_seen(self, row: int, moved: _Moved) -> Change | None:
-        """Return the change of the part of an object that was seen last.
+    def _last_seen(self, row: int) -> _Part | None:
+        """Compare the frame with the part of an object that was seen last.
 
         None if the frame cannot show this part.
         """
@@ -373,12 +406,12 @@ class _Compared:
             weighed = seen.surface.weighed_like(one.surface)
             seen = replace(seen, surface=weighed)
 
-        change = Change(seen.standing(camera))
+        stands = seen.standing(camera)
         if seen.known:  # from elsewhere the frame shows another part
-            return change
+            return _Part(stands)
         way = None if one is None else one.way(camera)[0][3:]
         beside = seen.beside(_others(self.places, row), self.top)
-        return _of_part(change, beside, camera, moved, way)
+        return _moved_part(stands, beside, camera, way)
 
 
 def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
@@ -480,15 +513,25 @@ def _still(objects: Sequence[_Object], expected: CameraError) -> CameraError:
 
 def _of_name(
     one: _Object,
+    standing: float,
     camera: CameraError,
     moved: _Moved,
     track: Track,
     tops: Sequence[TableTop],
 ) -> Change:
-    """Compare a frame with a named object, given the error of its pose by the others."""
+    """Compare a frame with a named object, given the error of its pose by the others.
+
+    Args:
+        one: the object.
+        standing: see ``_Object.standing``.
+        camera: error of the frame's pose, by the other objects.
+        moved: the other objects that moved.
+        track: of the object.
+        tops: support surfaces of the earlier frames.
+    """
     mean, covariance = one.expected(camera)
     # the likeliest of all motions is often small enough for an object that stands
-    stands = max(one.standing(camera), one.fit.evidence(mean, covariance))
+    stands = max(standing, one.fit.evidence(mean, covariance))
     elsewhere = one.elsewhere(camera, moved)
     change = Change(stands, elsewhere, one.there)
     if not change.found:
@@ -523,29 +566,26 @@ def _last_seen(
     return _object_at(posed, own, known, top, segments)
 
 
-def _of_part(
-    change: Change,
+def _moved_part(
+    stands: float,
     seen: _Object,
     camera: CameraError,
-    moved: _Moved,
     way: Float | None,
-) -> Change:
+) -> _Part:
     """Consider that the part of an object that was seen last, and is seen again, has moved.
 
     Args:
-        change: of this part, as if nothing stood before it. The poses of the others err, so that
-            they may hide less of it than is hidden.
+        stands: log-likelihood that it stands, as if nothing stood before it. The poses of the
+            others err, so that they may hide less of it than is hidden.
         seen: this part beside the others, which explain what this object need not.
         camera: error of the frame's pose, by the other objects.
-        moved: the other objects that moved.
         way: shift of the object by its name, (3,), metres; None without one.
     """
     mean, _ = seen.expected(camera)
     ways = [np.zeros(3), seen.shift, *([] if way is None else [way])]
     starts = [mean + np.append(np.zeros(3), each) for each in ways]
     seen = seen.looked_for(camera, starts)
-    stands = max(change.stands, seen.standing(camera))
-    return Change(stands, seen.elsewhere(camera, moved), seen.there)
+    return _Part(max(stands, seen.standing(camera)), seen)
 
 
 def _whatever_it_is(change: Change, unnamed: Change, confident: bool) -> Change:

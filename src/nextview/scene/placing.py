@@ -18,7 +18,7 @@ from nextview.things.expected_images import LOWEST_COSINE
 from nextview.things.registration import RegistrationPrior, scan_errors
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
-from nextview.types import Float
+from nextview.types import Float, Float32, Index
 
 DEPTH_RANGE = 1.0  # metres over which depth is spread that nothing known explains
 COMPARED_SIDE = 36  # rows and columns of pixels in which an object is compared
@@ -163,14 +163,19 @@ class PlacedSurface:
 
     def pose(self, motion: Float) -> Float:
         """Pose of the surface after a motion, (6,), in the world, (4, 4)."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
-        matrix[:3, 3] = self.centre - matrix[:3, :3] @ self.centre + motion[3:]
-        return np.asarray(matrix @ self.posed.pose)
+        return np.asarray(self._poses(motion[None])[0])
+
+    def _poses(self, motions: Float) -> Float:
+        """Return the pose of the surface after each motion, (M, 4, 4)."""
+        matrices = np.tile(np.eye(4), (len(motions), 1, 1))
+        turns = Rotation.from_rotvec(motions[:, :3]).as_matrix()
+        matrices[:, :3, :3] = turns
+        matrices[:, :3, 3] = self.centre - turns @ self.centre + motions[:, 3:]
+        return np.asarray(matrices @ self.posed.pose)
 
     def shown(self) -> Float:
         """Depth of the surface in its pose, (P,), metres, infinity beside it."""
-        return self._rendered(np.zeros((1, 6)))[0][0]
+        return np.asarray(self._cast(np.zeros((1, 6)))[0][0], np.float64)
 
     def gain(self, motion: Float) -> float:
         """Log-likelihood of the pixels after a motion, (6,), against that without the object."""
@@ -188,8 +193,8 @@ class PlacedSurface:
             their squared gradients (Berndt, Hall, Hall and Hausman, 1974).
         """
         steps = step * self.lengths
-        up = self._gains(motion + np.diag(steps))
-        down = self._gains(motion - np.diag(steps))
+        each = np.diag(steps)
+        up, down = np.split(self._gains(motion + np.concatenate([each, -each])), 2)
         slopes = ((up - down) / (2 * steps)[:, None]).T
         # the weighted sum of squares of gradients that were weighted already
         return slopes.sum(0), np.asarray(slopes.T @ slopes / self.weight)
@@ -201,27 +206,35 @@ class PlacedSurface:
 
     def _gains(self, motions: Float) -> Float:
         """Return the gain of each pixel after each motion, (M, P)."""
-        depth, slope = self._rendered(motions)
-        shows = np.isfinite(depth)
-        depth = np.where(shows, depth, 0)
-        sideways = depth / self.frame.intrinsics[0, 0] * slope
-        off = np.abs(self.depth - depth)
+        depths, slopes, hits = self._rendered(motions)
+        _, pixels = hits
+        depth = self.depth[pixels]
+        sideways = depths / self.frame.intrinsics[0, 0] * slopes
+        off = np.abs(depth - depths)
         for one in self.others:
-            nearer = np.minimum(off, np.abs(self.depth - one))
-            off = np.where(one < depth, nearer, off)
+            other = one[pixels]
+            nearer = np.minimum(off, np.abs(depth - other))
+            off = np.where(other < depths, nearer, off)
         # something unknown may hide the surface, but the camera rarely sees through it
-        otherwise = np.where(self.depth < depth, 0.5, SEEN_THROUGH)
-        found = log_density(off, np.hypot(self.sigma, sideways), otherwise)
-        return self.weight * np.where(shows, found - self.without, 0.0)
+        otherwise = np.where(depth < depths, 0.5, SEEN_THROUGH)
+        found = log_density(off, np.hypot(self.sigma[pixels], sideways), otherwise)
+        gains = np.zeros((len(motions), len(self.depth)))
+        gains[hits] = self.weight * (found - self.without[pixels])
+        return gains
 
     @cached_property
     def _caster(self) -> SurfaceCaster:
         return caster_of(self.posed)
 
-    def _rendered(self, motions: Float) -> tuple[Float, Float]:
-        """Return depth, (M, P), infinity beside the surface, and the tangent of its slope."""
+    @cached_property
+    def _directions(self) -> Float:
+        """Unit vectors along the rays, (P, 3)."""
+        return self.rays / np.linalg.norm(self.rays, axis=1, keepdims=True)
+
+    def _cast(self, motions: Float) -> tuple[Float32, Float32, Float32]:
+        """Return depth, (M, P), normals, (M, P, 3), and turns from the camera's axes, (M, 3, 3)."""
         to_camera = np.linalg.inv(self.frame.camera_to_world)
-        poses = to_camera @ np.stack([self.pose(motion) for motion in motions])
+        poses = to_camera @ self._poses(motions)
         turns = poses[:, :3, :3].astype(np.float32)
         origins = -np.einsum("mji,mj->mi", poses[:, :3, :3], poses[:, :3, 3])
         depth, normals = self._caster.cast(
@@ -229,11 +242,23 @@ class PlacedSurface:
             origins.astype(np.float32),
             self.rays.astype(np.float32) @ turns,
         )
-        directions = self.rays / np.linalg.norm(self.rays, axis=1, keepdims=True)
-        inwards = np.einsum("mpi,mij,pj->mp", normals, turns.swapaxes(1, 2), directions)
+        return depth, normals, turns
+
+    def _rendered(self, motions: Float) -> tuple[Float, Float, tuple[Index, Index]]:
+        """Return what the rays that meet the surface see after each motion.
+
+        Returns:
+            Depth, (N,), metres; the tangent of the slope, (N,); and the motion and the pixel of
+            each, (N,).
+        """
+        depth, normals, turns = self._cast(motions)
+        rows, pixels = np.nonzero(np.isfinite(depth))
+        hits = rows, pixels
+        directions = (self._directions @ turns)[hits]
+        inwards = np.einsum("ni,ni->n", normals[hits], directions)
         cosine = np.clip(np.abs(inwards), LOWEST_COSINE, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
-        return np.asarray(depth, np.float64), np.asarray(slope, np.float64)
+        return depth[hits].astype(np.float64), np.asarray(slope, np.float64), hits
 
 
 def likeliest(

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
@@ -241,9 +240,10 @@ def compare(
     owner = np.repeat(np.arange(count), [len(view.points) for view in views])
     world = np.concatenate(
         [
-            view.points @ pose[:3, :3].T + pose[:3, 3]
+            pose[:3, :3] @ view.points.T + pose[:3, 3:]
             for view, pose in zip(views, poses, strict=True)
-        ]
+        ],
+        axis=1,
     )
     tolerances = {
         sharpness: np.concatenate([view.tolerance(sharpness) for view in views])
@@ -254,54 +254,55 @@ def compare(
     contradicted = np.zeros((count, count))
     there = poses if looked_up_with is None else looked_up_with
     for j, (view, pose) in enumerate(zip(views, there, strict=True)):
-        seen_from = (world - pose[:3, 3]) @ pose[:3, :3]
+        seen_from = pose[:3, :3].T @ (world - pose[:3, 3:])
+        ahead = np.flatnonzero((seen_from[2] > LEAST_DEPTH) & (owner != j))
+        x, y, z = seen_from.take(ahead, axis=1)
+        rays = np.stack([x / z, y / z])
         for sharpness, tolerance in tolerances.items():
             which, agrees, looks_through = _looked_up(
                 view.pictures[sharpness],
-                seen_from,
-                tolerance,
+                rays,
+                z,
+                tolerance[ahead],
             )
-            other = owner[which] != j
-            confirmed[:, j] += np.bincount(
-                owner[which], agrees & other, minlength=count
-            )
-            contradicted[:, j] += np.bincount(
-                owner[which],
-                looks_through & other,
-                minlength=count,
-            )
+            found = owner[ahead[which]]
+            confirmed[:, j] += np.bincount(found[agrees], minlength=count)
+            contradicted[:, j] += np.bincount(found[looks_through], minlength=count)
     return Agreement(confirmed, contradicted)
 
 
 def _looked_up(
     picture: Picture,
-    points: Float,
+    rays: Float,
+    z: Float,
     tolerance: Float,
 ) -> tuple[Index, Mask, Mask]:
-    """Return which points, (P, 3), are inside an image, and confirmed or contradicted by it."""
+    """Return which points are inside an image, and confirmed or contradicted by it.
+
+    Args:
+        picture: the image.
+        rays: x and y of the rays (x, y, 1) to P points, (2, P).
+        z: depth of the points, (P,), metres.
+        tolerance: of each depth, (P,), metres.
+    """
     height, width = picture.nearest.shape
-    ahead = points[:, 2] > LEAST_DEPTH
-    z = np.where(ahead, points[:, 2], 1.0)
-    camera = PinholeCamera.of(picture.intrinsics, (height, width))
-    at = camera.project(np.column_stack([points[:, :2], z]))
-    column, row = np.floor(np.clip(at, -1, (width, height))).astype(np.int64).T
+    (fx, _, cx), (_, fy, cy) = picture.intrinsics[:2]
+    column = rays[0] * fx + cx
+    row = rays[1] * fy + cy
 
     # A small pose error moves points near the border out of the image.
-    inside = (
-        ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
-    )
+    inside = (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
     which = np.flatnonzero(inside)
-    row = row[which]
-    column = column[which]
+    at = row[which].astype(np.int64) * width + column[which].astype(np.int64)
     z = z[which]
     limit = tolerance[which]
 
-    nearest = picture.nearest[row, column]
-    farthest = picture.farthest[row, column]
+    nearest = picture.nearest.take(at)
+    farthest = picture.farthest.take(at)
     agrees = (z > nearest - limit) & (z < farthest + limit)
-    looks_through = (z <= nearest - limit) & picture.complete[row, column]
+    looks_through = (z <= nearest - limit) & picture.complete.take(at)
     if picture.object_near is not None:
-        on_object = picture.object_near[row, column]
+        on_object = picture.object_near.take(at)
         hidden = nearest < z - limit
         # Unless it is occluded, a point of the object must be inside the mask, even without depth.
         looks_through = np.where(on_object, looks_through, ~hidden)
