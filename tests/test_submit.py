@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
+from PIL import Image
 from pipeline import refused
 from scipy.spatial.transform import Rotation
 
@@ -168,9 +169,19 @@ def test_a_method_that_says_nothing_is_not_waited_for(archive, tmp_path):
 
 def test_a_changed_image_is_found(own, tmp_path, capsys):
     path = own / "episodes/0000/000.png"
-    path.write_bytes(path.read_bytes() + b" ")
+    with Image.open(path) as image:
+        pixels = np.array(image)
+    pixels[0, 0] += 1
+    Image.fromarray(pixels).save(path)
     said = refused(capsys, "submit", own, tmp_path / "out.json", "--policy", "fixed")
     assert "000.png: is missing, or not the file that the manifest names" in said
+
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(DatasetError, match="not the file that the manifest names"):
+        FrozenArchive(own).view("0000", 0)
+    path.unlink()
+    with pytest.raises(DatasetError, match="is missing"):
+        FrozenArchive(own).view("0000", 0)
 
 
 @pytest.mark.parametrize(
