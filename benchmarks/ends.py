@@ -15,7 +15,7 @@ Printed is how many scenes were done before the largest number of views, and of 
 the thing is named right, is unknown, has a wrong name, or belongs to no object; how many are done
 without any object; the frames that it took, and those that were refused, all of them false alarms:
 another one is taken from a random place. OUT.jsonl gets a line for each scene; those that it
-holds are not run again. MuJoCo draws with ``MUJOCO_GL=egl`` unless another is named.
+holds are not run again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from benchmarks.shared import names_to_stage, results
 from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
-    IMAGE,
     Bools,
     Float,
     as_told,
@@ -72,8 +71,6 @@ def look_until_done(
     Returns:
         Pixels of the thing in each frame that was used, and why others were refused.
     """
-    import mujoco
-
     model, data = world
     masks: list[Bools] = []
     refused: list[str] = []
@@ -82,24 +79,23 @@ def look_until_done(
         return camera_at(aim, rng.uniform(0, 360), rng.uniform(35, 65), distance)
 
     pose = anywhere()
-    with mujoco.Renderer(model, *IMAGE) as renderer:
-        while len(refused) < MOST_FRAMES:
-            depth, mask = looked(renderer, model, data, pose, rng)
-            frame = Frame(depth, CAMERA_MATRIX, as_told(pose, arm_error, rng))
-            try:
-                look = scene.update(frame)
-            except ObservationError as error:
-                refused.append(str(error))
-                pose = anywhere()
-                continue
-            if look.taken:
-                masks.append(mask)
-            else:
-                refused.append(str(look.warnings[0]))
-            target = scene.target
-            if scene.done or target is None:
-                break
-            pose = target if look.taken else anywhere()
+    while len(refused) < MOST_FRAMES:
+        depth, mask = looked(model, data, pose, rng)
+        frame = Frame(depth, CAMERA_MATRIX, as_told(pose, arm_error, rng))
+        try:
+            look = scene.update(frame)
+        except ObservationError as error:
+            refused.append(str(error))
+            pose = anywhere()
+            continue
+        if look.taken:
+            masks.append(mask)
+        else:
+            refused.append(str(look.warnings[0]))
+        target = scene.target
+        if scene.done or target is None:
+            break
+        pose = target if look.taken else anywhere()
     return masks, refused
 
 

@@ -8,10 +8,10 @@ physics of ``benchmarks/staged_things.py``, and a stereo camera takes all candid
 a grid of azimuths and elevations over where a camera can stand. Nothing of nextview's own
 simulation is used. docs/submit.md describes the files and how methods are compared on them.
 
-On one machine the same scans, seed and versions of the libraries give the same bytes. A run that
-was stopped goes on when the same command is given again: the manifest is written last, and a folder
-without it is no archive. SCANS holds NAME.ply, metres. It runs from the folder of the repository
-and needs ``mujoco`` (``research[arm]``).
+The same scans, seed and versions of the libraries give the same archive, with the same SHA-256, on
+every x86-64 processor with AVX2. A run that was stopped goes on when the same command is given
+again: the manifest is written last, and a folder without it is no archive. SCANS holds NAME.ply,
+metres. It runs from the folder of the repository and needs ``mujoco`` (``research[arm]``).
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from benchmarks.shared import names_to_stage
 from benchmarks.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
-    IMAGE,
     WHERE_CAMERAS_STAND,
     Float,
     Place,
@@ -74,7 +73,7 @@ FROZEN_PLACES: tuple[Place, ...] = (
 )
 STEPS_PER_METRE = 10_000  # of the depth images: 0.1 mm
 COMPRESSION = 6  # of PNG
-LIBRARIES = ("mujoco", "numpy", "scipy", "trimesh", "pillow")
+LIBRARIES = ("mujoco", "numpy", "scipy", "trimesh")  # that decide what is shown
 TERMS_FILE = ".terms.json"  # which does not belong to the archive
 PARTIAL = ".partial"  # ends the folder of an episode that is not whole
 LICENCE = "CC BY 4.0"
@@ -89,7 +88,7 @@ CARD = """\
   (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
   holds names, poses of the things and true poses of the cameras: only `nextview leaderboard` reads
   it. A method is not shown it; who wants to be sure moves it away.
-- **How**: things fall by the physics of MuJoCo and are seen by its renderer. Noise is that of a
+- **How**: things fall by the physics of MuJoCo and are seen along its rays. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and
   where the second camera sees nothing; nothing beyond {farthest:g} m. Told poses are wrong by
@@ -97,11 +96,12 @@ CARD = """\
 - **First view**: drawn among those that show {enough} pixels of the thing or more. Other views may
   show little or nothing of it.
 - **Made by** `python -m benchmarks.frozen` of nextview with {made_with}.
-  The same scans, seed and versions give the same bytes.
+  The same scans, seed and versions give the same archive on every x86-64 processor with AVX2.
 - **Licences**: `scans/` are of the {source},
   {licence}, as they were given to the script. Images and poses are derived from them, under the
   same licence.
-- **Checksum**: the SHA-256 of `manifest.json`, which names every file with its own.
+- **Checksum**: the SHA-256 of `manifest.json`, which names every file with its own, and every image
+  with that of its pixels.
 """
 
 
@@ -147,8 +147,6 @@ def make_episode(
     folder: Path, truth: Path, scans: Path, name: str, place: Place, how: FrozenTerms
 ) -> bool:
     """Write an episode and its truth; whether the thing can be shown there."""
-    import mujoco
-
     numbers = [how.seed, FROZEN_PLACES.index(place), *name.encode()]
     rng = np.random.default_rng(numbers)
     found = staged(place, str(scans), name, rng)
@@ -168,16 +166,15 @@ def make_episode(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     pixels = []
-    with mujoco.Renderer(model, *IMAGE) as renderer:
-        for number, pose in enumerate(poses):
-            depth, mask = looked(renderer, model, data, pose, rng, STEPS_PER_METRE)
-            depth[depth > how.farthest * STEPS_PER_METRE] = 0
-            pixels.append(int((mask & (depth > 0)).sum()))
-            place_of = partial / f"{number:03d}"
-            for end, image in (("", depth), ("-mask", mask)):
-                Image.fromarray(image).save(
-                    f"{place_of}{end}.png", compress_level=COMPRESSION
-                )
+    for number, pose in enumerate(poses):
+        depth, mask = looked(model, data, pose, rng, STEPS_PER_METRE)
+        depth[depth > how.farthest * STEPS_PER_METRE] = 0
+        pixels.append(int((mask & (depth > 0)).sum()))
+        place_of = partial / f"{number:03d}"
+        for end, image in (("", depth), ("-mask", mask)):
+            Image.fromarray(image).save(
+                f"{place_of}{end}.png", compress_level=COMPRESSION
+            )
 
     enough = np.flatnonzero(np.array(pixels) >= ENOUGH_PIXELS)
     if not len(enough):

@@ -3,10 +3,10 @@
     python -m benchmarks.places SCANS OUT.jsonl [--places shelf stack] [--things 20] [--seed 1]
 
 A judge that shares no code with nextview's own simulation (``benchmarks/staged_things.py``): things
-fall by the physics of MuJoCo, and depth is that of MuJoCo's renderer, as a stereo camera measures
-it. It runs from the folder of the repository and needs ``mujoco`` (``research[arm]``). SCANS holds
-the scans of the things that the memory knows, in metres, by their names. One episode is one thing
-in one place, and three views around it; a mask tells which pixels are its own.
+fall by the physics of MuJoCo, and a stereo camera measures the depth along MuJoCo's rays. It runs
+from the folder of the repository and needs ``mujoco`` (``research[arm]``). SCANS holds the scans of
+the things that the memory knows, in metres, by their names. One episode is one thing in one place,
+and three views around it; a mask tells which pixels are its own.
 
 The places: ``alone`` on a table of uneven planks, as it falls; ``stood`` there in any orientation
 in which it stays, however unlikely; ``shelf``, in a compartment; ``stack``, on another thing with a
@@ -26,8 +26,8 @@ confident and wrong, and unknown, with 95 % Wilson intervals; the median distanc
 surface from the posed one in the world, with the error of the arm, as median and 90 % quantile of
 the things that are named right; and the CPU time of a view. A view that shows fewer than 350 pixels
 of the thing is taken from elsewhere, up to 6 times, and then not judged. Confident is what the
-default rule of ``nextview.load`` would stop at. MuJoCo draws with ``MUJOCO_GL=egl`` unless another
-is named. The things come in a random order, so what is there of a run that was ended is a sample.
+default rule of ``nextview.load`` would stop at. The things come in a random order, so what is
+there of a run that was ended is a sample.
 """
 
 from __future__ import annotations

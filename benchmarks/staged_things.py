@@ -1,8 +1,13 @@
 """Things that lie where things lie, and a stereo camera: a world that imports nothing of nextview.
 
-Things fall by the physics of MuJoCo and are seen by its renderer. ``STAGES`` holds a function for
+Things fall by the physics of MuJoCo and are seen along its rays. ``STAGES`` holds a function for
 each place, which returns a scene in which a thing may come to rest there; ``at_rest`` lets it fall,
 and ``shots_of`` takes three views around it. ``benchmarks.places`` judges nextview with them.
+
+The same seed shows the same on every x86-64 processor. Matrix products, decompositions and
+exponentials differ in their last bits between processors, by the kernels that BLAS and NumPy choose
+there, and physics makes millimetres of them: what MuJoCo is given, and what it returns, is
+``rounded``, and ties are broken by rounded values. OpenGL is not used: its drivers differ by more.
 
 Convex things collide as their hulls, others as the hulls of up to 20 pieces of their surface, so
 that a thing on a spoon or in a bowl touches what is seen. All lengths are in metres. The floor is
@@ -11,7 +16,6 @@ level, a table of uneven planks has its top near a height of 0, and things are n
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,11 +23,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
-
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
@@ -38,6 +40,9 @@ IMAGE = 480, 640  # rows, columns
 STEREO_BASE = 0.055  # metres between the two cameras
 CAMERA_MATRIX = np.array([[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]])
 PER_METRE = 1000.0  # steps of a depth image, unless others are asked for
+FARTHEST = 10.0  # metres that a ray goes
+DECIMALS = 7  # of what is rounded, metres and parts of directions
+COLLIDES = 3  # group of the geoms that are not seen
 VIEW_COUNT = 3
 STAGINGS_TRIED = 12  # of a thing in a place
 ENOUGH_PIXELS = 350  # of a thing, below which a view is not judged
@@ -71,6 +76,18 @@ WHERE_CAMERAS_STAND: dict[Place, tuple[float, float, float, float]] = {
     "leaning": (-65, 65, 10, 55),
     "held": (-180, 180, -10, 50),
 }
+
+
+def rounded(values: ArrayLike) -> Float:
+    """Values without their last bits, in which processors differ, and without -0."""
+    return np.round(np.asarray(values, float), DECIMALS) + 0.0
+
+
+def quaternion(turn: Float) -> Float:
+    """A rotation, (3, 3), as MuJoCo is given it: w, x, y, z."""
+    return rounded(
+        Rotation.from_matrix(turn).as_quat(canonical=True, scalar_first=True)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +132,7 @@ def pieces_of(folder: str, name: str, most: int = 20) -> tuple[Float, ...]:
     open_parts = [(hull, np.arange(len(scan.faces)))]
     whole: list[tuple[trimesh.Trimesh, NDArray[np.int64]]] = []
     while open_parts and len(open_parts) + len(whole) < most:
-        open_parts.sort(key=lambda part: part[0].volume)
+        open_parts.sort(key=lambda part: round(part[0].volume, 15))
         hull, faces = open_parts.pop()
         axis = int(np.ptp(middles[faces], axis=0).argmax())
         low = middles[faces, axis] < np.median(middles[faces, axis])
@@ -143,8 +160,8 @@ def add_scan(
     if pose is None:
         body.add_freejoint()
     else:
-        body.pos = pose[0]
-        body.quat = Rotation.from_matrix(pose[1]).as_quat(scalar_first=True)
+        body.pos = rounded(pose[0])
+        body.quat = quaternion(pose[1])
 
     shell = spec.add_mesh(name=f"{body_name} seen")
     shell.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -158,7 +175,7 @@ def add_scan(
         piece = spec.add_mesh(name=f"{body_name} {number}")
         piece.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         piece.uservert = (scale * corners).ravel()
-        solid = body.add_geom(meshname=piece.name, density=400, group=3)
+        solid = body.add_geom(meshname=piece.name, density=400, group=COLLIDES)
         solid.type = mujoco.mjtGeom.mjGEOM_MESH
 
 
@@ -168,12 +185,12 @@ def add_box(
     """Add a box to a body by two opposite corners, (3,), metres, and its rotation, (3, 3)."""
     import mujoco
 
-    corners = np.array([low, high], float)
+    corners = rounded([low, high])
     box = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX)
     box.pos = corners.mean(0)
     box.size = np.ptp(corners, axis=0) / 2
     if turn is not None:
-        box.quat = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+        box.quat = quaternion(turn)
 
 
 def room(rng: np.random.Generator, table: bool = True) -> Any:
@@ -183,18 +200,10 @@ def room(rng: np.random.Generator, table: bool = True) -> Any:
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.stat.extent = 1
-    spec.visual.map.znear = 0.02
-    spec.visual.map.zfar = 10
-    spec.visual.quality.offsamples = 0
-    spec.visual.global_.offheight, spec.visual.global_.offwidth = IMAGE
     geom = spec.default.geom
     geom.friction = [0.7, 0.005, 0.002]
     geom.condim = 6
     geom.solref = [0.006, 1]
-    spec.worldbody.add_camera(
-        name="camera", fovy=np.degrees(2 * np.arctan(IMAGE[0] / 2 / FOCAL))
-    )
 
     floor = -FLOOR_DEPTH
     world = spec.worldbody
@@ -254,7 +263,7 @@ def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
     level = normals[stable] @ normals.T > np.cos(np.radians(2))
     areas = level @ hull.area_faces
     kept: list[int] = []
-    for one in np.argsort(-areas):
+    for one in np.argsort(-np.round(areas, 12), kind="stable"):
         others = normals[stable][kept]
         if not (others @ normals[stable][one] > np.cos(np.radians(10))).any():
             kept.append(int(one))
@@ -427,6 +436,7 @@ def leaning(actor: Actor, rng: np.random.Generator) -> Staging:
 
     points = actor.scan.vertices - actor.scan.vertices.mean(0)
     long_axis = np.linalg.svd(points, full_matrices=False)[2][0]
+    long_axis *= np.sign(long_axis[np.abs(long_axis).argmax()])
     upright = with_up(long_axis * rng.choice([-1, 1]), rng)
     tilt = Rotation.from_euler("y", -rng.uniform(8, 35), degrees=True)
     turn = tilt.as_matrix() @ upright
@@ -476,8 +486,8 @@ def held(actor: Actor, rng: np.random.Generator) -> Staging:
         boxes.append(((half, -0.01, -0.03), (half + 0.008, 0.01, 0.02)))
     else:
         boxes.append(((-0.012, -0.012, 0), (0.012, 0.012, 0.02)))
-    gripper.pos = axes.T @ (middle, tip[1], end)
-    gripper.quat = Rotation.from_matrix(axes.T).as_quat(scalar_first=True)
+    gripper.pos = rounded(axes.T @ (middle, tip[1], end))
+    gripper.quat = quaternion(axes.T)
     for corners in boxes:
         add_box(gripper, *corners)
     return Staging(spec, {}, lambda m, d: True)
@@ -504,8 +514,7 @@ def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     for name, (place, turn) in staging.starts.items():
         joint = model.body(name).jntadr[0]
         first = model.jnt_qposadr[joint]
-        quaternion = Rotation.from_matrix(turn).as_quat(scalar_first=True)
-        data.qpos[first : first + 7] = [*place, *quaternion]
+        data.qpos[first : first + 7] = [*rounded(place), *quaternion(turn)]
     mujoco.mj_forward(model, data)
 
     calm = 0
@@ -525,10 +534,15 @@ def staged(
     """A thing at rest where it should be: MuJoCo's model and data, and how many tries it took; None
     if all were in vain.
     """
+    import mujoco
+
     for tries in range(STAGINGS_TRIED):
         staging = STAGES[place](Actor(folder, name, tries), rng)
         scene = at_rest(staging)
         if scene is not None and staging.stays(*scene):
+            model, data = scene
+            data.qpos[:] = rounded(data.qpos)
+            mujoco.mj_kinematics(model, data)
             return scene, tries + 1
     return None
 
@@ -539,7 +553,7 @@ def true_pose(data: Any) -> Float:
     pose = np.eye(4)
     pose[:3, :3] = thing.xmat.reshape(3, 3)
     pose[:3, 3] = thing.xpos
-    return pose
+    return rounded(pose)
 
 
 def as_told(
@@ -553,7 +567,7 @@ def as_told(
     error = Rotation.from_rotvec(rng.normal(0, degrees, 3), degrees=True)
     told[:3, :3] = pose[:3, :3] @ error.as_matrix()
     told[:3, 3] += rng.normal(0, millimetres / 1000, 3)
-    return told
+    return rounded(told)
 
 
 def camera_distance(scan: trimesh.Trimesh) -> float:
@@ -563,8 +577,12 @@ def camera_distance(scan: trimesh.Trimesh) -> float:
 
 def field(rng: np.random.Generator) -> Float:
     """Normal noise of unit variance, correlated over about two pixels, of an image's shape."""
-    noise = ndimage.gaussian_filter(rng.normal(size=IMAGE), 1.0)
-    return noise / noise.std()
+    gaussian = np.exp(-0.5 * np.arange(-4, 5) ** 2)
+    weights = rounded(gaussian / np.sqrt((gaussian**2).sum()))
+    noise = rng.normal(size=IMAGE)
+    for axis in (0, 1):
+        noise = ndimage.correlate1d(noise, weights, axis)
+    return noise
 
 
 def slope_along(values: Float, axis: int) -> Float:
@@ -627,11 +645,10 @@ def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> 
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(right, back), -back], 1)
     pose[:3, 3] = aim + distance * back
-    return pose
+    return rounded(pose)
 
 
 def looked(
-    renderer: Any,
     model: Any,
     data: Any,
     pose: Float,
@@ -643,21 +660,34 @@ def looked(
     """
     import mujoco
 
-    model.cam_pos[0] = pose[:3, 3]
-    turn = pose[:3, :3] * (1, -1, -1)
-    model.cam_quat[0] = Rotation.from_matrix(turn).as_quat(scalar_first=True)
-    mujoco.mj_forward(model, data)
-    renderer.update_scene(data, "camera")
-    renderer.enable_depth_rendering()
-    depth = renderer.render().astype(float)
-    renderer.disable_depth_rendering()
-    renderer.enable_segmentation_rendering()
-    numbers, kinds = np.moveaxis(renderer.render(), -1, 0)
-    renderer.disable_segmentation_rendering()
-    thing = (numbers == model.geom("thing seen").id) & (
-        kinds == mujoco.mjtObj.mjOBJ_GEOM
+    rows, columns = np.indices(IMAGE)
+    across, down = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]
+    right, below, ahead = pose[:3, :3].T
+    # as long as the depth is 1, so that the distance along them is the depth
+    rays = (across[..., None] * right + down[..., None] * below) / FOCAL + ahead
+
+    groups = np.ones(mujoco.mjNGROUP, np.uint8)
+    groups[COLLIDES] = 0
+    count = rows.size
+    hit = np.empty(count, np.int32)
+    depth = np.empty(count)
+    mujoco.mj_multiRay(
+        model,
+        data,
+        pose[:3, 3],
+        rays.ravel(),
+        groups,
+        True,
+        -1,
+        hit,
+        depth,
+        None,
+        count,
+        FARTHEST,
     )
-    return as_measured(depth, rng, per_metre), thing
+    depth[hit < 0] = FARTHEST
+    thing = hit.reshape(IMAGE) == model.geom("thing seen").id
+    return as_measured(depth.reshape(IMAGE), rng, per_metre), thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -690,8 +720,6 @@ def shots_of(
     rng: np.random.Generator,
 ) -> tuple[list[Shot], float]:
     """Three views around a thing, the best found of each, and the cameras' distance, metres."""
-    import mujoco
-
     model, data = scene
     true = true_pose(data)
     middle = true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3]
@@ -700,18 +728,15 @@ def shots_of(
     around = (right - left) / VIEW_COUNT
     first = rng.uniform(0, 360) if right - left == 360 else 0.0
     shots = []
-    with mujoco.Renderer(model, *IMAGE) as renderer:
-        for third in rng.permutation(VIEW_COUNT):
-            tried: list[Shot] = []
-            while len(tried) < VIEWPOINTS_TRIED:
-                azimuth = first + left + (third + rng.uniform(0.15, 0.85)) * around
-                aim = middle + rng.normal(0, 0.005, 3)
-                pose = camera_at(aim, azimuth, rng.uniform(low, high), distance)
-                told = as_told(pose, arm_error, rng)
-                tried.append(
-                    Shot(*looked(renderer, model, data, pose, rng), pose, told)
-                )
-                if tried[-1].pixels >= ENOUGH_PIXELS:
-                    break
-            shots.append(max(tried, key=lambda shot: shot.pixels))
+    for third in rng.permutation(VIEW_COUNT):
+        tried: list[Shot] = []
+        while len(tried) < VIEWPOINTS_TRIED:
+            azimuth = first + left + (third + rng.uniform(0.15, 0.85)) * around
+            aim = middle + rng.normal(0, 0.005, 3)
+            pose = camera_at(aim, azimuth, rng.uniform(low, high), distance)
+            told = as_told(pose, arm_error, rng)
+            tried.append(Shot(*looked(model, data, pose, rng), pose, told))
+            if tried[-1].pixels >= ENOUGH_PIXELS:
+                break
+        shots.append(max(tried, key=lambda shot: shot.pixels))
     return shots, distance

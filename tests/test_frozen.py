@@ -1,28 +1,42 @@
-"""The script of the frozen archive: the same bytes each time, and a run that is stopped goes on."""
+"""The script of the frozen archive: it goes on after a stop, and is the same on each processor."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from test_places import MAKES_A_PICTURE
+from PIL import Image
 
 pytest.importorskip("mujoco")
 
-from nextview.benchmark.frozen import FrozenArchive
+from nextview.benchmark.frozen import FrozenArchive, seal
 from nextview.benchmark.submit import SubmitOptions, submit
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
-SURROUNDINGS = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
+SURROUNDINGS = {**os.environ, "OMP_NUM_THREADS": "1"}
+# what OpenBLAS, NumPy and the C library do on a processor without AVX2
+OLD_PROCESSOR = {
+    "OPENBLAS_CORETYPE": "Prescott",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2,-FMA4",
+}
+LAST_BITS = """
+import numpy as np
+from math import exp
+numbers = np.random.default_rng(0).random((60, 60))
+print(np.linalg.svd(numbers)[2].tobytes().hex(), np.exp(numbers).tobytes().hex())
+print([exp(number) for number in numbers.flat])
+"""
 
 
-def make(scans, out, options=OPTIONS):
+def make(scans, out, options=OPTIONS, **surroundings):
     return subprocess.run(
         [sys.executable, "-m", "benchmarks.frozen", scans, out, *options.split()],
         cwd=ROOT,
-        env=SURROUNDINGS,
+        env=SURROUNDINGS | surroundings,
         capture_output=True,
         text=True,
     )
@@ -37,10 +51,6 @@ def content(folder):
 
 
 def test_the_same_seed_gives_the_same_bytes_after_a_stop_too(household, tmp_path):
-    draws = subprocess.run([sys.executable, "-c", MAKES_A_PICTURE], env=SURROUNDINGS)
-    if draws.returncode:
-        pytest.skip("MuJoCo cannot draw here")
-
     out = tmp_path / "first/tiny-1.0"
     made = make(household, out)
     assert made.returncode == 0, made.stderr
@@ -68,3 +78,44 @@ def test_the_same_seed_gives_the_same_bytes_after_a_stop_too(household, tmp_path
 
     run = submit(out, tmp_path / "out.json", SubmitOptions("fixed"))
     assert run.whole
+
+
+def last_bits(**surroundings):
+    ended = subprocess.run(
+        [sys.executable, "-c", LAST_BITS],
+        env=SURROUNDINGS | surroundings,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return ended.stdout
+
+
+def test_another_processor_makes_the_same_archive(household, tmp_path):
+    one = last_bits()
+    if last_bits(**OLD_PROCESSOR) == one:
+        pytest.skip("the libraries do here what they do on an old processor")
+
+    options = "--places leaning --things 1 --draws 1 --grid 1 1 --seed 5"
+    sums = []
+    for number, surroundings in enumerate(({}, OLD_PROCESSOR)):
+        out = tmp_path / f"{number}/tiny-1.0"
+        made = make(household, out, options, **surroundings)
+        assert made.returncode == 0, made.stderr
+        sums.append(FrozenArchive(out).sha256)
+    assert sums[0] == sums[1]
+
+
+def test_another_compressor_makes_the_same_archive(archive, tmp_path):
+    other = shutil.copytree(archive, tmp_path / "archive")
+    (other / "manifest.json").unlink()
+    image = other / "episodes/0000/000.png"
+    before = image.read_bytes()
+    with Image.open(image) as pixels:
+        pixels.copy().save(image, compress_level=0)
+    assert image.read_bytes() != before
+
+    manifest = FrozenArchive(archive).manifest
+    again = seal(other, manifest.name, manifest.seed, manifest.made_with)
+    assert again == FrozenArchive(archive).sha256
+    FrozenArchive(other).view("0000", 0)

@@ -30,12 +30,6 @@ with_scans = pytest.mark.skipif(
     not (SCANS / f"{NAME}.ply").exists(),
     reason="NEXTVIEW_DATA has no YCB scans",
 )
-MAKES_A_PICTURE = """
-import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco/>")
-with mujoco.Renderer(model, 8, 8) as renderer:
-    renderer.render()
-"""
 
 
 def test_the_noise_of_a_wall_is_that_of_its_disparities():
@@ -92,11 +86,7 @@ def test_a_bottle_comes_to_rest_on_a_side_of_its_hull():
 
 @with_scans
 def test_a_thing_alone_is_staged_and_recognised(tmp_path):
-    surroundings = {**os.environ, "MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1"}
-    draws = subprocess.run([sys.executable, "-c", MAKES_A_PICTURE], env=surroundings)
-    if draws.returncode:
-        pytest.skip("MuJoCo cannot draw here")
-
+    surroundings = {**os.environ, "OMP_NUM_THREADS": "1"}
     scans = tmp_path / "scans"
     scans.mkdir()
     (scans / f"{NAME}.ply").symlink_to(SCANS / f"{NAME}.ply")

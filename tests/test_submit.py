@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
+from PIL import Image
 from pipeline import refused
 from scipy.spatial.transform import Rotation
 
@@ -150,8 +151,9 @@ def test_what_is_no_answer_is_refused(archive, tmp_path, answer, said):
 
 
 def test_a_method_that_ends_is_named(archive, tmp_path):
-    how = replace(answering(tmp_path), command=as_command(tmp_path, "print()"))
-    with pytest.raises(ResultsError, match=r"not an answer|has ended"):
+    greets = as_command(tmp_path, "print('my method'); input()")
+    how = replace(answering(tmp_path), command=greets)
+    with pytest.raises(ResultsError, match="'my method' is not an answer, a line of"):
         submit(archive, tmp_path / "out.json", how)
     how = replace(how, command=as_command(tmp_path, ""))
     with pytest.raises(ResultsError, match="the process has ended"):
@@ -167,9 +169,19 @@ def test_a_method_that_says_nothing_is_not_waited_for(archive, tmp_path):
 
 def test_a_changed_image_is_found(own, tmp_path, capsys):
     path = own / "episodes/0000/000.png"
-    path.write_bytes(path.read_bytes() + b" ")
+    with Image.open(path) as image:
+        pixels = np.array(image)
+    pixels[0, 0] += 1
+    Image.fromarray(pixels).save(path)
     said = refused(capsys, "submit", own, tmp_path / "out.json", "--policy", "fixed")
     assert "000.png: is missing, or not the file that the manifest names" in said
+
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(DatasetError, match="not the file that the manifest names"):
+        FrozenArchive(own).view("0000", 0)
+    path.unlink()
+    with pytest.raises(DatasetError, match="is missing"):
+        FrozenArchive(own).view("0000", 0)
 
 
 @pytest.mark.parametrize(

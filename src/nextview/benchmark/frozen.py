@@ -1,11 +1,13 @@
 """A frozen archive of episodes: what a method may see, and, in files of their own, the truth.
 
-An archive is a folder. ``manifest.json`` names every other file with its SHA-256; the SHA-256 of
-the manifest is that of the archive. ``things.json`` lists the things that may be shown,
+An archive is a folder. ``manifest.json`` names every other file with its SHA-256, and every image
+with that of its pixels; the SHA-256 of the manifest is that of the archive. ``things.json`` lists
+the things that may be shown,
 ``episodes/NUMBER/`` holds the candidate views of one thing in one place, and ``truth/NUMBER.json``
 what it is and where it lies. Only ``truth`` reads the latter.
 """
 
+import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +21,7 @@ from nextview.files import (
     HashText,
     checked_bytes,
     decode_record,
+    regular_file,
     sha256_of,
     write_record,
 )
@@ -30,7 +33,7 @@ EPISODES_FOLDER = "episodes"
 TRUTH_FOLDER = "truth"
 SCANS_FOLDER = "scans"
 EPISODE_FILE = "episode.json"
-FROZEN_FORMAT = 1
+FROZEN_FORMAT = 2
 LARGEST_FROZEN_VIEWS = 400  # of an episode
 
 Matrix = tuple[tuple[float, ...], ...]
@@ -43,9 +46,9 @@ class FrozenManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         format: of the files, FROZEN_FORMAT.
         name: of the archive, with its version, such as nextview-bench-1.0.
         seed: of everything random in it.
-        made_with: versions of the libraries by name; with the same ones it is made again byte for
-            byte.
-        files: SHA-256 of every other file, by its path in the archive.
+        made_with: versions of the libraries by name, with which it can be made again.
+        files: SHA-256 of every other file, by its path in the archive; of a PNG that of its pixels
+            (``pixels_sha256``).
     """
 
     format: int
@@ -172,7 +175,7 @@ class FrozenArchive:
         return self.folder / path
 
     def content(self, path: str) -> bytes:
-        """Read a file, and compare it with the manifest.
+        """Read a file that is no image, and compare it with the manifest.
 
         Args:
             path: of the file in the archive.
@@ -186,10 +189,7 @@ class FrozenArchive:
                 place, self.manifest.files[path], "a file of an archive"
             )
         except ModelError:
-            raise DatasetError(
-                f"{place}: is missing, or not the file that the manifest names; get the archive"
-                " again"
-            ) from None
+            raise changed(place) from None
 
     @cached_property
     def things(self) -> dict[str, FrozenThing]:
@@ -227,7 +227,7 @@ class FrozenArchive:
         return episode
 
     def view(self, number: str, view: int) -> FrozenView:
-        """Return the images of a view, which are compared with the manifest.
+        """Return the images of a view, whose pixels are compared with the manifest.
 
         Args:
             number: of the episode.
@@ -239,7 +239,13 @@ class FrozenArchive:
         place = f"{EPISODES_FOLDER}/{number}/{view:03d}"
         names = (f"{place}.png", f"{place}-mask.png")
         for name in names:
-            self.content(name)
+            image = self.file(name)
+            try:
+                same = pixels_sha256(image) == self.manifest.files[name]
+            except ObservationError:
+                same = False
+            if not same:
+                raise changed(image)
         return FrozenView(*(self.folder / name for name in names))
 
     def truth(self, number: str) -> EpisodeTruth:
@@ -273,6 +279,31 @@ class FrozenArchive:
     def _record(self, path: str, record: Any) -> Any:
         where = f"{self.folder / path}: not what it should be"
         return decode_record(self.content(path), record, where, DatasetError)
+
+
+def changed(place: Path) -> DatasetError:
+    """Return the error of a file that is not as the manifest has it."""
+    return DatasetError(
+        f"{place}: is missing, or not the file that the manifest names; get the archive again"
+    )
+
+
+def pixels_sha256(path: Path) -> str:
+    """Return the SHA-256 of the pixels of a PNG, whose bytes depend on the library that wrote it.
+
+    Hashed are the shape as text, such as ``(480, 640)``, and the values row by row, 4 bytes each,
+    little-endian.
+
+    Args:
+        path: of the image.
+
+    Raises:
+        ObservationError: it is missing or damaged.
+    """
+    regular_file(path, "an image of an archive", ObservationError)
+    with opened_image(path, ("PNG",)) as image:
+        pixels = np.asarray(image).astype("<u4")
+    return hashlib.sha256(str(pixels.shape).encode() + pixels.tobytes()).hexdigest()
 
 
 def read_view(view: FrozenView, metres_per_unit: float) -> tuple[Float32, Mask]:
@@ -318,7 +349,8 @@ def seal(folder: Path, name: str, seed: int, made_with: dict[str, str]) -> str:
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder)
         if path.is_file() and not any(part.startswith(".") for part in place.parts):
-            files[place.as_posix()] = sha256_of(path)
+            hashed = pixels_sha256 if path.suffix == ".png" else sha256_of
+            files[place.as_posix()] = hashed(path)
     manifest = FrozenManifest(FROZEN_FORMAT, name, seed, made_with, files)
     write_record(folder / MANIFEST, manifest)
     return sha256_of(folder / MANIFEST)

@@ -367,9 +367,10 @@ class CommandMethod:
 
         if not line:
             raise ResultsError(f"{where}: the process has ended; see what it said")
-        wanted = "not an answer, a line of JSON with name, confidence and confident"
+        said = f"{one_line(line)!r} is not an answer"
+        wanted = "a line of JSON with name, confidence and confident"
         return decode_record(
-            line.encode(), MethodAnswer, f"{where}: {wanted}", ResultsError
+            line.encode(), MethodAnswer, f"{where}: {said}, {wanted}", ResultsError
         )
 
     def cpu_seconds(self) -> float:
