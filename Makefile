@@ -1,6 +1,7 @@
 # Two commands do everything on a machine with Python 3.11+, pip and make: `make demo` and `make test`.
 PYTHON ?= python3
 
+.SECONDARY:  # what a rule makes on the way is kept
 .PHONY: demo test test-ros lint docs reproduce reproduce-small reproduce-things clean
 
 demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
@@ -40,11 +41,17 @@ PSB ?= data/PSB
 THINGS ?= reproduction-things
 NEXTVIEW = OMP_NUM_THREADS=1 .venv-test/bin/nextview
 PYTHON_TEST = OMP_NUM_THREADS=1 .venv-test/bin/python
-CHOICES = --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
+FIRST_DRAW = --draws 2 --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
+SECOND_DRAW = --draws 2 --seed 71 --views 1 2 --policies geometry --reference
 
-reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
-	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes $(THINGS)/pairs --models $(THINGS)/alike --families --draws 2 $(CHOICES)
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy --draws 2 $(CHOICES)
+reproduce-things: .venv-test/installed $(THINGS)/alike_60/memory.json $(THINGS)/alike_70/memory.json  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
+	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_60 $(THINGS)/pairs --models $(THINGS)/alike_60 --families $(FIRST_DRAW)
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy $(FIRST_DRAW)
+	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families $(SECOND_DRAW) spread
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy $(SECOND_DRAW) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half $(SECOND_DRAW) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_two --models ycb $(SECOND_DRAW) furthest
+	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_two heavy_two half_two clear_two) > $(THINGS)/joined.md
 	$(NEXTVIEW) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
 	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
@@ -59,13 +66,13 @@ reproduce-things: .venv-test/installed $(THINGS)/alike/memory.json  ## next view
 		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
 	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --overwrite
 
-$(THINGS)/look_alikes/pairs.csv: | .venv-test/installed
-	rm -rf $(THINGS)/look_alikes
+$(THINGS)/look_alikes_%/pairs.csv: | .venv-test/installed
+	rm -rf $(@D)
 	mkdir -p $(THINGS)
-	$(PYTHON_TEST) -m benchmarks.made_things look-alikes $(YCB) $(THINGS)/look_alikes --models $(DATA) --pairs 50 --seed 60
+	$(PYTHON_TEST) -m benchmarks.made_things look-alikes $(YCB) $(@D) --models $(DATA) --pairs 50 --seed $*
 
-$(THINGS)/alike/memory.json: $(THINGS)/look_alikes/pairs.csv
-	$(NEXTVIEW) learn $(THINGS)/look_alikes $(THINGS)/alike --unit m
+$(THINGS)/alike_%/memory.json: $(THINGS)/look_alikes_%/pairs.csv
+	$(NEXTVIEW) learn $(<D) $(@D) --unit m
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
