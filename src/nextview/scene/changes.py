@@ -215,6 +215,11 @@ class _Object:
         near = fitted(self.surface, mean, mean, covariance)
         return near.evidence(mean, covariance)
 
+    def near(self, camera: CameraError) -> float:
+        """Log-likelihood that it stands, by its likeliest motion too, which may be small."""
+        mean, covariance = self.expected(camera)
+        return max(self.standing(camera), self.fit.evidence(mean, covariance))
+
     def elsewhere(self, camera: CameraError, others: _Moved) -> float:
         """Log-likelihood that it moved, by any distance along the ground or as others did."""
         mean, covariance = self.expected(camera)
@@ -276,17 +281,16 @@ def changes(
         The change of each object, and the error of the pose of the new frame.
     """
     compared = _Compared.with_frame(tracks, top, segments, tops, cameras)
-    found = [compared.change(row, _Moved()) for row in range(len(tracks))]
     ways = {
         row: one.way(compared.by_others[row])
         for row, one in compared.named.items()
-        if found[row].found
+        if compared.by_name(row, _Moved()).found
     }
-    for row, change in enumerate(found):
+    found = []
+    for row in range(len(tracks)):
         along = tuple(way for other, way in ways.items() if other != row)
-        if along and not change.contradicts:
-            moved = _Moved(along, len(along) / len(compared.named))
-            found[row] = compared.change(row, moved)
+        moved = _Moved(along, len(along) / max(len(compared.named), 1))
+        found.append(compared.change(row, moved))
     return found, compared.camera
 
 
@@ -304,6 +308,7 @@ class _Compared:
         named: these objects beside each other, with their likeliest motions, by row.
         camera: error of the frame's pose.
         by_others: the same without the object itself, for each object.
+        stands: log-likelihood that each of ``named`` stands, by row.
     """
 
     tracks: Sequence[Track]
@@ -315,6 +320,7 @@ class _Compared:
     named: dict[int, _Object]
     camera: CameraError
     by_others: list[CameraError]
+    stands: dict[int, float]
 
     @classmethod
     def with_frame(
@@ -336,26 +342,45 @@ class _Compared:
             _camera_by([named[other] for other in standing if other != row], expected)
             for row in range(len(tracks))
         ]
+        stands = {row: one.near(by_others[row]) for row, one in named.items()}
         return cls(
-            tracks, top, segments, tops, cameras, places, named, camera, by_others
+            tracks,
+            top,
+            segments,
+            tops,
+            cameras,
+            places,
+            named,
+            camera,
+            by_others,
+            stands,
         )
 
     def change(self, row: int, moved: _Moved) -> Change:
         """Return the change of one object, given which others moved."""
-        track = self.tracks[row]
-        one = self.named.get(row)
-        by_name = Change()
-        if one is not None:
-            by_name = _of_name(one, self.by_others[row], moved, track, self.tops)
-            if not by_name.contradicts:
-                return by_name
-
+        by_name = self.by_name(row, moved) if row in self.named else None
+        if by_name is not None and not by_name.contradicts:
+            return by_name
         by_part = self._of_last_seen(row, moved)
         if by_part is None:
             return Change()
-        if one is None:
+        if by_name is None:
             return by_part
-        return _whatever_it_is(by_name, by_part, track.confident)
+        return _whatever_it_is(by_name, by_part, self.tracks[row].confident)
+
+    def by_name(self, row: int, moved: _Moved) -> Change:
+        """Return the change of an object with a geometry, if its name is right."""
+        one = self.named[row]
+        there = Change(
+            self.stands[row], one.elsewhere(self.by_others[row], moved), one.there
+        )
+        if not there.found:
+            return there
+        # it may have stood there all the time, in a pose that the earlier frames show less well
+        mean, _ = one.expected(self.by_others[row])
+        pose = one.surface.pose(one.fit.motion - mean)
+        always = there.elsewhere - _told_before(self.tracks[row], pose, self.tops)
+        return replace(there, stands=float(np.logaddexp(there.stands, always)))
 
     def _of_last_seen(self, row: int, moved: _Moved) -> Change | None:
         """Return the change of the part of an object that was seen last.
@@ -476,28 +501,6 @@ def _still(objects: Sequence[_Object], expected: CameraError) -> CameraError:
         expected.covariance,
     )
     return replace(expected, motion=motion)
-
-
-def _of_name(
-    one: _Object,
-    camera: CameraError,
-    moved: _Moved,
-    track: Track,
-    tops: Sequence[TableTop],
-) -> Change:
-    """Compare a frame with a named object, given the error of its pose by the others."""
-    mean, covariance = one.expected(camera)
-    # the likeliest of all motions is often small enough for an object that stands
-    stands = max(one.standing(camera), one.fit.evidence(mean, covariance))
-    elsewhere = one.elsewhere(camera, moved)
-    change = Change(stands, elsewhere, one.there)
-    if not change.found:
-        return change
-    # it may have stood there all the time, in a pose that the earlier frames show less well
-    always = elsewhere - _told_before(
-        track, one.surface.pose(one.fit.motion - mean), tops
-    )
-    return replace(change, stands=float(np.logaddexp(stands, always)))
 
 
 def _last_seen(
