@@ -215,6 +215,11 @@ class _Object:
         near = fitted(self.surface, mean, mean, covariance)
         return near.evidence(mean, covariance)
 
+    def near(self, camera: CameraError) -> float:
+        """Log-likelihood that it stands, by its likeliest motion too, which may be small."""
+        mean, covariance = self.expected(camera)
+        return max(self.standing(camera), self.fit.evidence(mean, covariance))
+
     def elsewhere(self, camera: CameraError, others: _Moved) -> float:
         """Log-likelihood that it moved, by any distance along the ground or as others did."""
         mean, covariance = self.expected(camera)
@@ -276,38 +281,17 @@ def changes(
         The change of each object, and the error of the pose of the new frame.
     """
     compared = _Compared.with_frame(tracks, top, segments, tops, cameras)
-    found = [compared.change(row, _Moved()) for row in range(len(tracks))]
     ways = {
         row: one.way(compared.by_others[row])
         for row, one in compared.named.items()
-        if found[row].found
+        if compared.by_name(row, _Moved()).found
     }
-    for row, change in enumerate(found):
+    found = []
+    for row in range(len(tracks)):
         along = tuple(way for other, way in ways.items() if other != row)
-        if along and not change.contradicts:
-            moved = _Moved(along, len(along) / len(compared.named))
-            found[row] = compared.change(row, moved)
+        moved = _Moved(along, len(along) / max(len(compared.named), 1))
+        found.append(compared.change(row, moved))
     return found, compared.camera
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """The part of an object that was seen last, compared with a frame.
-
-    Attributes:
-        stands: log-likelihood that it stands.
-        seen: the part, with its likeliest motion; None if the frame shows another part of the
-            object.
-    """
-
-    stands: float
-    seen: _Object | None = None
-
-    def change(self, camera: CameraError, moved: _Moved) -> Change:
-        """Return its change, given the error of the frame's pose, and which others moved."""
-        if self.seen is None:
-            return Change(self.stands)
-        return Change(self.stands, self.seen.elsewhere(camera, moved), self.seen.there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,8 +308,7 @@ class _Compared:
         named: these objects beside each other, with their likeliest motions, by row.
         camera: error of the frame's pose.
         by_others: the same without the object itself, for each object.
-        stands: log-likelihood that each of ``named`` stands, once it was asked for, by row.
-        parts: what was seen last of each object, once it was asked for, by row.
+        stands: log-likelihood that each of ``named`` stands, by row.
     """
 
     tracks: Sequence[Track]
@@ -337,8 +320,7 @@ class _Compared:
     named: dict[int, _Object]
     camera: CameraError
     by_others: list[CameraError]
-    stands: dict[int, float] = field(default_factory=dict)
-    parts: dict[int, _Part | None] = field(default_factory=dict)
+    stands: dict[int, float]
 
     @classmethod
     def with_frame(
@@ -360,38 +342,48 @@ class _Compared:
             _camera_by([named[other] for other in standing if other != row], expected)
             for row in range(len(tracks))
         ]
+        stands = {row: one.near(by_others[row]) for row, one in named.items()}
         return cls(
-            tracks, top, segments, tops, cameras, places, named, camera, by_others
+            tracks,
+            top,
+            segments,
+            tops,
+            cameras,
+            places,
+            named,
+            camera,
+            by_others,
+            stands,
         )
 
     def change(self, row: int, moved: _Moved) -> Change:
-        """Return the change of one object, given which others moved.
-
-        What does not depend on the others is found once.
-        """
-        track = self.tracks[row]
-        camera = self.by_others[row]
-        one = self.named.get(row)
-        by_name = Change()
-        if one is not None:
-            if row not in self.stands:
-                self.stands[row] = one.standing(camera)
-            by_name = _of_name(one, self.stands[row], camera, moved, track, self.tops)
-            if not by_name.contradicts:
-                return by_name
-
-        if row not in self.parts:
-            self.parts[row] = self._last_seen(row)
-        part = self.parts[row]
-        if part is None:
+        """Return the change of one object, given which others moved."""
+        by_name = self.by_name(row, moved) if row in self.named else None
+        if by_name is not None and not by_name.contradicts:
+            return by_name
+        by_part = self._of_last_seen(row, moved)
+        if by_part is None:
             return Change()
-        by_part = part.change(camera, moved)
-        if one is None:
+        if by_name is None:
             return by_part
-        return _whatever_it_is(by_name, by_part, track.confident)
+        return _whatever_it_is(by_name, by_part, self.tracks[row].confident)
 
-    def _last_seen(self, row: int) -> _Part | None:
-        """Compare the frame with the part of an object that was seen last.
+    def by_name(self, row: int, moved: _Moved) -> Change:
+        """Return the change of an object with a geometry, if its name is right."""
+        one = self.named[row]
+        there = Change(
+            self.stands[row], one.elsewhere(self.by_others[row], moved), one.there
+        )
+        if not there.found:
+            return there
+        # it may have stood there all the time, in a pose that the earlier frames show less well
+        mean, _ = one.expected(self.by_others[row])
+        pose = one.surface.pose(one.fit.motion - mean)
+        always = there.elsewhere - _told_before(self.tracks[row], pose, self.tops)
+        return replace(there, stands=float(np.logaddexp(there.stands, always)))
+
+    def _of_last_seen(self, row: int, moved: _Moved) -> Change | None:
+        """Return the change of the part of an object that was seen last.
 
         None if the frame cannot show this part.
         """
@@ -406,12 +398,12 @@ class _Compared:
             weighed = seen.surface.weighed_like(one.surface)
             seen = replace(seen, surface=weighed)
 
-        stands = seen.standing(camera)
+        change = Change(seen.standing(camera))
         if seen.known:  # from elsewhere the frame shows another part
-            return _Part(stands)
+            return change
         way = None if one is None else one.way(camera)[0][3:]
         beside = seen.beside(_others(self.places, row), self.top)
-        return _moved_part(stands, beside, camera, way)
+        return _of_part(change, beside, camera, moved, way)
 
 
 def wrong_pose(found: Sequence[Change], camera: CameraError) -> bool:
@@ -511,38 +503,6 @@ def _still(objects: Sequence[_Object], expected: CameraError) -> CameraError:
     return replace(expected, motion=motion)
 
 
-def _of_name(
-    one: _Object,
-    standing: float,
-    camera: CameraError,
-    moved: _Moved,
-    track: Track,
-    tops: Sequence[TableTop],
-) -> Change:
-    """Compare a frame with a named object, given the error of its pose by the others.
-
-    Args:
-        one: the object.
-        standing: see ``_Object.standing``.
-        camera: error of the frame's pose, by the other objects.
-        moved: the other objects that moved.
-        track: of the object.
-        tops: support surfaces of the earlier frames.
-    """
-    mean, covariance = one.expected(camera)
-    # the likeliest of all motions is often small enough for an object that stands
-    stands = max(standing, one.fit.evidence(mean, covariance))
-    elsewhere = one.elsewhere(camera, moved)
-    change = Change(stands, elsewhere, one.there)
-    if not change.found:
-        return change
-    # it may have stood there all the time, in a pose that the earlier frames show less well
-    always = elsewhere - _told_before(
-        track, one.surface.pose(one.fit.motion - mean), tops
-    )
-    return replace(change, stands=float(np.logaddexp(stands, always)))
-
-
 def _last_seen(
     track: Track,
     top: TableTop,
@@ -566,26 +526,29 @@ def _last_seen(
     return _object_at(posed, own, known, top, segments)
 
 
-def _moved_part(
-    stands: float,
+def _of_part(
+    change: Change,
     seen: _Object,
     camera: CameraError,
+    moved: _Moved,
     way: Float | None,
-) -> _Part:
+) -> Change:
     """Consider that the part of an object that was seen last, and is seen again, has moved.
 
     Args:
-        stands: log-likelihood that it stands, as if nothing stood before it. The poses of the
-            others err, so that they may hide less of it than is hidden.
+        change: of this part, as if nothing stood before it. The poses of the others err, so that
+            they may hide less of it than is hidden.
         seen: this part beside the others, which explain what this object need not.
         camera: error of the frame's pose, by the other objects.
+        moved: the other objects that moved.
         way: shift of the object by its name, (3,), metres; None without one.
     """
     mean, _ = seen.expected(camera)
     ways = [np.zeros(3), seen.shift, *([] if way is None else [way])]
     starts = [mean + np.append(np.zeros(3), each) for each in ways]
     seen = seen.looked_for(camera, starts)
-    return _Part(max(stands, seen.standing(camera)), seen)
+    stands = max(change.stands, seen.standing(camera))
+    return Change(stands, seen.elsewhere(camera, moved), seen.there)
 
 
 def _whatever_it_is(change: Change, unnamed: Change, confident: bool) -> Change:
