@@ -78,12 +78,15 @@ from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.recognition.novelty import unit
 
 
+SIZE = 16  # of a feature
+
+
 def teach(path, name, how, threads, features):  # as a network would, but at once
     rng = np.random.default_rng([*path.read_bytes(), *name.encode()])
     return {
-        "views": unit(rng.normal(size=(2, len(RINGS), AZIMUTHS, 256))).astype(np.float16),
+        "views": unit(rng.normal(size=(2, len(RINGS), AZIMUTHS, SIZE))).astype(np.float16),
         "rotations": np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)),
-        "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
+        "held_out": unit(rng.normal(size=(4, SIZE))).astype(np.float16),
         "held_out_views": np.zeros((4, 2), np.float32),
         "radii": np.array([0.1], np.float32),
         "upright": np.array([False]),
@@ -93,7 +96,7 @@ def teach(path, name, how, threads, features):  # as a network would, but at onc
 
 module.teach = teach
 module.draw_learned = lambda path, pictures, fit: path.write_text(" ".join(pictures))
-module.Features = lambda threads: SimpleNamespace(size=256)
+module.Features = lambda threads: SimpleNamespace(size=SIZE)
 case, earlier, folder = sys.argv[1], sys.argv[2] == "earlier", Path(sys.argv[3])
 old, out = folder / "old", folder / "place" / "mine"
 for name, things in {"first": "box ball", "more": "cup", "other": "ball box"}.items():

@@ -191,10 +191,13 @@ def test_the_demo_draws_over_its_own_picture_and_no_other(
     capsys,
 ):
     monkeypatch.chdir(tmp_path)
-    for _ in range(2):
-        main(["demo-episode"])
+    picture = tmp_path / "nextview_demo.png"
+    picture.write_bytes(b"of an earlier run")
+    main(["demo-episode"])
     assert "wrote nextview_demo.png" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["nextview_demo.png"]
+    with Image.open(picture) as drawn:
+        assert min(drawn.size) > 300
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")
     assert "mine.png: exists" in refused(capsys, "demo-episode", "--figure", mine)

@@ -21,6 +21,12 @@ def meshes():
     return meshes_of(NAMES)
 
 
+@pytest.fixture(scope="module")
+def three(meshes):
+    """Some of them: each is compared with a frame beside all others."""
+    return {name: meshes[name] for name in ("cracker_box", "tuna_fish_can", "scissors")}
+
+
 @dataclass
 class TrueMasks:
     """A segmentation: which thing each pixel of the last frame shows."""
@@ -107,10 +113,10 @@ def test_a_flat_thing_that_was_taken_away_is_gone(watched):
     assert look.moved == ()
 
 
-def test_what_stands_still_is_not_said_to_move_because_of_an_arms_errors(ycb, meshes):
-    camera, scene = seen_once(ycb, meshes, moved=0.003, turned=0.3)
-    assert {thing.name for thing in scene.objects} == set(NAMES)
-    for degrees in (20, 50, 80):
+def test_what_stands_still_is_not_said_to_move_because_of_an_arms_errors(ycb, three):
+    camera, scene = seen_once(ycb, three, moved=0.003, turned=0.3)
+    assert {thing.name for thing in scene.objects} == set(three)
+    for degrees in (20, 80):
         look = scene.update(camera.frame(view(degrees)))
         assert look.taken
         assert look.moved == look.gone == look.appeared == ()
@@ -133,8 +139,8 @@ def test_two_things_that_were_swapped_have_both_moved(watched):
             assert np.linalg.norm(thing.place[:2] - true) < 0.02
 
 
-def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes):
-    camera = camera_over(list(meshes.values()), seed=8)
+def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, three):
+    camera = camera_over(list(three.values()), seed=8)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     belt = np.eye(4)
@@ -154,17 +160,17 @@ def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, meshes):
         true = next(thing for thing in camera.table.things if thing.name == one.name)
         middle = np.append(true.vertices.mean(0), 1)
         assert np.linalg.norm((belt @ one.pose - true.pose) @ middle) < 0.003
-    assert {one.name for one in scene.objects} == set(NAMES)
+    assert {one.name for one in scene.objects} == set(three)
 
 
 @pytest.mark.parametrize("metres", [0.01, 0.05])
-def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, metres):
-    camera = camera_over(list(meshes.values()), seed=8)
+def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, three, metres):
+    camera = camera_over(list(three.values()), seed=8)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     start = camera.table
     belt = np.eye(4)
-    for number in range(4):
+    for number in range(3):
         belt[0, 3] = number * metres
         things = [replace(one, pose=belt @ one.pose) for one in start.things]
         camera.change(SimulatedTable(tuple(things)))
@@ -173,16 +179,16 @@ def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, meshes, me
         assert look.taken
         assert look.gone == ()
         if number:
-            assert len(look.moved) == len(NAMES)
+            assert len(look.moved) == len(three)
             assert look.appeared == ()
     for one in scene.objects:
         true = next(thing for thing in camera.table.things if thing.name == one.name)
         middle = np.append(true.vertices.mean(0), 1)
         assert np.linalg.norm((one.pose - true.pose) @ middle) < 0.003
-    assert {one.name for one in scene.objects} == set(NAMES)
+    assert {one.name for one in scene.objects} == set(three)
 
 
-def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, meshes):
+def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, three):
     chair = replace(
         sample_mesh("chair"),
         radius=0.09,
@@ -190,7 +196,7 @@ def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, meshes):
         name="chair",
         unit="m",
     )
-    camera = camera_over([*meshes.values(), chair], seed=8)
+    camera = camera_over([*three.values(), chair], seed=8)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
 

@@ -330,7 +330,7 @@ def test_a_run_that_was_killed_in_mid_epoch_and_moved_resumes_the_same_to_the_bi
     whole, folder = uninterrupted
     (tmp_path / "a").mkdir()
     arguments = tmp_path / "a", RECIPE, Hardware(), stop
-    process = multiprocessing.get_context("spawn").Process(target=train, args=arguments)
+    process = multiprocessing.get_context("fork").Process(target=train, args=arguments)
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL

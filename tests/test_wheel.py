@@ -170,13 +170,8 @@ def test_it_runs_with_its_declared_requirements(wheel, extra, tmp_path):
         )
     for installed in found.values():
         link(installed, packages)
-    run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
-    assert f"{packages}" in run(
-        python,
-        "-c",
-        "import nextview; print(nextview.__file__)",
-        cwd=tmp_path,
-    )
+    code = f"{EXAMPLES[extra]}; import nextview; print(nextview.__file__)"
+    assert f"{packages}" in run(python, "-c", code, cwd=wheel.parents[1])
 
 
 def test_it_contains_only_the_package(wheel):
