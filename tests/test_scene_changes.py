@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from small_tables import camera_over, meshes_of, view, without
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import nextview
 from nextview.data.samples import sample_mesh
@@ -224,3 +225,18 @@ def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, three):
     after = shown()
     assert after.number == before.number
     assert np.allclose((after.place - before.place)[:2], shift, atol=0.005)
+
+
+def test_matrix_products_of_a_scene_take_one_core(watched):
+    camera, scene, _ = watched
+    threads = set()
+
+    def masks(frame):
+        pools = threadpool_info()
+        threads.update(p["num_threads"] for p in pools if p["user_api"] == "blas")
+        return camera.owner + 1
+
+    scene.segmentation = masks
+    with threadpool_limits(2, "blas"):
+        scene.update(camera.frame(view(70)))
+    assert threads == {1}

@@ -48,7 +48,7 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.session.judging import Judge
+from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.reach import (
     Reach,
@@ -347,7 +347,8 @@ class Scene:
         """
         with self._lock:
             if self._targets is None:
-                self._target_rows, self._targets = self._ranked()
+                with one_blas_thread():
+                    self._target_rows, self._targets = self._ranked()
             return self._targets
 
     def _ranked(self) -> tuple[list[int], Float]:
@@ -429,10 +430,12 @@ class Scene:
         """
         with self._lock:
             if not isinstance(frame, Sequence):
-                return self._update(frame)
+                with one_blas_thread():
+                    return self._update(frame)
             before = self._state
             try:
-                return tuple([self._update(one) for one in frame])
+                with one_blas_thread():
+                    return tuple([self._update(one) for one in frame])
             except BaseException:
                 self._state = before
                 self._changed()

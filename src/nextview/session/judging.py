@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of, direction_of
@@ -20,6 +23,22 @@ from nextview.sensing.observed_object import ObservedObject
 from nextview.session.result import Recognition
 from nextview.session.view import View
 from nextview.types import Floats
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    """Return a controller of the thread pools below NumPy."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Limit NumPy's matrix products to one thread in this context.
+
+    They are small, and the threads of BLAS spin while they wait for each other. That takes the
+    cores from the networks; on a computer that is busy otherwise, a search takes several times as
+    long.
+    """
+    return _blas().limit(limits=1)
 
 
 class Judge:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Protocol, get_args, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import ThreadpoolController
 
 from nextview.checks import number, one_line, plugin_errors, whole
 from nextview.errors import (
@@ -47,7 +45,7 @@ from nextview.sensing.plausibility import (
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
-from nextview.session.judging import Judge
+from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
@@ -102,15 +100,6 @@ class FrameCamera(Protocol):
         Returns if there may be another frame; otherwise raises the error.
         """
         ...
-
-
-@lru_cache(maxsize=1)
-def _blas() -> ThreadpoolController:
-    """Return a controller of the thread pools below NumPy.
-
-    Their idle threads spin and take the cores from the networks.
-    """
-    return ThreadpoolController().select(user_api="blas")
 
 
 class Session:
@@ -655,7 +644,7 @@ class Session:
 
     def _update(self, seen: Observation | Frame) -> View:
         """Process one view."""
-        with _blas().limit(limits=1):
+        with one_blas_thread():
             view = (
                 self._add_frame(seen)
                 if isinstance(seen, Frame)
