@@ -192,14 +192,18 @@ def knobs_memory(shared, knobs) -> Path:
 
 @pytest.fixture(scope="session")
 def mixed_memory(shared, knobs_memory) -> Path:
-    """A memory of them and of a block of unknown size: with features, and with their geometry."""
+    """A memory of one of them and of a block of unknown size: with features, and the geometry of
+    that one.
+    """
 
     def make(folder: Path) -> None:
         shutil.copytree(knobs_memory, folder / "mine")
+        mine = folder / "mine"
+        learn(mine, mine, remove=("can", "plain"), workers=0)
         (folder / "unsized").mkdir()
         block = pipeline.box((3, 2, 1), (0, 0, 0.5))
         block.export(folder / "unsized" / "block.ply")
-        learn(folder / "unsized", folder / "mine", add=True, upright=True, workers=0)
+        learn(folder / "unsized", mine, add=True, upright=True, workers=0)
 
     return shared("mixed_memory", make) / "mine"
 

@@ -710,8 +710,11 @@ class Session:
             novelty = judge([thing])[0].novelty
             return 1.0 if novelty is None else novelty
 
-        if p_value(object) < SUSPICIOUS * self.unknown:
-            object.part_otherwise(p_value)
+        as_it_is = p_value(object)
+        if as_it_is < SUSPICIOUS * self.unknown:
+            object.part_otherwise(
+                lambda thing: as_it_is if thing is object else p_value(thing)
+            )
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Reject frames whose object is as large as the camera distance only in combination.
