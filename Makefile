@@ -42,16 +42,21 @@ THINGS ?= reproduction-things
 NEXTVIEW = OMP_NUM_THREADS=1 .venv-test/bin/nextview
 PYTHON_TEST = OMP_NUM_THREADS=1 .venv-test/bin/python
 FIRST_DRAW = --draws 2 --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
-SECOND_DRAW = --draws 2 --seed 71 --views 1 2 --policies geometry --reference
+NEXT_DRAWS = --draws 2 --views 1 2 --policies geometry --reference
 
-reproduce-things: .venv-test/installed $(THINGS)/alike_60/memory.json $(THINGS)/alike_70/memory.json  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
+reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$(seed)/memory.json)  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
 	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_60 $(THINGS)/pairs --models $(THINGS)/alike_60 --families $(FIRST_DRAW)
 	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy $(FIRST_DRAW)
-	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families $(SECOND_DRAW) spread
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy $(SECOND_DRAW) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half $(SECOND_DRAW) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_two --models ycb $(SECOND_DRAW) furthest
-	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_two heavy_two half_two clear_two) > $(THINGS)/joined.md
+	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families --seed 71 $(NEXT_DRAWS) spread
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy --seed 71 $(NEXT_DRAWS) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half --seed 71 $(NEXT_DRAWS) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_two --models ycb --seed 71 $(NEXT_DRAWS) furthest
+	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_two heavy_two half_two clear_two) > $(THINGS)/joined_two.md
+	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_75 $(THINGS)/pairs_three --models $(THINGS)/alike_75 --families --seed 74 $(NEXT_DRAWS) spread
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_three --models ycb --occlusion heavy --seed 74 $(NEXT_DRAWS) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_three --models ycb --occlusion half --seed 74 $(NEXT_DRAWS) furthest
+	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_three --models ycb --seed 74 $(NEXT_DRAWS) furthest
+	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_three heavy_three half_three clear_three) > $(THINGS)/joined_three.md
 	$(NEXTVIEW) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
 	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
