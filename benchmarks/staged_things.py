@@ -663,7 +663,7 @@ def looked(
     rows, columns = np.indices(IMAGE)
     across, down = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]
     right, below, ahead = pose[:3, :3].T
-    # as long as the depth is 1, so that the distance along them is the depth
+    # scaled to a depth of 1, so that distances in units of a ray are depths
     rays = (across[..., None] * right + down[..., None] * below) / FOCAL + ahead
 
     groups = np.ones(mujoco.mjNGROUP, np.uint8)

@@ -133,6 +133,7 @@ def test_a_thing_that_leans_is_confident_in_a_scene_of_any_orientation(leans, yc
         scene.update(frame)
     doubtful = named(resting, "cracker_box")
     assert not doubtful.confident
+    assert doubtful.result.refused
     thing = named(scene, "cracker_box")
     assert thing.confident
     np.testing.assert_allclose(thing.pose, truth["cracker_box"], atol=0.02)

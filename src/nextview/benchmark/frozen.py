@@ -2,9 +2,8 @@
 
 An archive is a folder. ``manifest.json`` names every other file with its SHA-256, and every image
 with that of its pixels; the SHA-256 of the manifest is that of the archive. ``things.json`` lists
-the things that may be shown,
-``episodes/NUMBER/`` holds the candidate views of one thing in one place, and ``truth/NUMBER.json``
-what it is and where it lies. Only ``truth`` reads the latter.
+the things that may be shown, ``episodes/NUMBER/`` holds the candidate views of one thing in one
+place, and ``truth/NUMBER.json`` what it is and where it lies. Only ``truth`` reads the latter.
 """
 
 import hashlib

@@ -158,12 +158,14 @@ class NextviewMethod:
         self.blind = policy in BLIND_RULES
         self._policy = policy
         self._seed = seed
+
         self._things = frozenset(things)
         self._system = load(
             models, policy="random-all", stopping=_never, max_views=1000, threads=1
         )
         if not self._things & set(self._system.classes):
             raise UsageError(f"{models}: knows none of the things of the archive")
+
         self._rule = Stopping.of(self._system.models.recogniser.calibration)
         self._sphere = ViewSphere.named("40")
         self._make_policy(self._sphere)

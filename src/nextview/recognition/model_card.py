@@ -362,10 +362,12 @@ def check_numbers(path: Path, card: Any, error: type[NextviewError]) -> None:
     left: list[tuple[str, Any]] = [("", msgspec.to_builtins(card))]
     while left:
         name, value = left.pop()
+        # of a long list of numbers, the largest is enough
         if isinstance(value, list | tuple) and {int, float}.issuperset(
             map(type, value)
         ):
             value = max(value, key=abs, default=0)
+
         if isinstance(value, dict):
             left += [(f"{name}.{key}".lstrip("."), item) for key, item in value.items()]
         elif isinstance(value, list | tuple):

@@ -215,8 +215,8 @@ class _Object:
         near = fitted(self.surface, mean, mean, covariance)
         return near.evidence(mean, covariance)
 
-    def near(self, camera: CameraError) -> float:
-        """Log-likelihood that it stands, by its likeliest motion too, which may be small."""
+    def standing_at_best(self, camera: CameraError) -> float:
+        """Log-likelihood that it stands; its likeliest motion may be small enough for that."""
         mean, covariance = self.expected(camera)
         return max(self.standing(camera), self.fit.evidence(mean, covariance))
 
@@ -337,23 +337,27 @@ class _Compared:
         still = _still(list(known.values()), expected)
         places = {row: _displaced(one, still) for row, one in known.items()}
         named = _searched(known, places, still, expected, top)
+
         standing, camera = _agreeing(named, expected)
         by_others = [
             _camera_by([named[other] for other in standing if other != row], expected)
             for row in range(len(tracks))
         ]
-        stands = {row: one.near(by_others[row]) for row, one in named.items()}
+        stands = {
+            row: one.standing_at_best(by_others[row]) for row, one in named.items()
+        }
+
         return cls(
-            tracks,
-            top,
-            segments,
-            tops,
-            cameras,
-            places,
-            named,
-            camera,
-            by_others,
-            stands,
+            tracks=tracks,
+            top=top,
+            segments=segments,
+            tops=tops,
+            cameras=cameras,
+            places=places,
+            named=named,
+            camera=camera,
+            by_others=by_others,
+            stands=stands,
         )
 
     def change(self, row: int, moved: _Moved) -> Change:

@@ -194,10 +194,12 @@ def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
     in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = in_camera[:, 2] > 0.01
     away = np.where(ahead, in_camera[:, 2], 1.0)
+
     at = frame.pinhole.project(np.column_stack([in_camera[:, :2], away]))
     column, row = np.floor(np.clip(at, -1e6, 1e6)).astype(np.int64).T
     inside = ahead & (row >= 0) & (row < frame.shape[0])
     inside &= (column >= 0) & (column < frame.shape[1])
+
     depth = np.where(
         inside,
         frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)],

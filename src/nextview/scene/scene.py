@@ -251,8 +251,9 @@ class Scene:
                 views = self._candidates
                 if views is None:
                     return ()
-                left = views.poses[views.free]
+
                 state = self._state
+                left = views.poses[views.free]
                 self._open = open_points(
                     state.tracks,
                     state.unexplained,
@@ -428,14 +429,12 @@ class Scene:
             ObservationError: the frame is invalid or has no pose, it shows no support plane, it
                 does not fit the known world, or ``segmentation`` returned no masks.
         """
-        with self._lock:
+        with self._lock, one_blas_thread():
             if not isinstance(frame, Sequence):
-                with one_blas_thread():
-                    return self._update(frame)
+                return self._update(frame)
             before = self._state
             try:
-                with one_blas_thread():
-                    return tuple([self._update(one) for one in frame])
+                return tuple([self._update(one) for one in frame])
             except BaseException:
                 self._state = before
                 self._changed()

@@ -124,7 +124,8 @@ class MetricImage:
         noise: noise of single pixels.
         ground: level plane under the thing, if it is visible; it may be the top of other things.
         floor: plane below which nothing can be, if the ground is visible.
-        hiding: pixels around the thing that show an occluder, (H, W) bool.
+        hiding: pixels around the thing that show an occluder, or lie in its shadow, where nothing
+            is measured, (H, W) bool.
         camera: name of the camera; "" for the one camera.
     """
 
@@ -198,12 +199,13 @@ class MetricImage:
         return find_planes(points[~thing], points[thing], origin, self.pose[:3, 2])
 
     def find_hiding(self) -> Mask:
-        """Find the pixels around the thing that show an occluder in front of it.
+        """Find the pixels around the thing that show an occluder in front of it, or its shadow.
 
-        The floor is no occluder.
+        The floor is no occluder. A pixel without a measurement is in the shadow of an occluder if
+        that is the nearest of what is measured beside the thing.
 
         Returns:
-            Mask of the occluders, (H, W) bool.
+            Mask of the occluders and their shadows, (H, W) bool.
         """
         rows, columns = (
             slice(lines[0], lines[-1] + 1)
@@ -230,6 +232,12 @@ class MetricImage:
             heights = self.floor.heights(points)
             allowed = np.hypot(HIDING, HIDING_NOISE * self.floor.noise * depth[at] ** 2)
             hiding[at] = heights > allowed
+
+        if hiding.any():
+            measured = distance_transform_edt(
+                kind != ELSEWHERE, return_distances=False, return_indices=True
+            )
+            hiding |= (kind == NOT_MEASURED) & hiding[tuple(measured)]
 
         every = np.zeros(self.kind.shape, bool)
         every[rows, columns] = hiding

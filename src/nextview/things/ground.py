@@ -125,7 +125,7 @@ def _highest_plane(
     origin: Float,
     axis: Float,
     layer: float,
-    highest: float,
+    limit: float,
 ) -> Ground | None:
     """Find the highest level plane that contains a sufficient share of the points.
 
@@ -135,7 +135,7 @@ def _highest_plane(
         origin: position of the camera, (3,).
         axis: optical axis of the camera, (3,).
         layer: thickness of a plane in the search, metres.
-        highest: upper limit of its height, metres.
+        limit: of its height, metres.
 
     Returns:
         The plane; None if too few of the points lie on one.
@@ -146,7 +146,7 @@ def _highest_plane(
 
     heights = np.sort(beside[:, 2])
     inside = np.searchsorted(heights, heights + layer) - np.arange(len(heights))
-    below = (inside >= enough) & (heights <= highest)
+    below = (inside >= enough) & (heights <= limit)
     if not below.any():
         return None
     highest = heights[below].max()

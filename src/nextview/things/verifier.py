@@ -50,8 +50,8 @@ class Stage:
     Attributes:
         side: rows and columns of pixels.
         levels: steps of the registration.
-        most: largest number of survivors, at most half of them of one thing; more of many
-            hypotheses: see SHARE_KEPT.
+        most: largest number of survivors, at most half of them of one thing; SHARE_KEPT of the
+            hypotheses if these are more.
         hopeless: log-likelihood below the best hypothesis at which a hypothesis is rejected.
         rivals: whether the likeliest hypotheses of RIVAL_THINGS things are also tried in the poses
             of their near symmetries.

@@ -19,12 +19,11 @@ from hashlib import sha256
 from weakref import WeakValueDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, MetricImage
+from nextview.things.depth_view import NOT_MEASURED, THING, MetricImage
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
@@ -463,13 +462,11 @@ class SeenOutline:
         found = cls.of_depth(image.depth, shown, known, camera, image.pose)
 
         around = ndimage.binary_dilation(shown, iterations=2) & ~shown
-        rows, columns = np.nonzero(around)
-        beside = _nearest_measured(image.kind, rows, columns)
-        hiding = image.hiding[beside]
-        if np.count_nonzero(hiding) < HIDDEN_SHARE * len(rows):
+        hiding = around & image.hiding
+        if np.count_nonzero(hiding) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
 
-        rows, columns = rows[hiding], columns[hiding]
+        rows, columns = np.nonzero(hiding)
         towards = np.array([columns.mean(), rows.mean()]) - found.centre
         step, reach = SHIFTS
         lines = np.arange(-reach, reach + step / 2, step)
@@ -557,28 +554,6 @@ class SeenOutline:
             np.clip(behind, -FARTHEST_BEHIND, FARTHEST_BEHIND).astype(np.float32),
             np.count_nonzero(self.shown) / cell**2,
         )
-
-
-def _nearest_measured(
-    kind: NDArray[np.uint8], rows: Index, columns: Index
-) -> tuple[Index, Index]:
-    """Find the nearest measured pixels beside the thing, beyond the shadow of an occluder.
-
-    Args:
-        kind: NOT_MEASURED, ELSEWHERE or THING, (H, W) uint8.
-        rows: rows of some pixels, (N,).
-        columns: columns of these, (N,).
-
-    Returns:
-        Rows and columns, (N,) each; the pixels themselves if nothing beside the thing is measured.
-    """
-    elsewhere = kind == ELSEWHERE
-    if not elsewhere.any():
-        return rows, columns
-    nearest = ndimage.distance_transform_edt(
-        ~elsewhere, return_distances=False, return_indices=True
-    )
-    return nearest[0][rows, columns], nearest[1][rows, columns]
 
 
 def turned_grid(turns: Float) -> Float32:
