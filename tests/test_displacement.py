@@ -48,7 +48,7 @@ def looked_at(thing, moves, views=VIEWS, **more) -> ObservedObject:
     """An object that stands elsewhere in each frame, as do the camera and the table if it is the
     pose that errs.
     """
-    known = ObservedObject(parting="touching", **more)  # it stands alone
+    known = ObservedObject(alone=True, **more)
     for k, (view, move) in enumerate(zip(views, moves, strict=True)):
         moved = thing.copy().apply_translation(move)
         known.add(seen([TABLE, moved], pose_at(*view, 0.5, (0, 0, 0.04)), k))

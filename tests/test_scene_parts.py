@@ -8,7 +8,7 @@ from small_tables import camera_over, view
 
 import nextview
 from nextview.scene.next_view import TableGround, outline_of
-from nextview.scene.parting import (
+from nextview.session.parting import (
     MOST_CUT,
     MOST_JOINED,
     MOST_TRIMMED,
@@ -18,7 +18,7 @@ from nextview.scene.parting import (
     part,
     taken_over,
 )
-from nextview.scene.tracks import Track
+from nextview.session.tracks import Track
 from nextview.segmentation.instances import instances_of
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop

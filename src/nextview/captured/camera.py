@@ -14,7 +14,6 @@ from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
-from nextview.sensing.choosing import ALONE
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.observed_object import ObservedObject
@@ -95,7 +94,7 @@ class CapturedCamera:
         same: dict[str, Any] = {
             "denoise": denoise,
             "life_size": life_size,
-            "parting": ALONE,
+            "alone": True,
         }
         if box is not None:
             up = box.axes[2] if up is None else up
@@ -196,7 +195,7 @@ class CapturedCamera:
         """Locate the object approximately."""
         reason = ""
         for frame in self.capture.frames:
-            thing = ObservedObject(up, point, parting=ALONE)
+            thing = ObservedObject(up, point, alone=True)
             try:
                 thing.add(frame.read(self._masked))
             except (DatasetError, ObservationError) as error:

@@ -21,7 +21,6 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame, ObservedObject
-from nextview.sensing.choosing import ALONE
 from nextview.sensing.object_frame import smallest_circle
 from nextview.types import Float
 
@@ -69,7 +68,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     ]
     shown = []
     for frame in frames:
-        thing = ObservedObject(parting=ALONE)
+        thing = ObservedObject(alone=True)
         try:
             thing.add(Frame(frame.read().depth, k))
         except ObservationError as error:

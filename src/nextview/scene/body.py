@@ -10,7 +10,7 @@ from scipy.special import expit, logit
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty
 from nextview.scene.motion import BodyState, MotionModel, Rest
 from nextview.scene.objects import SceneObject
-from nextview.scene.tracks import caster_of
+from nextview.session.tracks import caster_of
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.types import Float, Float32
 

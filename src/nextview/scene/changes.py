@@ -22,10 +22,10 @@ from nextview.scene.placing import (
     likeliest,
     seen_surface,
 )
-from nextview.scene.tracks import Track
 from nextview.sensing.displacement import CAMERA_AIM, CAMERA_PLACE, FARTHEST_SHIFT
 from nextview.sensing.frame import Frame, stands_still
 from nextview.sensing.tabletop import TableTop
+from nextview.session.tracks import Track
 from nextview.things.registration import scan_errors
 from nextview.types import Float, Mask
 

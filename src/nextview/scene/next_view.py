@@ -18,7 +18,6 @@ from scipy import ndimage
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
 from nextview.recognition.protocol import LooksAhead
-from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
@@ -26,6 +25,7 @@ from nextview.session.limits import Limits
 from nextview.session.reach import Reach
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
+from nextview.session.tracks import Track
 from nextview.types import Float, Index, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table

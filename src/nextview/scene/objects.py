@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words
-from nextview.scene.tracks import Track
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.result import Recognition
+from nextview.session.tracks import Track
 from nextview.types import Float, Mask
 
 UNKNOWN_NAME = "unknown"

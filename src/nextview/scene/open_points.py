@@ -12,8 +12,8 @@ from nextview.scene.next_view import (
     TableGround,
     outline_of,
 )
-from nextview.scene.tracks import ENOUGH_VIEWS, Track
 from nextview.scene.unexplained import UnexplainedPatch
+from nextview.session.tracks import ENOUGH_VIEWS, Track
 from nextview.types import Float
 
 

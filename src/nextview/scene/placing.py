@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nextview.recognition.poses import PoseCandidate
-from nextview.scene.tracks import caster_of, window_around
 from nextview.sensing.frame import Frame, Part
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
+from nextview.session.tracks import caster_of, window_around
 from nextview.things.expected_images import LOWEST_COSINE
 from nextview.things.registration import RegistrationPrior, scan_errors
 from nextview.things.surface import SurfaceCaster

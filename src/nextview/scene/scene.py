@@ -16,7 +16,6 @@ from nextview.checks import did_you_mean, one_line
 from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import Change, changes, wrong_pose
-from nextview.scene.following import SAME_OBJECT_SHARE, assign
 from nextview.scene.grasps import (
     GRASP_CLEARANCE,
     MOST_UNSEEN,
@@ -29,10 +28,8 @@ from nextview.scene.grasps import (
 from nextview.scene.next_view import Candidates, candidates
 from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint, open_points
-from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.rule import SceneRule, ruled_out_by
 from nextview.scene.state import MOST_VERIFIED, SceneState
-from nextview.scene.tracks import Track, render_track
 from nextview.scene.view_policies import (
     INFORMATION_POLICY,
     NamedPolicy,
@@ -48,8 +45,17 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.session.judging import Judge, one_blas_thread
+from nextview.session.following import SAME_OBJECT_SHARE, assign
+from nextview.session.judging import CORES, Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits
+from nextview.session.parting import (
+    GOOD_FIT,
+    Bench,
+    merged,
+    new_track,
+    part,
+    taken_over,
+)
 from nextview.session.reach import (
     Reach,
     Reachable,
@@ -61,6 +67,7 @@ from nextview.session.reach import (
 from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
+from nextview.session.tracks import Track, render_track
 from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
@@ -68,7 +75,6 @@ if TYPE_CHECKING:
 
 
 ENOUGH_FRAMES = 2  # frames after which a settled object is not judged again
-CORES = 2  # objects that are judged in parallel
 WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"

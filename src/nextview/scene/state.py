@@ -12,11 +12,11 @@ from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import CameraError
 from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject
-from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
+from nextview.session.tracks import Track
 
 # largest number of objects verified per frame, those with the most pixels first
 MOST_VERIFIED = 20

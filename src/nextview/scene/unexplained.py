@@ -13,11 +13,11 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.axes import upright_axes
-from nextview.scene.following import GONE, SAME_OBJECT_SHARE, Outline, seen_through
-from nextview.scene.tracks import EDGE_WIDTH, Track
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
+from nextview.session.following import GONE, SAME_OBJECT_SHARE, Outline, seen_through
+from nextview.session.tracks import EDGE_WIDTH, Track
 from nextview.types import Float, Mask
 
 NEAR_DEVIATIONS = (

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import compress
-from typing import Literal
 
 import numpy as np
 
@@ -16,12 +14,6 @@ from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
-Parting = Literal["instance", "touching", "piece"]
-"""Part of the segmentation that is one object: an instance, an instance with everything that
-touches it, or a piece of an instance."""
-
-# for an object that stands alone, so that everything that touches it belongs to it
-ALONE: Parting = "touching"
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
@@ -38,7 +30,7 @@ def choose_instance(
     seen: SegmentedFrame,
     point: Float | None,
     known: ObjectFrame | None,
-    parting: Parting = "instance",
+    alone: bool = False,
 ) -> Mask:
     """Select the instance of a frame that is the object.
 
@@ -49,7 +41,7 @@ def choose_instance(
         seen: the frame with its instances and surfaces.
         point: on the object, (3,), world, metres; None if not given.
         known: object frame from earlier frames; None in a first frame.
-        parting: part of the segmentation that is one object.
+        alone: whether everything that touches the object is a part of it.
 
     Returns:
         Its mask, (H, W) bool.
@@ -57,27 +49,13 @@ def choose_instance(
     Raises:
         ObservationError: there is no such instance.
     """
-    chosen = _chosen(seen, point, known)
-    if parting == "touching":
-        return _with_neighbours(chosen, seen)
-    if parting == "piece" and (pieces := seen.pieces) is not None:
-        numbers = np.unique(pieces[chosen & (pieces > 0)])
-        masks = tuple(chosen & (pieces == number) for number in numbers)
-        carriers = (seen.under(chosen),) * len(masks)
-        parts = replace(seen, masks=masks, carriers=carriers)
-        return _chosen(parts, point, known) if _of_size(parts) else chosen
-    return chosen
-
-
-def _chosen(
-    seen: SegmentedFrame, point: Float | None, known: ObjectFrame | None
-) -> Mask:
-    """Return the instance at the known place, at the point, or on the optical axis."""
     if known is not None:
-        return _seen_before(seen, known)
-    if point is not None:
-        return _at_point(seen, point)
-    return _aimed_at(seen)
+        chosen = _seen_before(seen, known)
+    elif point is not None:
+        chosen = _at_point(seen, point)
+    else:
+        chosen = _aimed_at(seen)
+    return _with_neighbours(chosen, seen) if alone else chosen
 
 
 def _with_neighbours(chosen: Mask, seen: SegmentedFrame) -> Mask:

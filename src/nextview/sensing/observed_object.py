@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +14,7 @@ from nextview.geometry.axes import three, upright_axes
 from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing import plausibility
-from nextview.sensing.choosing import Parting, choose_instance
+from nextview.sensing.choosing import choose_instance
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
@@ -45,8 +43,6 @@ from nextview.sensing.sighting import (
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
-# least share of an object's pixels by which another segmentation differs
-OTHER_SHARE = 0.03
 # change of centre or radius, in object radii, below which the object frame is kept
 SAME_FRAME = 0.01
 NO_OUTLINE = (
@@ -61,6 +57,11 @@ NO_PLANE = ViewWarning(
 )
 
 
+Parter = Callable[["ObservedObject", SegmentedFrame], Mask | None]
+"""Function of an object after a frame, and of the segmented frame, that returns other pixels of the
+object, (H, W) bool; None if they stay as they are."""
+
+
 @dataclass(frozen=True)
 class ObjectState:
     """State of an object after some frames.
@@ -71,8 +72,6 @@ class ObjectState:
         observations: of the frames, in the latest object frame.
         warnings: about the latest frame.
         revision: number of changes of the object frame.
-        parting: part of the segmentation that is the object.
-        partings: alternatives that give other pixels in the latest frame.
     """
 
     frame: ObjectFrame | None = None
@@ -80,8 +79,6 @@ class ObjectState:
     observations: tuple[Observation, ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
     revision: int = 0
-    parting: Parting = "instance"
-    partings: tuple[Parting, ...] = ()
 
 
 class ObservedObject:
@@ -113,8 +110,8 @@ class ObservedObject:
             evidence.
         segmentation: segments the objects in frames, see ``nextview.Scene``; None for the bundled
             network.
-        parting: part of the segmentation that is the object: an "instance"; or, for an object that
-            stands alone, an instance with everything "touching" it; or a "piece" of one.
+        alone: whether the object stands alone, so that every instance that touches it is a part of
+            it.
     """
 
     def __init__(
@@ -127,7 +124,7 @@ class ObservedObject:
         denoise: bool = True,
         life_size: bool = True,
         segmentation: Segmenter | None = None,
-        parting: Parting = "instance",
+        alone: bool = False,
     ) -> None:
         if sum(asked is not None for asked in (point, box, known)) > 1:
             raise UsageError(
@@ -142,7 +139,8 @@ class ObservedObject:
         self.denoise = denoise
         self.life_size = life_size
         self.segmentation = segmentation
-        self.state = ObjectState(self.known, parting=parting)
+        self.alone = alone
+        self.state = ObjectState(self.known)
 
     @property
     def object_frame(self) -> ObjectFrame:
@@ -173,15 +171,17 @@ class ObservedObject:
         """Number of times that earlier observations have changed."""
         return self.state.revision
 
-    def add(self, frame: Frame) -> Observation:
+    def add(self, frame: Frame, part: Parter | None = None) -> Observation:
         """Process a frame and return its observation from three object radii.
 
         An ObservationError is raised if the object is not found; the frame is then not used.
 
         Args:
             frame: of a depth camera.
+            part: corrects the pixels of the object. Not used for a frame with a mask, for a known
+                object frame, and for an object without a support plane.
         """
-        self.state = self._after(frame)
+        self.state = self._after(frame, part)
         return self.state.observations[-1]
 
     def add_again(self, frame: Frame, number: int) -> None:
@@ -200,58 +200,48 @@ class ObservedObject:
             sightings=(*state.sightings, state.sightings[number]),
             observations=(*state.observations, state.observations[number]),
             warnings=(REPEATED,),
-            partings=(),
         )
 
-    def part_otherwise(
-        self,
-        p_value: Callable[[ObservedObject], float],
-    ) -> None:
-        """Choose the part of the segmentation that is the object by the best-explained views.
-
-        Candidates are an instance, an instance with everything that touches it, or a piece of one.
-
-        Args:
-            p_value: function from an object to its p-value as a known thing.
-        """
-        found = [self]
-        for parting in self.state.partings:
-            other = copy(self)
-            revision = self.revision + 1
-            other.state = ObjectState(self.known, revision=revision, parting=parting)
-            with suppress(ObservationError):
-                for sighting in self.sightings:
-                    other.add(sighting.frame_as_given)
-                found.append(other)
-        if len(found) > 1:
-            values = [p_value(thing) for thing in found]
-            self.state = found[int(np.argmax(values))].state
-
-    def _after(self, frame: Frame) -> ObjectState:
+    def _after(self, frame: Frame, part: Parter | None) -> ObjectState:
         """Return the state after a frame, running all stages from frame to observation."""
-        before = self.state
         known = self._known_frames
         known.refuse(frame)
-
         up = self._up(frame)
         segmented = self._segmented(frame, up)
         warnings = tuple(check_mistakes(segmented, known))
-        parting = before.parting
-        pixels = self._pixels(segmented, parting)
-        partings: tuple[Parting, ...] = ()
-        if frame.mask is None and self.known is None:
-            partings = tuple(
-                other
-                for other in get_args(Parting)
-                if other != parting and _differ(pixels, self._pixels(segmented, other))
-            )
+        pixels = self._pixels(segmented)
+        after = self._with_pixels(pixels, segmented, up, warnings)
+        if (
+            part is None
+            or frame.mask is not None
+            or self.known is not None
+            or after.sightings[-1].plane is None
+        ):
+            return after
+        thing = copy(self)
+        thing.state = after
+        other = part(thing, segmented)
+        if other is None:
+            return after
+        return self._with_pixels(other, segmented, up, warnings)
+
+    def _with_pixels(
+        self,
+        pixels: Mask,
+        segmented: SegmentedFrame,
+        up: Float | None,
+        warnings: tuple[ViewWarning, ...],
+    ) -> ObjectState:
+        """Return the state after a frame in which some pixels, (H, W) bool, are the object."""
+        frame = segmented.frame
+        before = self.state
         plane = self._plane_under(pixels, segmented)
         if up is None and plane is None:
             raise ObservationError(
                 "no support plane is seen, so there is no telling where up is: give it, and the"
                 " camera's pose"
             )
-        warnings += tuple(known.check(frame, plane))
+        warnings += tuple(self._known_frames.check(frame, plane))
 
         mask = self._without_plane(pixels, segmented, plane)
         seen = sighting_of(frame, mask, plane, segmented.noise, self.denoise)
@@ -266,7 +256,7 @@ class ObservedObject:
         after = self._known_by([*before.sightings, seen], up)
         warnings = self._warnings_of_view(after, -1, self._check(after, plane))
         warnings += tuple(plausibility.check_place(displaced))
-        return replace(after, warnings=warnings, partings=partings)
+        return replace(after, warnings=warnings)
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
         """Replace the state of the object by some sightings.
@@ -353,7 +343,7 @@ class ObservedObject:
             found = Instances((frame.mask,), surface, found.background & outside)
         return segmented_frame(frame, found, up)
 
-    def _pixels(self, seen: SegmentedFrame, parting: Parting) -> Mask:
+    def _pixels(self, seen: SegmentedFrame) -> Mask:
         """Return the object's pixels: its mask, box, sphere or instance, (H, W) bool.
 
         Raises:
@@ -370,7 +360,7 @@ class ObservedObject:
             )
         if not self.support and self.point is None:
             raise ObservationError(NO_OUTLINE)
-        return choose_instance(seen, self.point, self.state.frame, parting)
+        return choose_instance(seen, self.point, self.state.frame, self.alone)
 
     def _plane_under(self, pixels: Mask, seen: SegmentedFrame) -> Plane | None:
         """Return the support plane of the object, by earlier frames if this one does not show it.
@@ -483,8 +473,3 @@ def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
         and abs(new.radius / old.radius - 1) < SAME_FRAME
         and np.allclose(new.axes, old.axes)
     )
-
-
-def _differ(one: Mask, other: Mask) -> bool:
-    """Return True if two masks, (H, W) bool, differ by more than noise."""
-    return bool(np.count_nonzero(one != other) > OTHER_SHARE * np.count_nonzero(one))

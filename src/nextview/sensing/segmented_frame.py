@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,6 +64,15 @@ class SegmentedFrame:
             for mask, carrier in pairs
             if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
         )
+
+    def parted(self, masks: Sequence[Mask]) -> SegmentedFrame:
+        """Return the frame with other instances.
+
+        Args:
+            masks: of each instance, (H, W) bool each.
+        """
+        carriers = tuple(self.under(mask) for mask in masks)
+        return replace(self, masks=tuple(masks), carriers=carriers)
 
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
         """Return the level that carries most pixels of candidate objects.

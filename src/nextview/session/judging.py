@@ -24,6 +24,8 @@ from nextview.session.result import Recognition
 from nextview.session.view import View
 from nextview.types import Floats
 
+CORES = 2  # objects that are judged in parallel
+
 
 @lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:

@@ -45,8 +45,9 @@ from nextview.sensing.plausibility import (
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
-from nextview.session.judging import Judge, one_blas_thread
+from nextview.session.judging import CORES, Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
+from nextview.session.parting import parted_from_neighbours
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
     Reach,
@@ -56,8 +57,9 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.result import SUSPICIOUS, Recognition
+from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
+from nextview.session.tracks import Track
 from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
@@ -65,6 +67,7 @@ from nextview.types import Float, Mask
 if TYPE_CHECKING:
     from nextview.segmentation.instances import Segmenter
     from nextview.sensing.observed_object import ObservedObject
+    from nextview.sensing.segmented_frame import SegmentedFrame
 
 FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres
@@ -684,12 +687,9 @@ class Session:
             known = [one.frame for one in object.sightings[self._before :]]
             number = repeated(frame, known, any_mask=True)
             if number is None:
-                object.add(frame)
+                object.add(frame, self._parted)
             else:
                 object.add_again(frame, self._before + number)
-            if self.unknown and object.state.partings:
-                self._part(object)
-
             self._refuse_disagreement(object)
             self._check_distance(object)
             return self._take(
@@ -702,19 +702,15 @@ class Session:
             object.state = before
             raise
 
-    def _part(self, object: ObservedObject) -> None:
-        """Try other segmentations of an object that is suspiciously novel."""
-        judge = Judge(self.models, self.sphere, self.stopping, self.unknown, 1)
-
-        def p_value(thing: ObservedObject) -> float:
-            novelty = judge([thing])[0].novelty
-            return 1.0 if novelty is None else novelty
-
-        as_it_is = p_value(object)
-        if as_it_is < SUSPICIOUS * self.unknown:
-            object.part_otherwise(
-                lambda thing: as_it_is if thing is object else p_value(thing)
-            )
+    def _parted(self, object: ObservedObject, seen: SegmentedFrame) -> Mask | None:
+        """Part the object from its neighbours, see ``session.parting.parted_from_neighbours``."""
+        judge = Judge(self.models, self.sphere, self.stopping, self.unknown, CORES)
+        before = None
+        if self.views and self.object is not None:
+            result = self._recognition(self.views, self.object)
+            frames = tuple(range(len(self.object.sightings)))
+            before = Track(0, copy(self.object), frames, result)
+        return parted_from_neighbours(object, seen, judge, before)
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Reject frames whose object is as large as the camera distance only in combination.

@@ -11,9 +11,9 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.axes import upright_axes
-from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.tabletop import TableTop
+from nextview.session.tracks import Track, render_track
 from nextview.types import Float, Index, Mask
 
 # metres around the outline of an object in the top view within which pixels may belong to it
@@ -140,7 +140,7 @@ def _seen_in(segment: Mask, tracks: Sequence[Track], frame: Frame) -> int | None
         if track.likeliest is not None:
             continue
         last = track.thing.sightings[-1]
-        at, off = _points_in(points, last.frame)
+        at, off = points_in(points, last.frame)
         both = np.abs(off) < STEP_BEHIND
         inside = int(np.count_nonzero(both & last.mask[at]))
         if inside > most and inside > SAME_OBJECT_SHARE * np.count_nonzero(both):
@@ -193,7 +193,7 @@ def _divided(
     return {int(row): label == row + 1 for row in rows if (label == row + 1).any()}
 
 
-def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
+def points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
     """Project points into a frame.
 
     Args:
@@ -227,7 +227,7 @@ def seen_through(points: Float, frame: Frame) -> float:
     Returns:
         The share; 0 if too few points fall on pixels with depth.
     """
-    _, off = _points_in(points, frame)
+    _, off = points_in(points, frame)
     if len(off) < FEWEST_TESTED:
         return 0.0
     return float((off > STEP_BEHIND).mean())
