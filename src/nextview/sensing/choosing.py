@@ -55,11 +55,19 @@ def choose_instance(
         chosen = _at_point(seen, point)
     else:
         chosen = _aimed_at(seen)
-    return _with_neighbours(chosen, seen) if alone else chosen
+    return with_neighbours(chosen, seen) if alone else chosen
 
 
-def _with_neighbours(chosen: Mask, seen: SegmentedFrame) -> Mask:
-    """Return an instance with everything that touches it, directly or indirectly, (H, W) bool."""
+def with_neighbours(chosen: Mask, seen: SegmentedFrame) -> Mask:
+    """Return an instance with everything that touches it, directly or indirectly.
+
+    Args:
+        chosen: the instance, (H, W) bool.
+        seen: the frame with all instances.
+
+    Returns:
+        The pixels of all of them, (H, W) bool.
+    """
     found = chosen
     left = [mask for mask in seen.masks if not (mask & chosen).any()]
     while True:

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
-from nextview.sensing.choosing import NO_INSTANCE, choose_instance
+from nextview.sensing.choosing import NO_INSTANCE, choose_instance, with_neighbours
 from nextview.sensing.masks import above_plane, touching
 from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.segmented_frame import SegmentedFrame
@@ -191,7 +191,9 @@ def parted_from_neighbours(
     if beside or len(seen.pieces_of(own)) > 1:
         if target.result is None:
             target = judged([target])[0]
-        if target.likeliest is not None and not bench.is_good(target):
+        if target.likeliest is None:
+            target = _more_familiar(target, bench)
+        elif not bench.is_good(target):
             tracks = part([target, *judged(_new_tracks(beside, bench))], bench, known)
             target = _asked_for(tracks, thing, before, bench)
     if before is None and thing.point is not None:
@@ -227,6 +229,24 @@ def _new_tracks(masks: Sequence[Mask], bench: Bench) -> list[Track]:
         with suppress(ObservationError):
             found.append(new_track(mask, bench))
     return found
+
+
+def _more_familiar(target: Track, bench: Bench) -> Track:
+    """Return an object of a class that is suspiciously novel with all that touches it, if less so.
+
+    No scan tells where an object of a class ends.
+    """
+    assert target.result is not None
+    mask = target.mask_in(bench.number)
+    if mask is None or target.result.familiarity >= 1:
+        return target
+    whole = with_neighbours(mask, bench.top.seen)
+    with suppress(ObservationError):
+        other = bench.judge([target.with_mask(bench.number, whole, bench.top)])[0]
+        assert other.result is not None
+        if other.result.familiarity > target.result.familiarity:
+            return other
+    return target
 
 
 def _without_others(target: Track, point: Float, bench: Bench) -> Track:

@@ -168,9 +168,14 @@ class Recognition:
             return True
         if is_doubtful([view.warnings for view in self.views]):
             return True
-        return (
-            self.novelty is not None and self.novelty < SUSPICIOUS * self.unknown_rate
-        )
+        return self.familiarity < 1
+
+    @property
+    def familiarity(self) -> float:
+        """1 for an object that is not suspiciously novel; less, the more novel it is."""
+        if self.novelty is None or not self.unknown_rate:
+            return 1.0
+        return min(1.0, self.novelty / (SUSPICIOUS * self.unknown_rate))
 
     @property
     def none_of_them(self) -> str:
