@@ -32,6 +32,7 @@ from nextview.scene.view_policies import (
     ScenePolicy,
 )
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
+from nextview.sensing.frame import Frame
 from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
@@ -284,8 +285,8 @@ class Looking:
         self.cameras: list[tuple[Float, Float]] = []
         self.seconds = 0.0
 
-    def look(self, pose: Float) -> None:
-        """Take a frame from a pose."""
+    def look(self, pose: Float) -> Frame:
+        """Take a frame from a pose, and return it."""
         frame = self.camera.frame(pose)
         begun = time.process_time()
         try:
@@ -296,6 +297,7 @@ class Looking:
         if taken:
             self.owners.append(self.camera.owner)
             self.cameras.append((pose, self.camera.true_pose))
+        return frame
 
     def truth(self, thing: SceneObject) -> int:
         """Return the true object of most pixels of a found object, -1 for none."""

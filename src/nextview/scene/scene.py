@@ -575,7 +575,8 @@ class Scene:
             () if earlier is None else earlier.seen.levels,
         )
         warnings = tuple(check_mistakes(seen, self._known_frames))
-        top = TableTop.of(seen, self.up, earlier, inside, self._widest)
+        ground = None if earlier is None else earlier.plane
+        top = TableTop.of(seen, self.up, ground, inside, self._widest)
         return replace(top, warnings=warnings)
 
     def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:

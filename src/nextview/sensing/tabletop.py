@@ -64,7 +64,7 @@ class TableTop:
         cls,
         seen: SegmentedFrame,
         up: Float | None,
-        earlier: TableTop | None = None,
+        earlier: Plane | None = None,
         among: Mask | None = None,
         widest: float | None = None,
     ) -> TableTop:
@@ -73,7 +73,7 @@ class TableTop:
         Args:
             seen: the frame with its instances and surfaces.
             up: direction against gravity, (3,), world; None for the normal of the plane.
-            earlier: that of an earlier frame, whose plane is found again.
+            earlier: ground of an earlier frame, which is found again.
             among: search area, (H, W) bool; None for the whole frame.
             widest: diameter of the largest candidate object, metres; None for any.
 
@@ -85,11 +85,11 @@ class TableTop:
             inside = np.ones(frame.shape, bool) if among is None else among
             level = seen.ground(inside, widest)
         else:
-            level = seen.again(earlier.plane)
+            level = seen.again(earlier)
         if level is not None:
             plane = level.plane
         elif earlier is not None:
-            plane = earlier.plane
+            plane = earlier
         else:
             raise ObservationError(NO_SUPPORT)
 

@@ -173,9 +173,11 @@ def parted_from_neighbours(
         ]
 
     number = len(thing.sightings) - 1
-    bench = Bench(TableTop.of(seen, thing.object_frame.axes[2]), number, judged)
+    sighting = thing.sightings[-1]
+    top = TableTop.of(seen, thing.object_frame.axes[2], sighting.plane)
+    bench = Bench(top, number, judged)
     segments = seen.segments()
-    chosen = thing.sightings[-1].mask
+    chosen = sighting.mask
     if before is None or before.posed is None:
         target = Track(0, thing, tuple(range(number + 1)))
         others = [mask & ~chosen for mask in segments]
