@@ -195,7 +195,7 @@ def parted_from_neighbours(
             target = judged([target])[0]
         if target.likeliest is None:
             target = _more_familiar(target, bench)
-        elif not bench.is_good(target):
+        elif beside or not bench.is_good(target):
             tracks = part([target, *judged(_new_tracks(beside, bench))], bench, known)
             target = _asked_for(tracks, thing, before, bench)
     if before is None and thing.point is not None:
