@@ -1,6 +1,7 @@
 """Parts of a scene: objects that are one, the ground, what hides."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,10 @@ from small_tables import camera_over, view
 
 import nextview
 from nextview.scene.next_view import TableGround, outline_of
+from nextview.segmentation.instances import instances_of
+from nextview.sensing.segmented_frame import segmented_frame
+from nextview.sensing.tabletop import TableTop
+from nextview.session.judging import Judge
 from nextview.session.parting import (
     MOST_CUT,
     MOST_JOINED,
@@ -18,11 +23,7 @@ from nextview.session.parting import (
     part,
     taken_over,
 )
-from nextview.session.tracks import Track
-from nextview.segmentation.instances import instances_of
-from nextview.sensing.segmented_frame import segmented_frame
-from nextview.sensing.tabletop import TableTop
-from nextview.session.judging import Judge
+from nextview.session.tracks import Track, judged
 
 UP = np.array([0, 0, 1.0])
 
@@ -35,14 +36,7 @@ def top_of(frame):
 def judged_by(ycb):
     judge = Judge(ycb.models, ycb.sphere, ycb.stopping, ycb.unknown, 1)
 
-    def judged(tracks):
-        results = judge([track.thing for track in tracks])
-        return [
-            replace(track, result=one)
-            for track, one in zip(tracks, results, strict=True)
-        ]
-
-    return judged
+    return partial(judged, judge=judge)
 
 
 def two_sides(

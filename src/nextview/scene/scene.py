@@ -67,7 +67,7 @@ from nextview.session.reach import (
 from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
-from nextview.session.tracks import Track, render_track
+from nextview.session.tracks import Track, judged, render_track
 from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
@@ -714,11 +714,7 @@ class Scene:
 
     def _judged(self, tracks: Sequence[Track]) -> list[Track]:
         """Judge all objects."""
-        results = self._judge([track.thing for track in tracks])
-        return [
-            replace(track, result=result)
-            for track, result in zip(tracks, results, strict=True)
-        ]
+        return judged(tracks, self._judge)
 
 
 def _judge_of(system: System) -> Judge:

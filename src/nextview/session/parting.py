@@ -18,13 +18,10 @@ from scipy import ndimage
 
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
-from nextview.sensing.choosing import NO_INSTANCE, choose_instance, with_neighbours
-from nextview.sensing.masks import above_plane, touching
+from nextview.sensing.masks import touching
 from nextview.sensing.observed_object import ObservedObject
-from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
-from nextview.session.following import STEP_BEHIND, assign, points_in
 from nextview.session.result import Recognition
 from nextview.session.tracks import RenderedObject, Track, render_track
 from nextview.types import Float, Index, Mask
@@ -141,164 +138,6 @@ def part(
         track if bench.is_good(track) else replace(track, tries=track.tries + 1)
         for track in tracks
     ]
-
-
-def parted_from_neighbours(
-    thing: ObservedObject,
-    seen: SegmentedFrame,
-    judge: Callable[[Sequence[ObservedObject]], list[Recognition]],
-    before: Track | None,
-) -> Mask | None:
-    """Part one object from its neighbours in a frame, as the objects of a scene are parted.
-
-    Args:
-        thing: the object after the frame.
-        seen: the frame with its instances.
-        judge: recognises objects.
-        before: the object before the frame, already judged, with the number 0; None in a first
-            frame.
-
-    Returns:
-        The pixels of the object, (H, W) bool; None if they stay as they are.
-
-    Raises:
-        ObservationError: something hides the object.
-    """
-
-    def judged(tracks: Sequence[Track]) -> list[Track]:
-        results = judge([track.thing for track in tracks])
-        return [
-            replace(track, result=result)
-            for track, result in zip(tracks, results, strict=True)
-        ]
-
-    number = len(thing.sightings) - 1
-    sighting = thing.sightings[-1]
-    top = TableTop.of(seen, thing.object_frame.axes[2], sighting.plane)
-    bench = Bench(top, number, judged)
-    segments = seen.segments()
-    chosen = sighting.mask
-    if before is None or before.posed is None:
-        target = Track(0, thing, tuple(range(number + 1)))
-        others = [mask & ~chosen for mask in segments]
-        known = {}
-    else:
-        target, others = _followed(before, segments, bench)
-        known = {0: before}
-    own = target.mask_in(number)
-    assert own is not None
-    beside = [
-        mask for mask in others if touching(seen.frame, own, mask, NEAR_GAP, NEAR_STEP)
-    ]
-    if beside or len(seen.pieces_of(own)) > 1:
-        if target.result is None:
-            target = judged([target])[0]
-        if target.likeliest is None:
-            target = _more_familiar(target, bench)
-        elif beside or not bench.is_good(target):
-            tracks = part([target, *judged(_new_tracks(beside, bench))], bench, known)
-            target = _asked_for(tracks, thing, before, bench)
-    if before is None and thing.point is not None:
-        target = _without_others(target, thing.point, bench)
-
-    found = target.mask_in(number)
-    return None if found is chosen else found
-
-
-def _followed(
-    before: Track, segments: Sequence[Mask], bench: Bench
-) -> tuple[Track, list[Mask]]:
-    """Return a named object with its pixels in a frame, and the masks of everything else.
-
-    Raises:
-        ObservationError: something hides the object.
-    """
-    own, others = assign(segments, [before], bench.top)
-    if own:
-        return before.with_mask(bench.number, own[0], bench.top), others
-    tracks = taken_over([before, *_new_tracks(others, bench)], [bench])
-    target = next((track for track in tracks if track.number == 0), before)
-    if target.mask_in(bench.number) is None:
-        raise ObservationError(NO_INSTANCE.format(where="of the object known so far"))
-    masks = [one.mask_in(bench.number) for one in tracks if one.number != 0]
-    return target, [mask for mask in masks if mask is not None]
-
-
-def _new_tracks(masks: Sequence[Mask], bench: Bench) -> list[Track]:
-    """Create objects from those masks, (H, W) bool, that show enough of one."""
-    found = []
-    for mask in masks:
-        with suppress(ObservationError):
-            found.append(new_track(mask, bench))
-    return found
-
-
-def _more_familiar(target: Track, bench: Bench) -> Track:
-    """Return an object of a class that is suspiciously novel with all that touches it, if less so.
-
-    No scan tells where an object of a class ends.
-    """
-    assert target.result is not None
-    mask = target.mask_in(bench.number)
-    if mask is None or target.result.familiarity >= 1:
-        return target
-    whole = with_neighbours(mask, bench.top.seen)
-    with suppress(ObservationError):
-        other = bench.judge([target.with_mask(bench.number, whole, bench.top)])[0]
-        assert other.result is not None
-        if other.result.familiarity > target.result.familiarity:
-            return other
-    return target
-
-
-def _without_others(target: Track, point: Float, bench: Bench) -> Track:
-    """Return the part of an object that shows a point, if its scan explains only the other parts.
-
-    Args:
-        target: the object.
-        point: on the object that is asked for, (3,), world, metres.
-        bench: the frame.
-
-    Raises:
-        ObservationError: the segmentation does not part what the point is on.
-    """
-    top = bench.top
-    mask = target.mask_in(bench.number)
-    assert mask is not None
-    at, off = points_in(point[None], top.frame)
-    high = above_plane(top.frame, top.under(mask), top.noise)
-    if not (high[at] & (np.abs(off) < STEP_BEHIND)).any():
-        return target
-    if target.result is None:
-        if mask[at].all():
-            return target
-        [target] = bench.judge([target])
-    rendered = bench.render(target)
-    if rendered is None or rendered.around(mask.shape)[at].all():
-        return target
-    shown = [mask, *(one for one in top.seen.masks if one[at].any())]
-    rests = np.any(shown, axis=0) & high & ~rendered.around(mask.shape)
-    for rest in top.seen.pieces_of(rests):
-        if rest[at].any():
-            return target.with_mask(bench.number, rest, top)
-    raise ObservationError(NO_INSTANCE.format(where="of its own at the point"))
-
-
-def _asked_for(
-    tracks: Sequence[Track],
-    thing: ObservedObject,
-    before: Track | None,
-    bench: Bench,
-) -> Track:
-    """Return which of the parted objects is the one that a session asks for."""
-    if before is not None and before.posed is not None:
-        return next(track for track in tracks if track.number == before.number)
-    masks = [track.mask_in(bench.number) for track in tracks]
-    every = [mask for mask in masks if mask is not None]
-    place = None if before is None else before.thing.object_frame
-    chosen = choose_instance(bench.top.seen.parted(every), thing.point, place)
-    row = next(row for row, mask in enumerate(masks) if mask is chosen)
-    return tracks[row]
 
 
 def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
@@ -712,6 +551,23 @@ def new_track(mask: Mask, bench: Bench) -> Track:
     top = bench.top
     up = None if top.frame.pose is None else top.up
     return Track(-1, ObservedObject(up), ()).with_mask(bench.number, mask, top)
+
+
+def new_tracks(masks: Sequence[Mask], bench: Bench) -> list[Track]:
+    """Create objects that no earlier frame showed.
+
+    Args:
+        masks: pixels of each in the frame, (H, W) bool.
+        bench: the frame.
+
+    Returns:
+        Those that are visible enough.
+    """
+    found = []
+    for mask in masks:
+        with suppress(ObservationError):
+            found.append(new_track(mask, bench))
+    return found
 
 
 def _better(

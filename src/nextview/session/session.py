@@ -47,7 +47,6 @@ from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.judging import CORES, Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
-from nextview.session.parting import parted_from_neighbours
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
     Reach,
@@ -59,6 +58,7 @@ from nextview.session.reach import (
 )
 from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
+from nextview.session.target import parted_from_neighbours
 from nextview.session.tracks import Track
 from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
@@ -703,7 +703,7 @@ class Session:
             raise
 
     def _parted(self, object: ObservedObject, seen: SegmentedFrame) -> Mask | None:
-        """Part the object from its neighbours, see ``session.parting.parted_from_neighbours``."""
+        """Part the object from its neighbours, see ``session.target.parted_from_neighbours``."""
         judge = Judge(self.models, self.sphere, self.stopping, self.unknown, CORES)
         before = None
         if self.views and self.object is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -177,6 +177,24 @@ class Track:
             [frame for frame, _ in kept],
             top.up,
         )
+
+
+def judged(
+    tracks: Sequence[Track],
+    judge: Callable[[Sequence[ObservedObject]], list[Recognition]],
+) -> list[Track]:
+    """Recognise objects from all of their views.
+
+    Args:
+        tracks: the objects.
+        judge: such as a ``session.judging.Judge``.
+
+    Returns:
+        The same with their results.
+    """
+    results = judge([track.thing for track in tracks])
+    pairs = zip(tracks, results, strict=True)
+    return [replace(track, result=result) for track, result in pairs]
 
 
 @dataclass(frozen=True, eq=False)
