@@ -64,17 +64,13 @@ def parted_from_neighbours(
         known = {0: before}
     own = target.mask_in(number)
     assert own is not None
-    beside = [
-        mask for mask in others if touching(seen.frame, own, mask, NEAR_GAP, NEAR_STEP)
-    ]
-    if beside or len(seen.pieces_of(own)) > 1:
+    if _near(own, others, bench) or len(seen.pieces_of(own)) > 1:
         if target.result is None:
             [target] = bench.judge([target])
         if target.likeliest is None:
             target = _more_familiar(target, bench)
-        elif beside or not bench.is_good(target):
-            others_judged = bench.judge(new_tracks(beside, bench))
-            tracks = part([target, *others_judged], bench, known)
+        else:
+            tracks = part(_with_neighbours(target, others, bench), bench, known)
             target = _asked_for(tracks, thing, before, bench)
     if before is None and thing.point is not None:
         target = _without_others(target, thing.point, bench)
@@ -101,6 +97,35 @@ def _followed(
         raise ObservationError(NO_INSTANCE.format(where="of the object known so far"))
     masks = [one.mask_in(bench.number) for one in tracks if one.number != 0]
     return target, [mask for mask in masks if mask is not None]
+
+
+def _near(own: Mask, masks: Sequence[Mask], bench: Bench) -> list[Mask]:
+    """Return the masks, (H, W) bool, of what may touch an object."""
+    frame = bench.top.frame
+    return [mask for mask in masks if touching(frame, own, mask, NEAR_GAP, NEAR_STEP)]
+
+
+def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list[Track]:
+    """Return an object with those that touch it, and those that touch unexplained ones of these.
+
+    Args:
+        target: the object, already judged.
+        masks: everything else in the frame, (H, W) bool each.
+        bench: the frame.
+
+    Returns:
+        The objects, judged.
+    """
+    found = [target]
+    left = list(masks)
+    for track in found:  # it grows
+        own = track.mask_in(bench.number)
+        if own is None or (track is not target and bench.is_good(track)):
+            continue
+        beside = _near(own, left, bench)
+        left = [mask for mask in left if not any(mask is one for one in beside)]
+        found += bench.judge(new_tracks(beside, bench))
+    return found
 
 
 def _more_familiar(target: Track, bench: Bench) -> Track:
