@@ -129,7 +129,7 @@ def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list
 
 
 def _more_familiar(target: Track, bench: Bench) -> Track:
-    """Return an object of a class that is suspiciously novel with all that touches it, if less so.
+    """Return an object of a class with all that touches it, if that is more like a known one.
 
     No scan tells where an object of a class ends.
     """
@@ -140,8 +140,9 @@ def _more_familiar(target: Track, bench: Bench) -> Track:
     whole = with_neighbours(mask, bench.top.seen)
     with suppress(ObservationError):
         other = bench.judge([target.with_mask(bench.number, whole, bench.top)])[0]
-        assert other.result is not None
-        if other.result.familiarity > target.result.familiarity:
+        result = other.result
+        assert result is not None
+        if not result.unknown and result.familiarity > target.result.familiarity:
             return other
     return target
 
