@@ -37,10 +37,15 @@ class Instances:
         self.camera = camera
         self.joined: tuple[int, ...] = ()
         self.missed: tuple[int, ...] = ()
+        self.strips = 1
 
     def __call__(self, frame):
         owner = self.camera.owner
         labels = np.where(np.isin(owner, self.missed), -1, owner) + 1
+        columns = np.nonzero(owner == 0)[1]
+        edges = np.linspace(columns.min(), columns.max() + 1, self.strips + 1)
+        strip = np.digitize(np.arange(owner.shape[1]), edges[1:-1])
+        labels = np.where(labels == 1, 1 + 10 * strip, labels)
         pieces = labels.copy()
         labels[np.isin(owner, self.joined)] = 1 + min(self.joined, default=0)
         return Segmentation(
@@ -119,6 +124,22 @@ def test_another_object_is_not_taken_for_the_known_one_that_it_hides(
     with pytest.raises(ObservationError, match="nothing of the object known so far"):
         session.update(camera.frame(view(110)))
     assert len(session.views) == 1
+
+
+def test_a_thing_that_is_cut_into_seven_strips_is_found_whole(ycb, block_and_box):
+    block, _ = block_and_box
+    camera, instances = over(block)
+    instances.strips = 7
+    frame = camera.frame(view(60))
+    thing = ObservedObject(point=point_on(camera, frame, 0), segmentation=instances)
+    session = ycb.session(object=thing, distance=0.5)
+    session.update(frame)
+    scene = nextview.Scene(ycb, segmentation=instances)
+    scene.update(frame)
+    assert session.result.answer == "wood_block"
+    assert [one.name for one in scene.objects] == ["wood_block"]
+    whole = np.count_nonzero(camera.owner == 0)
+    assert np.count_nonzero(thing.sightings[-1].mask) > 0.9 * whole
 
 
 def test_a_point_on_a_thing_that_is_joined_with_a_large_one_finds_the_thing(
