@@ -220,7 +220,7 @@ def episode(job: Job) -> tuple[Room, Session, list[Look]]:
         try:
             session.update(handed)
             looks.append(Look(handed, shown, ""))
-        except ObservationError as error:
+        except (ObservationError, UsageError) as error:  # or larger than the distance
             looks.append(Look(handed, shown, str(error)))
             if not session.views:
                 break
