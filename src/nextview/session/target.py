@@ -68,7 +68,7 @@ def parted_from_neighbours(
         if target.result is None:
             [target] = bench.judge([target])
         if target.likeliest is None:
-            target = _more_familiar(target, thing, before, bench)
+            target = _more_familiar(target, bench)
         else:
             tracks = part(_with_neighbours(target, others, bench), bench, known)
             target = _asked_for(tracks, thing, before, bench)
@@ -128,45 +128,24 @@ def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list
     return found
 
 
-def _more_familiar(
-    target: Track, thing: ObservedObject, before: Track | None, bench: Bench
-) -> Track:
-    """Return an object of a class with all that touches it, or a piece of it, if that is known.
+def _more_familiar(target: Track, bench: Bench) -> Track:
+    """Return an object of a class with all that touches it, if that is more like a known one.
 
     No scan tells where an object of a class ends.
     """
-    assert target.result is not None
-    mask = target.mask_in(bench.number)
-    if mask is None or target.result.familiarity >= 1:
-        return target
-    seen = bench.top.seen
-    masks = [with_neighbours(mask, seen)]
-    pieces = seen.pieces_of(mask)
-    if len(pieces) > 1:
-        masks.append(_chosen(pieces, thing, before, seen))
-    others = []
-    for other in masks:
-        with suppress(ObservationError):
-            others.append(target.with_mask(bench.number, other, bench.top))
-    return max([target, *bench.judge(others)], key=_known)
-
-
-def _known(track: Track) -> float:
-    """Return how familiar an object is, 0 to 1; 0 for an unknown one."""
-    result = track.result
+    result, mask = target.result, target.mask_in(bench.number)
     assert result is not None
-    return 0.0 if result.unknown else result.familiarity
-
-
-def _chosen(
-    masks: Sequence[Mask],
-    thing: ObservedObject,
-    before: Track | None,
-    seen: SegmentedFrame,
-) -> Mask:
-    """Return which of some masks, (H, W) bool, a session asks for."""
-    place = None if before is None else before.thing.object_frame
-    return choose_instance(seen.parted(masks), thing.point, place)
+    assert mask is not None
+    if result.familiarity >= 1:
+        return target
+    whole = with_neighbours(mask, bench.top.seen)
+    with suppress(ObservationError):
+        [other] = bench.judge([target.with_mask(bench.number, whole, bench.top)])
+        found = other.result
+        assert found is not None
+        if not found.unknown and found.familiarity > result.familiarity:
+            return other
+    return target
 
 
 def _without_others(target: Track, point: Float, bench: Bench) -> Track:
@@ -213,6 +192,7 @@ def _asked_for(
         return next(track for track in tracks if track.number == before.number)
     masks = [track.mask_in(bench.number) for track in tracks]
     every = [mask for mask in masks if mask is not None]
-    chosen = _chosen(every, thing, before, bench.top.seen)
+    place = None if before is None else before.thing.object_frame
+    chosen = choose_instance(bench.top.seen.parted(every), thing.point, place)
     row = next(row for row, mask in enumerate(masks) if mask is chosen)
     return tracks[row]
