@@ -5,9 +5,11 @@ A test that alters a file of it copies the file first. And: the order of the fil
 without deadlines (slow is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
 """
 
+import importlib.util
 import os
 import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import kept_results
@@ -23,6 +25,7 @@ from hypothesis import settings
 from small_tables import meshes_of
 
 import nextview
+from nextview import runtime
 from nextview.benchmark import table_runs
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
@@ -122,6 +125,40 @@ def kept_things(shared):
             function = getattr(module, name)
             kept = kept_results.Kept(function, folder, given)
             patched.setattr(module, name, kept)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_networks():
+    """Prepare each file of a network once in a process, and run it in one thread: the processes of
+    pytest-xdist have the other cores. Its hash is compared whenever it is opened.
+    """
+    prepare = runtime.OnnxFile
+    prepared = {}
+
+    def kept(content, options, opened):
+        if opened not in prepared:
+            options.intra_op_num_threads = 1
+            prepared[opened] = prepare(content, options, opened)
+        return prepared[opened]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(runtime, "OnnxFile", kept)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_operators():
+    """Read the operators that torch exports once in a process: that takes half of an export."""
+    if importlib.util.find_spec("torch") is None:
+        yield
+        return
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            ONNXRegistry, "from_torchlib", cache(ONNXRegistry.from_torchlib)
+        )
         yield
 
 
