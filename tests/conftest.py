@@ -5,9 +5,9 @@ A test that alters a file of it copies the file first. And: the order of the fil
 without deadlines (slow is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
 """
 
-import importlib.util
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -150,15 +150,14 @@ def kept_networks():
 @pytest.fixture(scope="session", autouse=True)
 def kept_operators():
     """Read the operators that torch exports once in a process: that takes half of an export."""
-    if importlib.util.find_spec("torch") is None:
+    if "torch" not in sys.modules:  # no test file imports it
         yield
         return
     from torch.onnx._internal.exporter._registration import ONNXRegistry
 
+    kept = staticmethod(cache(ONNXRegistry.from_torchlib))
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(
-            ONNXRegistry, "from_torchlib", cache(ONNXRegistry.from_torchlib)
-        )
+        patched.setattr(ONNXRegistry, "from_torchlib", kept)
         yield
 
 
