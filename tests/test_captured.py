@@ -386,10 +386,14 @@ def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
         CapturedCamera(read_capture(tmp_path))
 
 
-@pytest.mark.parametrize("layout", WRITERS)
 @pytest.mark.parametrize(
-    ("count", "moved", "turned"),
-    [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)],
+    ("layout", "count", "moved", "turned"),
+    [
+        *((layout, 9, 0, 0) for layout in WRITERS),
+        ("7scenes", 9, 0.004, 0.5),
+        ("7scenes", 5, 0.004, 0.5),
+        ("7scenes", 2, 0, 0),
+    ],
 )
 def test_right_frames_pass(layout, count, moved, turned, tmp_path):
     write_frames(tmp_path, layout, *seen(count, moved, turned))
