@@ -27,6 +27,7 @@ from small_tables import meshes_of
 import nextview
 from nextview import runtime
 from nextview.benchmark import table_runs
+from nextview.data import room_drawing
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
@@ -121,6 +122,7 @@ def kept_things(shared):
             (learn_module, "show", kept_results.of_show),
             (small_tables, "resting_poses", kept_results.of_mesh),
             (table_runs, "resting_poses", kept_results.of_mesh),
+            (room_drawing, "resting_poses", kept_results.of_mesh),
         ):
             function = getattr(module, name)
             kept = kept_results.Kept(function, folder, given)
