@@ -7,7 +7,9 @@ without deadlines (slow is not wrong); tests that take minutes run where NEXTVIE
 
 import os
 import shutil
+import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import kept_results
@@ -23,7 +25,9 @@ from hypothesis import settings
 from small_tables import meshes_of
 
 import nextview
+from nextview import runtime
 from nextview.benchmark import table_runs
+from nextview.data import room_drawing
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
@@ -118,10 +122,44 @@ def kept_things(shared):
             (learn_module, "show", kept_results.of_show),
             (small_tables, "resting_poses", kept_results.of_mesh),
             (table_runs, "resting_poses", kept_results.of_mesh),
+            (room_drawing, "resting_poses", kept_results.of_mesh),
         ):
             function = getattr(module, name)
             kept = kept_results.Kept(function, folder, given)
             patched.setattr(module, name, kept)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_networks():
+    """Prepare each file of a network once in a process, and run it in one thread: the processes of
+    pytest-xdist have the other cores. Its hash is compared whenever it is opened.
+    """
+    prepare = runtime.OnnxFile
+    prepared = {}
+
+    def kept(content, options, opened):
+        if opened not in prepared:
+            options.intra_op_num_threads = 1
+            prepared[opened] = prepare(content, options, opened)
+        return prepared[opened]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(runtime, "OnnxFile", kept)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_operators():
+    """Read the operators that torch exports once in a process: that takes half of an export."""
+    if "torch" not in sys.modules:  # no test file imports it
+        yield
+        return
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+    kept = staticmethod(cache(ONNXRegistry.from_torchlib))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(ONNXRegistry, "from_torchlib", kept)
         yield
 
 

@@ -67,8 +67,14 @@ def test_right_poses_are_left_as_they_are(thing, views):
     assert all(not sighting.shift.any() for sighting in known.sightings)
 
 
-@pytest.mark.parametrize("thing", THINGS)
-@pytest.mark.parametrize("nudge", [(0.01, 0, 0), (-0.005, 0.009, 0), (0, -0.01, 0)])
+@pytest.mark.parametrize(
+    ("thing", "nudge"),
+    [
+        ("carton", (0.01, 0, 0)),
+        ("carton", (-0.005, 0.009, 0)),
+        ("mug", (0, -0.01, 0)),
+    ],
+)
 def test_a_nudged_object_is_put_back_and_warned_of(thing, nudge):
     mesh = THINGS[thing]
     views = (40, 20), (32, 50), (45, 85)  # so near that two sides are seen in each
@@ -166,10 +172,15 @@ def leaning(degrees, azimuth) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("degrees", "warned"),
-    [(0.0, False), (0.4, False), (2.0, True)],
+    ("degrees", "azimuth", "warned"),
+    [
+        (0.0, 0, False),
+        (0.4, 10, False),
+        (2.0, 10, True),
+        (2.0, 130, True),
+        (2.0, 250, True),
+    ],
 )
-@pytest.mark.parametrize("azimuth", [10, 130, 250])
 def test_a_table_that_leans_is_warned_of(degrees, warned, azimuth):
     turn = leaning(degrees, azimuth)
     scene = [mesh.copy().apply_transform(turn) for mesh in (TABLE, CARTON)]

@@ -305,8 +305,7 @@ def shipped(folder, policy) -> Gain:
     return make_policy(str(folder / "mine.json"), SPHERE)
 
 
-@pytest.mark.parametrize("frame", ["camera", "object"])
-@pytest.mark.parametrize("travel_weight", [0.0, 0.3])
+@pytest.mark.parametrize(("frame", "travel_weight"), [("camera", 0.3), ("object", 0.0)])
 def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, frame, tmp_path):
     policy = shipped(tmp_path, some_gain(travel_weight=travel_weight, frame=frame))
     state = some_state(episodes=300)
@@ -328,8 +327,9 @@ def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, frame, tmp_pa
     np.testing.assert_array_equal(mirror[going], flip[chosen][going])
 
 
-@pytest.mark.parametrize("scope", ["global", "local"])
-@pytest.mark.parametrize("inputs", [INPUTS, ("view", "place")])
+@pytest.mark.parametrize(
+    ("scope", "inputs"), [("global", INPUTS), ("local", ("view", "place"))]
+)
 def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     state, policy = (
         some_state(episodes=300),

@@ -181,24 +181,16 @@ def scaled(scans, unit, folder):
     return folder
 
 
-@pytest.fixture(scope="module")
-def in_metres(knobs, settings, shared):
-    """Runs of a policy that knows the truth: the pose counts in its choice, and is measured."""
-    known = replace(settings, policies=("random", "ceiling"), sensor="none")
-    folder = shared(
-        "knobs_in_metres",
-        lambda f: benchmark_things(knobs, f / "out", known, workers=0),
-    )
-    return known, folder / "out"
-
-
 @pytest.mark.long  # two benchmarks
 def test_scans_in_millimetres_are_named_and_found_as_those_in_metres(
     knobs,
-    in_metres,
+    settings,
     tmp_path,
 ):
-    settings, expected = in_metres
+    # one of the policies knows the truth: the pose counts in its choice, and is measured
+    settings = replace(settings, policies=("random", "ceiling"), sensor="none")
+    expected = tmp_path / "expected"
+    benchmark_things(knobs, expected, settings, workers=0)
     scans = scaled(knobs, "mm", tmp_path / "mm")
     out = tmp_path / "out"
     benchmark_things(scans, out, replace(settings, unit="mm"), workers=0)
@@ -476,11 +468,11 @@ def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
 def test_what_the_memory_says_counts_the_same_as_a_recogniser_of_ones_own(
     knobs,
     knobs_memory,
-    in_metres,
+    made,
+    settings,
     tmp_path,
     monkeypatch,
 ):
-    settings, expected = in_metres
     monkeypatch.setattr(AsRemembered, "memory", str(knobs_memory))
     own = replace(
         settings,
@@ -489,7 +481,9 @@ def test_what_the_memory_says_counts_the_same_as_a_recogniser_of_ones_own(
         policies=("random",),
     )
     benchmark_things(knobs, tmp_path / "out", own, workers=0)
-    for file in sorted((expected / "runs").iterdir()):
+    files = sorted((made / "runs").iterdir())
+    assert len(files) == 3
+    for file in files:
         then, now = (
             read_record(one, EpisodeRuns, "runs", ResultsError).runs["random"][0]
             for one in (file, tmp_path / "out" / "runs" / file.name)

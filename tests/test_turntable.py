@@ -20,7 +20,7 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
 
-RADIUS, N, SHAPE = 0.3, 24, (240, 320)
+RADIUS, N, SHAPE = 0.3, 12, (240, 320)
 # first pixel's corner at 0
 K = np.array([[262.5, 0, 160], [0, 262.5, 120], [0, 0, 1]])
 POSE = look_at_origin(np.radians(35), np.radians(20), 4.2 * RADIUS)

@@ -41,10 +41,11 @@ def test_flat_parts_that_fall_on_each_other_do_not_sink_into_the_bottom(examples
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_part_is_gripped_by_friction_and_dropped_into_the_box(
-    examples, cell, row, tmp_path
+    examples, cell, row, tmp_path, monkeypatch
 ):
     module = examples["bin_cell"]
-    film = examples["films"].BinFilm(cell, tmp_path / f"{row}.gif")
+    monkeypatch.setattr(cell, "watch", cell.watch)  # this test alone is filmed
+    film = examples["films"].BinFilm(cell, None if row else tmp_path / "0.gif")
     solid = examples["bin_parts"].bin_parts()[cell.names[row]].solid
     mesh = make_mesh(0.001 * solid[0], solid[1], cell.names[row], "m")
     pose = cell.pose_of(row)
@@ -65,8 +66,9 @@ def test_a_part_is_gripped_by_friction_and_dropped_into_the_box(
     assert cell.seconds - before < 20
     assert row in cell.inside(module.BOX, module.BOX_INSIDE)
     assert row not in picker.still_inside
-    film.save()
-    assert len(film.frames) > 10
+    if not row:
+        film.save()
+        assert len(film.frames) > 10
 
 
 def test_the_camera_sees_the_parts_where_they_are(cell, examples):

@@ -138,6 +138,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
         (p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None])
         for (p, q), r in zip(clouds, turns, strict=True)
     ]
+    trees = [cKDTree(points) for points, _ in turned]
     pairs = [
         (i, (i + gap) % n)
         for gap in sorted({max(1, n // TURN_PARTS), 1})
@@ -151,7 +152,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
             p, _ = turned[i]
             q, normals = turned[j]
             shift = (turns[i] - turns[j])[:, :2]
-            distance, nearest = cKDTree(q).query(p - shift @ axis)
+            distance, nearest = trees[j].query(p - shift @ axis)
             close = distance <= np.quantile(distance, CLOSEST_TURN)
             near = np.asarray(nearest)[close]
             rows.append(normals[near] @ shift)

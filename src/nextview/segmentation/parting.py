@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import heapq
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 from scipy import ndimage
@@ -69,11 +69,7 @@ def part(output: Float32, valid: Mask, doubt: float = 0.0) -> Index:
 
     graph = coo_array((np.ones(joined.sum()), pairs[:, joined]), shape=(size, size))
     component = connected_components(graph, directed=False)[1].astype(np.int64)
-    used, region = np.unique(
-        np.where(thing.ravel(), component + 1, 0), return_inverse=True
-    )
-    if used[0] != 0:  # every pixel is of a thing
-        region = region + 1
+    region = _renumbered(np.where(thing.ravel(), component + 1, 0), size + 1)
     label = _contracted(region[pairs], weight, int(region.max(initial=0)) + 1)
     return _without_scraps(label[region], pairs, weight).reshape(thing.shape)
 
@@ -106,7 +102,20 @@ def _without_scraps(labels: Index, pairs: Index, weight: Float32) -> Index:
     order = np.argsort(mean, kind="stable")  # the last one that is written stays
     owner = np.arange(len(sizes))
     owner[keys[order] // len(sizes)] = keys[order] % len(sizes)
-    return np.unique(owner[labels], return_inverse=True)[1] + (owner[labels].min() > 0)
+    return _renumbered(owner[labels], len(sizes))
+
+
+def _renumbered(labels: Index, count: int) -> Index:
+    """Number the labels that occur from 1 on, in their order; 0 stays 0.
+
+    Args:
+        labels: (P,).
+        count: more than the largest label.
+    """
+    occurs = np.zeros(count, bool)
+    occurs[labels] = True
+    occurs[0] = True
+    return (np.cumsum(occurs) - 1)[labels]
 
 
 def surface_of(output: Float32, valid: Mask) -> Mask:
@@ -179,37 +188,37 @@ def _contracted(
     apart = low != high
     keys, which = np.unique(low[apart] * count + high[apart], return_inverse=True)
     sums = np.bincount(which, weight[apart], len(keys))
+    ends = zip(*(one.tolist() for one in np.divmod(keys, count)), strict=True)
     beside: list[dict[int, float]] = [{} for _ in range(count)]
-    for key, value in zip(keys.tolist(), sums.tolist(), strict=True):
-        one, other = divmod(key, count)
+    heap = []
+    for (one, other), value in zip(ends, sums.tolist(), strict=True):
         beside[one][other] = value
         beside[other][one] = value
+        if value > 0:
+            heap.append((-value, one, other))
 
     owner = np.arange(count)
-    heap = [
-        (-value, one, other)
-        for one in range(count)
-        for other, value in beside[one].items()
-        if one < other and value > 0
-    ]
-    heapq.heapify(heap)
+    heapify(heap)
     while heap:
-        value, one, other = heapq.heappop(heap)
+        value, one, other = heappop(heap)
         if beside[one].get(other) != -value:
             continue  # one of the two was joined with a third since
         if len(beside[one]) < len(beside[other]):
             one, other = other, one
         owner[other] = one
-        for third, sum_there in beside[other].items():
-            del beside[third][other]
-            if third == one:
-                continue
-            total = beside[one].get(third, 0.0) + sum_there
-            beside[one][third] = total
-            beside[third][one] = total
-            if total > 0:
-                heapq.heappush(heap, (-total, one, third))
+        of_one = beside[one]
+        of_other = beside[other]
         beside[other] = {}
+        del of_one[other]
+        del of_other[one]
+        for third, sum_there in of_other.items():
+            of_third = beside[third]
+            del of_third[other]
+            total = of_one.get(third, 0.0) + sum_there
+            of_one[third] = total
+            of_third[one] = total
+            if total > 0:
+                heappush(heap, (-total, one, third))
 
     return _numbered(owner)
 
@@ -267,16 +276,19 @@ def sharpen(
     row = rows // factor
     column = columns // factor
     middle = (factor - 1) / 2
+    last_row, last_column = np.subtract(labels.shape, 1)
     for down in (-1, 0, 1):
+        r = np.clip(row + down, 0, last_row)
+        below = rows - r * factor - middle
         for right in (-1, 0, 1):
-            r = np.clip(row + down, 0, labels.shape[0] - 1)
-            c = np.clip(column + right, 0, labels.shape[1] - 1)
-            there = picture.depth[r, c]
-            aside = np.hypot(rows - r * factor - middle, columns - c * factor - middle)
+            c = np.clip(column + right, 0, last_column)
+            at = r * labels.shape[1] + c
+            there = picture.depth.take(at)
+            aside = np.hypot(below, columns - c * factor - middle)
             apart = np.abs(there - z) / z * EDGE_SHARPNESS + aside / factor
             apart = np.where(there > 0, apart, np.inf).astype(np.float32)
-            nearer = apart < best
+            nearer = np.flatnonzero(apart < best)
             best[nearer] = apart[nearer]
-            chosen[nearer] = labels[r, c][nearer]
+            chosen[nearer] = labels.take(at[nearer])
     fine[rows, columns] = chosen
     return fine

@@ -1,6 +1,7 @@
 """Error-free cameras that cast rays with Embree at a mesh, a target, or a scene."""
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,12 +94,7 @@ class SimulatedCamera:
         self._faces = mesh.faces
         self._scene = embree_scene([(vertices, mesh.faces)])
         (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
-        y, x = np.indices(self.shape, np.float32, sparse=True)
-        # rays have z = 1, so that Embree's distance is the depth
-        self._rays = np.ones((*self.shape, 3), np.float32)
-        self._rays[..., 0] = (x + np.float32(0.5 - cx)) / np.float32(fx)
-        self._rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
-        self._ray_length = np.linalg.norm(self._rays, axis=-1)
+        self._rays, self._ray_length = _rays_of(self.shape, fx, fy, cx, cy)
 
     def observe(self, pose: Float) -> Observation:
         """Render an observation from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
@@ -162,6 +158,24 @@ class SimulatedCamera:
             )
 
         return spans[0], spans[1]
+
+
+@lru_cache(maxsize=4)
+def _rays_of(
+    shape: tuple[int, int], fx: float, fy: float, cx: float, cy: float
+) -> tuple[Float32, Float32]:
+    """Return the rays of all pixels, (H, W, 3), and their lengths, (H, W), both read-only.
+
+    They have z = 1, so that Embree's distance is the depth. One camera looks at many objects.
+    """
+    y, x = np.indices(shape, np.float32, sparse=True)
+    rays = np.ones((*shape, 3), np.float32)
+    rays[..., 0] = (x + np.float32(0.5 - cx)) / np.float32(fx)
+    rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
+    lengths = np.linalg.norm(rays, axis=-1)
+    for array in (rays, lengths):
+        array.flags.writeable = False
+    return rays, lengths
 
 
 class OccludedCamera:
