@@ -95,7 +95,7 @@ def an_error(rng, millimetres=4.0, degrees=0.6):
     return error
 
 
-def moments_of(rng, error, count=4, cameras=(LEFT, RIGHT)):
+def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
     """Frames of several cameras; the stated poses of all but the first err."""
     names = ("left", "right", "top")
     found = []
