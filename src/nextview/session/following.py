@@ -1,4 +1,4 @@
-"""Track objects from frame to frame: assign pixels, detect moved objects and removed ones."""
+"""Assign the pixels of a frame to known objects."""
 
 from __future__ import annotations
 
