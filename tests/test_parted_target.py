@@ -68,9 +68,20 @@ def point_on(camera, frame, number):
     return points[away.argmin()]
 
 
-def share_of(thing, camera, number):
+def begun(system, camera, instances, number, degrees=60):
+    """A session with a first frame, asked for the object of the table at a point on it."""
+    frame = camera.frame(view(degrees))
+    thing = ObservedObject(
+        point=point_on(camera, frame, number), segmentation=instances
+    )
+    session = system.session(object=thing, distance=0.5)
+    session.update(frame)
+    return session
+
+
+def share_of(session, camera, number):
     """Share of an object's pixels in the last frame that show a thing of the table."""
-    mask = thing.sightings[-1].mask
+    mask = session.object.sightings[-1].mask
     return np.mean(camera.owner[mask] == number)
 
 
@@ -90,11 +101,8 @@ def test_a_stranger_is_not_named_as_the_taught_thing_that_it_touches(
     ycb, block_and_box
 ):
     camera, instances = over(*block_and_box)
-    frame = camera.frame(view(60))
-    stranger = ObservedObject(point=point_on(camera, frame, 1), segmentation=instances)
-    session = ycb.session(object=stranger, distance=0.5)
-    session.update(frame)
-    assert share_of(stranger, camera, 1) > 0.9
+    session = begun(ycb, camera, instances, 1)
+    assert share_of(session, camera, 1) > 0.9
     assert session.result.answer != "wood_block"
 
 
@@ -102,24 +110,18 @@ def test_a_known_object_keeps_its_pixels_where_a_later_frame_joins_it_with_anoth
     never_sure, block_and_box
 ):
     camera, instances = over(*block_and_box)
-    frame = camera.frame(view(60))
-    block = ObservedObject(point=point_on(camera, frame, 0), segmentation=instances)
-    session = never_sure.session(object=block, distance=0.5)
-    session.update(frame)
+    session = begun(never_sure, camera, instances, 0)
     assert session.result.answer == "wood_block"
     instances.joined = (0, 1)
     session.update(camera.frame(view(20)))
-    assert share_of(block, camera, 0) > 0.95
+    assert share_of(session, camera, 0) > 0.95
 
 
 def test_another_object_is_not_taken_for_the_known_one_that_it_hides(
     never_sure, block_and_box
 ):
     camera, instances = over(*block_and_box)
-    frame = camera.frame(view(60))
-    block = ObservedObject(point=point_on(camera, frame, 0), segmentation=instances)
-    session = never_sure.session(object=block, distance=0.5)
-    session.update(frame)
+    session = begun(never_sure, camera, instances, 0)
     instances.missed = (0,)
     with pytest.raises(ObservationError, match="nothing of the object known so far"):
         session.update(camera.frame(view(110)))
@@ -130,16 +132,14 @@ def test_a_thing_that_is_cut_into_seven_strips_is_found_whole(ycb, block_and_box
     block, _ = block_and_box
     camera, instances = over(block)
     instances.strips = 7
-    frame = camera.frame(view(60))
-    thing = ObservedObject(point=point_on(camera, frame, 0), segmentation=instances)
-    session = ycb.session(object=thing, distance=0.5)
-    session.update(frame)
+    session = begun(ycb, camera, instances, 0)
+    sighting = session.object.sightings[0]
     scene = nextview.Scene(ycb, segmentation=instances)
-    scene.update(frame)
+    scene.update(sighting.frame_as_given)
     assert session.result.answer == "wood_block"
     assert [one.name for one in scene.objects] == ["wood_block"]
     whole = np.count_nonzero(camera.owner == 0)
-    assert np.count_nonzero(thing.sightings[-1].mask) > 0.9 * whole
+    assert np.count_nonzero(sighting.mask) > 0.9 * whole
 
 
 def test_a_point_on_a_thing_that_is_joined_with_a_large_one_finds_the_thing(
@@ -148,9 +148,6 @@ def test_a_point_on_a_thing_that_is_joined_with_a_large_one_finds_the_thing(
     block, _ = block_and_box
     camera, instances = over(block, box((0.02, 0.03, 0.04), (0.065, 0.0)))
     instances.joined = (0, 1)
-    frame = camera.frame(view(20))
-    small = ObservedObject(point=point_on(camera, frame, 1), segmentation=instances)
-    session = ycb.session(object=small, distance=0.5)
-    session.update(frame)
-    assert share_of(small, camera, 1) > 0.8
+    session = begun(ycb, camera, instances, 1, degrees=20)
+    assert share_of(session, camera, 1) > 0.8
     assert session.result.answer != "wood_block"
