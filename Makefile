@@ -8,7 +8,7 @@ demo: .venv/installed  ## name everything on a bundled table, with the base inst
 	.venv/bin/nextview demo
 
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread; what it imports is compiled once
+	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # for two cores, as tests wait, too; one file is run by one process, of one thread; what it imports is compiled once
 
 # Folder with clones of the repositories in ros2/environment.py; those that are missing are cloned.
 ROS_SOURCES ?= .venv-ros/src
