@@ -106,7 +106,7 @@ def _near(own: Mask, masks: Sequence[Mask], bench: Bench) -> list[Mask]:
 
 
 def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list[Track]:
-    """Return an object with those that touch it, and those that touch unexplained ones of these.
+    """Recognise the neighbours of an object, and those of neighbours that no scan explains.
 
     Args:
         target: the object, already judged.
@@ -114,7 +114,7 @@ def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list
         bench: the frame.
 
     Returns:
-        The objects, judged.
+        The object and its neighbours, judged.
     """
     found = [target]
     left = list(masks)
@@ -129,7 +129,7 @@ def _with_neighbours(target: Track, masks: Sequence[Mask], bench: Bench) -> list
 
 
 def _more_familiar(target: Track, bench: Bench) -> Track:
-    """Return an object of a class with all that touches it, if that is more like a known one.
+    """Join an object with everything that touches it if that is more like a known class.
 
     No scan tells where an object of a class ends.
     """
@@ -149,7 +149,7 @@ def _more_familiar(target: Track, bench: Bench) -> Track:
 
 
 def _without_others(target: Track, point: Float, bench: Bench) -> Track:
-    """Return the part of an object that shows a point, if its scan explains only the other parts.
+    """Return the part of an object on which a point lies, unless its scan explains the point.
 
     Args:
         target: the object.
@@ -187,7 +187,7 @@ def _asked_for(
     before: Track | None,
     bench: Bench,
 ) -> Track:
-    """Return which of the parted objects is the one that a session asks for."""
+    """Return the object that the session asks for."""
     if before is not None and before.posed is not None:
         return next(track for track in tracks if track.number == before.number)
     masks = [track.mask_in(bench.number) for track in tracks]
