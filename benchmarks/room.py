@@ -220,7 +220,8 @@ def episode(job: Job) -> tuple[Room, Session, list[Look]]:
         try:
             session.update(handed)
             looks.append(Look(handed, shown, ""))
-        except (ObservationError, UsageError) as error:  # or larger than the distance
+        # UsageError: what was found is larger than the distance at which to stand
+        except (ObservationError, UsageError) as error:
             looks.append(Look(handed, shown, str(error)))
             if not session.views:
                 break

@@ -46,13 +46,24 @@ Answers = list[tuple[str, bool]]
 
 
 def point_on(frame: Frame, own: Mask) -> Float:
-    """The measured point of an object that is nearest to the median of all, (3,), metres."""
+    """The measured point of an object that is nearest to the median of all, (3,), metres.
+
+    Args:
+        frame: that shows the object.
+        own: its pixels, (H, W) bool.
+    """
     points = frame.positions(*np.nonzero(own & (frame.depth > 0)))
     return points[np.linalg.norm(points - np.median(points, 0), axis=1).argmin()]
 
 
 def by_a_session(system: System, frames: list[Frame], point: Float) -> Answers:
-    """What a session for the object at a point answers."""
+    """What a session for the object at a point answers.
+
+    Args:
+        system: with the taught things.
+        frames: in order.
+        point: on the object, (3,), metres.
+    """
     session = system.session(object=ObservedObject(point=point), distance=0.5)
     found: Answers = []
     for frame in frames:
@@ -83,7 +94,15 @@ def by_the_scene(looking: Looking) -> dict[int, tuple[str, bool]]:
 def both(
     asked: tuple[int, int], scans: Path, strangers: Path, models: str, frames: int
 ) -> dict[str, Any]:
-    """Look at a table by a scene and by sessions: a line of the output."""
+    """Look at a table by a scene and by sessions: a line of the output.
+
+    Args:
+        asked: seed and number of the table.
+        scans: folder of the scans that the memory knows, metres.
+        strangers: folder of other meshes.
+        models: memory of the things.
+        frames: of the table.
+    """
     rng = np.random.default_rng(asked)
     table = draw_table(meshes_in(scans), meshes_in(strangers), rng)
     camera = TableCamera(table, SENSORS["wrist"], np.random.default_rng([*asked, 1]))
@@ -93,7 +112,8 @@ def both(
     around = azimuth + np.pi / 2 * np.arange(frames)
     system, _ = opened_models(models, None)
     looking = Looking(camera, system)
-    taken, seconds = [], []
+    taken = []
+    seconds = []
     by_scene = []
     owner = np.zeros((0, 0), np.int64)
     for pose in poses_around(around, elevation, CAMERA_FROM_TABLE, TABLE_CENTRE):
@@ -115,7 +135,12 @@ def both(
 
 
 def summary(lines: list[dict[str, Any]], frames: int) -> str:
-    """Counts after each frame, for sessions and for scenes."""
+    """Counts after each frame, for sessions and for scenes.
+
+    Args:
+        lines: of the tables.
+        frames: of each table.
+    """
     objects = [one for line in lines for one in line["objects"]]
     known = [one for one in objects if one["thing"] != STRANGER]
     strangers = [one for one in objects if one["thing"] == STRANGER]

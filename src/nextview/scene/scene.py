@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, overload
@@ -52,7 +52,7 @@ from nextview.session.parting import (
     GOOD_FIT,
     Bench,
     merged,
-    new_track,
+    new_tracks,
     part,
     taken_over,
 )
@@ -379,6 +379,7 @@ class Scene:
             self._surroundings = Surroundings.in_frames(
                 tops, around, self._surroundings
             )
+
             self._views = candidates(
                 self.system,
                 tops,
@@ -635,10 +636,7 @@ class Scene:
             except ObservationError:  # too little of it is visible
                 hidden.append(track)
         of_new = verified[len(doubtful) :]
-        for mask, chosen in zip(new, of_new, strict=True):
-            if chosen:
-                with suppress(ObservationError):
-                    shown.append(new_track(mask, bench))
+        shown += new_tracks(list(compress(new, of_new)), bench)
 
         known = {track.number: track for track in there}
         shown = part(self._judged_if_new(shown), bench, known)

@@ -209,6 +209,7 @@ class ObservedObject:
         up = self._up(frame)
         segmented = self._segmented(frame, up)
         warnings = tuple(check_mistakes(segmented, known))
+
         pixels = self._pixels(segmented)
         after = self._with_pixels(pixels, segmented, up, warnings)
         if (
@@ -218,6 +219,7 @@ class ObservedObject:
             or after.sightings[-1].plane is None
         ):
             return after
+
         thing = copy(self)
         thing.state = after
         other = part(thing, segmented)

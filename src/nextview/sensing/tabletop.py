@@ -179,6 +179,7 @@ class TableTop:
                 if mask is not None
             ]
         ).reshape(-1, 2, 2)
+
         nearest = self.frame.depth[self.frame.depth > 0].min(initial=np.inf)
         focal = float(self.frame.intrinsics[[0, 1], [0, 1]].max())
         reach = max(2.0, gap * focal / nearest) + 1

@@ -46,7 +46,7 @@ NEAR_GAP = 0.02
 NEAR_STEP = (
     0.1  # metres between their depths there, at most: across the hollow of a bowl
 )
-MOST_GROUP = 5  # segments that touch and are tried as one object
+MOST_PIECES = 5  # into which an object is cut, at most
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
 # objects that are judged anew in a frame at most, those with the most pixels first
 MOST_TRIMMED = 2  # that were not known before the frame
@@ -500,7 +500,7 @@ def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
         found = [] if mask is None else bench.top.seen.pieces_of(mask)
-        if 1 < len(found) <= MOST_GROUP:
+        if 1 < len(found) <= MOST_PIECES:
             parts[row] = found
     return _better(tracks, parts, bench)
 

@@ -172,7 +172,7 @@ class Recognition:
 
     @property
     def familiarity(self) -> float:
-        """1 for an object that is not suspiciously novel; less, the more novel it is."""
+        """1 unless the object is suspiciously novel; then its p-value relative to that limit."""
         if self.novelty is None or not self.unknown_rate:
             return 1.0
         return min(1.0, self.novelty / (SUSPICIOUS * self.unknown_rate))

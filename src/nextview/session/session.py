@@ -39,10 +39,12 @@ from nextview.recognition.protocol import (
 )
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
+from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.plausibility import (
     check_last_view,
     check_observation,
 )
+from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.judging import CORES, Judge, one_blas_thread
@@ -66,8 +68,6 @@ from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
     from nextview.segmentation.instances import Segmenter
-    from nextview.sensing.observed_object import ObservedObject
-    from nextview.sensing.segmented_frame import SegmentedFrame
 
 FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres
@@ -176,7 +176,7 @@ class Session:
         self.sphere = sphere
         self._distance = as_distance(distance)
         self.object = (
-            _new_object(segmentation)
+            ObservedObject(segmentation=segmentation)
             if object is None and distance is not None
             else object
         )
@@ -533,6 +533,7 @@ class Session:
                 next_view=_next_of(step),
                 values=self._values(step),
             )
+
             self._episodes.keep_choice(step)
             self._reach = reach
             self.views[-1] = view
@@ -676,7 +677,7 @@ class Session:
             raise SessionError(
                 "this session has taken observations; begin another one for frames"
             )
-        object = self.object or _new_object(self.segmentation)
+        object = self.object or ObservedObject(segmentation=self.segmentation)
         if len(object.sightings) != self._before + len(self.views):
             raise SessionError(
                 "frames were added to this object outside of the session; begin another one"
@@ -865,6 +866,7 @@ class Session:
         """Return the views of some steps, without their choices of the next view."""
         directions = [self._snapped(direction_of(seen.pose)) for seen in observations]
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
+
         found = {}
         for k in which:
             step = steps[k]
@@ -1006,12 +1008,6 @@ def _half_diagonal(points: Float) -> float:
     if not len(points):
         return 0.0
     return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
-
-
-def _new_object(segmentation: Segmenter | None) -> ObservedObject:
-    from nextview.sensing.observed_object import ObservedObject
-
-    return ObservedObject(segmentation=segmentation)
 
 
 def _check_needs(policy: Policy, models: Models) -> None:

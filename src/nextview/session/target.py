@@ -133,7 +133,8 @@ def _more_familiar(target: Track, bench: Bench) -> Track:
 
     No scan tells where an object of a class ends.
     """
-    result, mask = target.result, target.mask_in(bench.number)
+    result = target.result
+    mask = target.mask_in(bench.number)
     assert result is not None
     assert mask is not None
     if result.familiarity >= 1:
@@ -165,7 +166,8 @@ def _without_others(target: Track, point: Float, bench: Bench) -> Track:
     at, off = points_in(point[None], top.frame)
     high = above_plane(top.frame, top.under(mask), top.noise)
     if not (high[at] & (np.abs(off) < STEP_BEHIND)).any():
-        return target
+        return target  # the frame does not show the point, or it is on the support
+
     if target.result is None:
         if mask[at].all():
             return target
@@ -173,6 +175,7 @@ def _without_others(target: Track, point: Float, bench: Bench) -> Track:
     rendered = bench.render(target)
     if rendered is None or rendered.around(mask.shape)[at].all():
         return target
+
     shown = [mask, *(one for one in top.seen.masks if one[at].any())]
     rests = np.any(shown, axis=0) & high & ~rendered.around(mask.shape)
     for rest in top.seen.pieces_of(rests):
