@@ -414,7 +414,7 @@ def test_without_a_terminal_progress_is_printed_as_lines(
 
     def steps():
         nonlocal seconds
-        assert capsys.readouterr().err == "rendering v.zarr: begun, 100 in all\n"
+        assert capsys.readouterr().err == "rendering v.zarr: 100 to do\n"
         while seconds < 100:
             seconds += 1
             yield seconds

@@ -88,7 +88,8 @@ def test_the_listing_reports_used_and_unused_files(tmp_path):
     )
     (root / "bed/gone.off").symlink_to(root / "nowhere.off")
     assert scan_dataset(root).summary() == (
-        "3 objects: 1 in CLASS/train/MESH, 1 in CLASS/val/MESH, 1 in CLASS/.../MESH; left out: "
+        "3 objects: 1 mesh as CLASS/train/MESH, 1 mesh as CLASS/val/MESH, 1 mesh as"
+        " CLASS/.../MESH; left out: "
         ".trash: hidden; bed/gone.off: a link that leads nowhere; loose.off: not in a class folder"
     )
 
@@ -264,7 +265,7 @@ def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
     summary = scan_dataset(meshes(tmp_path, "Train/a.ply", "plane/b.ply")).summary()
     assert (
         summary
-        == "2 objects: 2 in CLASS/MESH; the folder Train is taken for a class, not for a split"
+        == "2 objects: 2 meshes as CLASS/MESH; the folder Train is taken for a class, not for a split"
     )
 
 

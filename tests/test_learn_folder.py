@@ -77,7 +77,7 @@ def test_frames_meshes_and_classes_are_found_together(tmp_path):
         "b.dae: of a format that is not read; export it as .off, .obj, .ply, .stl, .glb",
     }
     assert found.notes == (
-        f"in {tmp_path}: 1 in MESH, 1 in CLASS/MESH, 1 folder of depth frames",
+        f"in {tmp_path}: 1 mesh, 1 mesh as CLASS/MESH, 1 folder of depth frames",
     )
 
 
@@ -187,7 +187,7 @@ def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
         main(["learn", folder, out, "--workers", "0", *again])
         assert read_card(Path(out) / "memory.json").classes == ("box", "tin")
     printed = " ".join("".join(capsys.readouterr()).split())
-    assert f"in {folder}: 2 in MESH" in printed
+    assert f"in {folder}: 2 meshes" in printed
     assert ("mine: is where the result goes" in printed) == (out != ".")
 
 
@@ -199,7 +199,7 @@ def test_from_python_it_tells_how_far_it_is_and_how_a_memory_is_replaced(
     root = scans_in(tmp_path / "things", "box.ply", "tin.ply")
     out = tmp_path / "mine"
     learn(root, out, workers=0)
-    assert "things: begun, 2 in all\n" in capsys.readouterr().err
+    assert "teaching things: 2 to do\n" in capsys.readouterr().err
     with pytest.raises(UsageError, match=r"overwrite=True .*--overwrite"):
         learn(root, out, workers=0)
     assert capsys.readouterr().err == ""

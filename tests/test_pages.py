@@ -372,4 +372,4 @@ def test_shots_with_poses_in_one_folder_form_one_scene(recorded, capsys):
     main(["look", "table", "--frames", "2"])
     shown = " ".join(capsys.readouterr().err.split())
     assert "2 of the 3 frames are looked at, evenly spread; --frames 3 for all" in shown
-    assert "frames: begun, 2 in all" in shown
+    assert "looking at frames: 2 to do" in shown

@@ -515,7 +515,7 @@ def test_a_bag_is_a_thing_to_be_taught_beside_scans(views, tmp_path):
     found = find_things(things_folder(tmp_path / "things", views))
     assert [thing.name for thing in found.things] == ["brick", "seat"]
     assert not found.left_out
-    assert "1 in MESH, 1 ROS 2 bag" in found.notes[0]
+    assert "1 mesh, 1 ROS 2 bag" in found.notes[0]
     arrays = teach(found.things[1].path, "seat", TeachingOptions())
     assert arrays["radii"][0] == pytest.approx(meshed(chair()).radius, rel=0.1)
     assert len(arrays["vertices"]) > 100

@@ -6,17 +6,13 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_type_hints
 
-import docstring_parser
 import tyro
 
 from nextview.cli.commands import Command
+from nextview.cli.option_names import GROUPS, HELP, check_options
+from nextview.cli.option_values import CONFIG, VALUES, described, explained
+from nextview.cli.words import EXAMPLES
 
-CONFIG = (
-    tyro.conf.OmitArgPrefixes,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.PositionalMetavarFromFieldName,
-    tyro.conf.PositionalRequiredArgs,
-)
 PRESET = "recipe that sets the defaults of the recipe options"
 
 
@@ -44,7 +40,21 @@ def call(
         The return value of the function, and its arguments by name.
     """
     run, called = entry(command, arguments, track)
-    returned = tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG)
+    helped = not HELP.isdisjoint(arguments)
+    if not helped:
+        check_options(f"nextview {name}", run, arguments)
+    try:
+        returned = tyro.cli(
+            run,
+            prog=f"nextview {name}",
+            args=arguments,
+            config=CONFIG,
+            registry=VALUES,
+        )
+    except SystemExit:
+        if helped:
+            print(f"\nexample: nextview {EXAMPLES[name]}")
+        raise
     return returned, called
 
 
@@ -69,12 +79,14 @@ def entry(
     function = find(command.function)
     signature = inspect.signature(function)
     hints = get_type_hints(function, include_extras=True)
-    about, helps = _described(function)
+    about, helps = described(function)
     parameters = []
     for parameter in signature.parameters.values():
         kind = hints[parameter.name]
         if parameter.name in helps:
-            kind = Annotated[kind, tyro.conf.arg(help=helps[parameter.name])]
+            kind = explained(kind, helps[parameter.name])
+        if parameter.name in GROUPS:
+            kind = Annotated[kind, tyro.conf.arg(name=GROUPS[parameter.name])]
         if parameter.name != "track":
             parameters.append(parameter.replace(annotation=kind))
     if command.thesis:
@@ -101,26 +113,3 @@ def entry(
     }
     run.__doc__ = about
     return run, called
-
-
-def _described(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
-    """Read the docstring of a function.
-
-    Args:
-        function: with a docstring in Google style.
-
-    Returns:
-        The description, with each paragraph on one line because tyro keeps line breaks; and the
-        help of each parameter in the ``Args`` section.
-    """
-    parsed = docstring_parser.parse(
-        function.__doc__ or "",
-        docstring_parser.DocstringStyle.GOOGLE,
-    )
-    text = (parsed.description or "").replace("``", "")
-    about = re.sub(r"(?<=\S)\n *(?=\S)", " ", text)
-
-    helps = {}
-    for parameter in parsed.params:
-        helps[parameter.arg_name] = " ".join((parameter.description or "").split())
-    return about, helps

@@ -65,7 +65,7 @@ def _bundled_scene() -> Scene:
             scene.update(captured.read(masked=False))
             yield done
 
-    track(each(), len(capture.frames), "frames")
+    track(each(), len(capture.frames), "looking at frames")
     return scene
 
 

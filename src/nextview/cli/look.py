@@ -219,7 +219,7 @@ def _look_at_frames(
                 recorder(scene)
             yield done
 
-    track(each(), len(few), "frames")
+    track(each(), len(few), "looking at frames")
     return looks
 
 

@@ -27,9 +27,11 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _run(arguments: list[str]) -> None:
-    if arguments == ["--version"]:
+    if arguments in (["--version"], ["version"]):
         return print(f"nextview {__version__}")
 
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     words = list(takewhile(lambda word: not word.startswith("-"), arguments[:2]))
     for count in range(len(words), 0, -1):
         if (name := " ".join(words[:count])) in COMMANDS:
@@ -41,23 +43,35 @@ def _run(arguments: list[str]) -> None:
         for name, command in COMMANDS.items()
         if f"{name} ".startswith(f"{group} ".lstrip())
     }
-
     if len(words) == 2 or not listed:
-        name = " ".join(words) if listed else group
-        if listed and not did_you_mean(words[1], " ".join(listed).split()):
-            there = ", ".join(listed)
-            raise UsageError(f"there is no command {name!r}; there are {there}")
-        groups = [name.split()[0] for name in COMMANDS]
-        near = did_you_mean(name, listed or [*COMMANDS, *groups])
-        raise UsageError(
-            f"there is no command {name!r}{near or '; nextview --help lists all'}"
-        )
+        raise UsageError(_no_command(words, list(listed)))
 
     usage = f"nextview {group} COMMAND".replace("  ", " ")
     print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
+    width = max(map(len, listed))
     for name, line in listed.items():
-        print(f"  {name:18}  {line}")
+        print(f"  {name:{width}}  {line}")
     print(f"\n{usage} --help explains a command; --version prints the version.")
+
+
+def _no_command(words: list[str], group: list[str]) -> str:
+    """Say that there is no such command, and which one may be meant.
+
+    Args:
+        words: first words of the command line.
+        group: commands that begin with the first word.
+    """
+    from nextview.cli.words import suggested_commands
+
+    if not group:
+        near = suggested_commands(words[0]) or "; nextview --help lists all"
+        return f"there is no command {words[0]!r}{near}"
+
+    name = " ".join(words)
+    if did_you_mean(words[1], " ".join(group).split()):
+        return f"there is no command {name!r}{did_you_mean(name, group)}"
+    near = suggested_commands(words[0])
+    return f"there is no command {name!r}; there are {', '.join(group)}{near}"
 
 
 def _call(name: str, arguments: list[str]) -> None:

@@ -135,9 +135,12 @@ class Listing:
         return f"{text}; left out: {'; '.join(phrases)}" if phrases else text
 
     def layout(self) -> str:
-        """Describe the number of objects in each layout."""
-        layouts = Counter(entry.layout for entry in self.entries)
-        return ", ".join(f"{count} in {layout}" for layout, count in layouts.items())
+        """Describe the number of objects in each layout, such as "5 meshes as CLASS/MESH"."""
+        phrases = []
+        for layout, count in Counter(entry.layout for entry in self.entries).items():
+            meshes = "1 mesh" if count == 1 else f"{count} meshes"
+            phrases.append(meshes if layout == "MESH" else f"{meshes} as {layout}")
+        return ", ".join(phrases)
 
 
 def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:

@@ -34,7 +34,7 @@ def in_lines(done: Iterable[int], total: int, what: str, /) -> None:
         total: final count.
         what: name of the work.
     """
-    print(f"{what}: begun, {total} in all", file=sys.stderr, flush=True)
+    print(f"{what}: {total} to do", file=sys.stderr, flush=True)
     begun = last = time.monotonic()
     wait = FIRST_WAIT
     for n in done:

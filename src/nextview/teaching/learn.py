@@ -317,7 +317,7 @@ def learn_things(
 
         of_classes = _of_classes([*found.things, *(source for source, _ in taught)])
         work = Work(how, part, workers, scheduler, track, of_classes)
-        track(_teach(found.things, work, taught, left_out), len(found.things), "things")
+        track(_teach(found.things, work, taught, left_out), len(found.things), "teaching things")
         if not taught and nothing_new:
             raise UsageError(
                 f"{out}: no thing would be left; delete the folder instead"
@@ -462,7 +462,7 @@ def _with_features_where_they_count(
         if not arrays["views"].shape[-1]
     ]
     render = partial(_features_again, work.how)
-    results = _all_done(render, missing, work, "things rendered")
+    results = _all_done(render, missing, work, "rendering things")
     found = {row: arrays for (row, _, _), arrays in results}
     return [
         (source, arrays | found.get(row, {}))
@@ -678,7 +678,7 @@ def _shown(
     """
     items = to_be_shown(things, known, rng)
     show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
-    found = dict(_all_done(show_one, items, work, "things shown"))
+    found = dict(_all_done(show_one, items, work, "testing simulated views"))
 
     shown = [one for item in sorted(found) for one in found[item]]
     unseen = {thing for thing, _ in items} - {one.thing for one in shown}
@@ -702,7 +702,7 @@ def _all_done(
         results = each(function, items, work.workers, work.scheduler)
         for count, (item, result) in enumerate(results, 1):
             if isinstance(result, WorkerDied):
-                raise DatasetError(f"not all {what} ({result})")
+                raise DatasetError(f"{what} did not end ({result})")
             found.append((item, result))
             yield count
 

@@ -1,0 +1,63 @@
+"""The names of the options of a command."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from itertools import takewhile
+from typing import Any
+
+from nextview.checks import did_you_mean
+from nextview.errors import UsageError
+
+HELP = frozenset(("-h", "--help"))
+GROUPS = {  # title of a group of options in the help, by the parameter that holds it
+    "how": "further",
+    "looking": "recognition",
+    "settings": "run",
+    "source": "input",
+}
+
+
+def check_options(
+    command: str,
+    function: Callable[..., Any],
+    arguments: Sequence[str],
+) -> None:
+    """Check that a command has the options of a command line.
+
+    Args:
+        command: as it is typed.
+        function: its function, see ``entry``.
+        arguments: of the command line.
+
+    Raises:
+        UsageError: there is no such option; the message names the one that is meant.
+    """
+    known = option_names(function)
+    for word in takewhile(lambda each: each != "--", arguments):
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--") and option not in known | HELP:
+            near = did_you_mean(option, sorted(known))
+            near = near or f"; {command} --help lists those that there are"
+            raise UsageError(f"{command} has no option {option}{near}")
+
+
+def option_names(function: Callable[..., Any]) -> set[str]:
+    """Return the names of the options of a command, as they are typed.
+
+    Args:
+        function: of the command, see ``entry``.
+    """
+    defaults: dict[str, Any] = {}
+    for parameter in inspect.signature(function).parameters.values():
+        default = parameter.default
+        if is_dataclass(default):
+            defaults |= {
+                one.name: getattr(default, one.name) for one in fields(default)
+            }
+        elif parameter.kind is not parameter.POSITIONAL_ONLY:
+            defaults[parameter.name] = default
+    return {
+        f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
+        for name, default in defaults.items()
+    }
