@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import nextview
-from nextview.files import OVERWRITE
+from nextview.errors import option, shell_words
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/error_messages.md").read_text(encoding="utf-8")
@@ -19,7 +19,7 @@ SENTENCES = re.findall(r"^\| `([^`]+)` \|", PAGE, re.M)
 def texts() -> str:
     """All texts of the source and of the ROS node, a line each.
 
-    What an f-string puts in is left out, except for ``OVERWRITE``.
+    What an f-string puts in is left out, except for options, which are named as in a shell.
     """
     found = []
     for top in ("src/nextview", "ros2/nextview_ros/nextview_ros"):
@@ -36,8 +36,11 @@ def _part(value: ast.expr) -> str:
     if isinstance(value, ast.Constant):
         return str(value.value)
     inserted = value.value if isinstance(value, ast.FormattedValue) else None
-    is_overwrite = isinstance(inserted, ast.Name) and inserted.id == "OVERWRITE"
-    return OVERWRITE if is_overwrite else "\n"
+    if not isinstance(inserted, ast.Call) or ast.unparse(inserted.func) != "option":
+        return "\n"
+    given = [a.value if isinstance(a, ast.Constant) else "\n" for a in inserted.args]
+    with shell_words():
+        return option(*given)
 
 
 @pytest.mark.parametrize("sentence", SENTENCES)

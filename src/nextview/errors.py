@@ -4,9 +4,12 @@ Each message is one sentence: what is wrong, in which file, and what to do. The 
 it and exits with status 2. Any other exception is a bug and keeps its traceback.
 """
 
+import os
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # What the readers of NumPy, zarr, Pillow and others raise for a damaged file, which may lead them
 # anywhere. A package that is missing, memory that runs out, and a bug in this package's own names
@@ -25,6 +28,42 @@ DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
+
+
+# an environment variable, which worker processes inherit: a command of the shell is running
+IN_SHELL = "NEXTVIEW_IN_SHELL"
+
+
+@contextmanager
+def shell_words() -> Iterator[None]:
+    """Name options in messages as they are typed in a shell; see ``option``."""
+    before = os.environ.get(IN_SHELL)
+    os.environ[IN_SHELL] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(IN_SHELL)
+        if before is not None:
+            os.environ[IN_SHELL] = before
+
+
+def option(name: str, value: str | bool | None = None) -> str:
+    """Name an option for a message: --max-faces in a shell, max_faces in Python.
+
+    >>> option("max_faces"), option("unit", "mm"), option("overwrite", True)
+    ('max_faces', "unit='mm'", 'overwrite=True')
+    >>> with shell_words():
+    ...     option("max_faces"), option("unit", "mm"), option("overwrite", True)
+    ('--max-faces', '--unit mm', '--overwrite')
+
+    Args:
+        name: of the argument in Python.
+        value: that is recommended; None to name the option alone.
+    """
+    if IN_SHELL not in os.environ:
+        return name if value is None else f"{name}={value!r}"
+    typed = f"--{name.replace('_', '-')}"
+    return typed if value is None or value is True else f"{typed} {value}"
 
 
 def printable(text: str) -> str:

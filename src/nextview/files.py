@@ -25,10 +25,14 @@ import msgspec
 import numpy as np
 
 from nextview.checks import one_line
-from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
+from nextview.errors import (
+    DatasetError,
+    ModelError,
+    NextviewError,
+    ResultsError,
+    option,
+)
 
-# how an output that exists is replaced: by a call from Python, and in a shell
-OVERWRITE = "overwrite=True (in a shell: --overwrite)"
 T = TypeVar("T")
 # a field of a record: a hash in hexadecimal digits
 HashText = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
@@ -66,7 +70,7 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
             raise ResultsError(f"{path}: is a {kind}; give another name")
         if not overwrite and not (folder and not any(path.iterdir())):
             raise ResultsError(
-                f"{path}: exists; give another name, or {OVERWRITE} to replace it"
+                f"{path}: exists; give another name, or {option('overwrite', True)} to replace it"
             )
 
     above = next(p for p in path.absolute().parents if p.exists())

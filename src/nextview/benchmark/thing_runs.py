@@ -29,7 +29,7 @@ from nextview.benchmark.thing_policies import (
     policies_of,
 )
 from nextview.checks import number, whole
-from nextview.errors import DatasetError, PolicyError, UsageError
+from nextview.errors import DatasetError, PolicyError, UsageError, option
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
 from nextview.recognition.model_card import find_models
@@ -299,8 +299,8 @@ def scan_of(
     for other in UNITS:
         if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
             raise DatasetError(
-                f"{file}: is not in {unit}, by what was taught of it; give --unit {other}"
-                f" (unit={other!r})"
+                f"{file}: is not in {unit}, by what was taught of it; give"
+                f" {option('unit', other)}"
             )
     raise DatasetError(
         f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"

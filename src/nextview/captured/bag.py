@@ -39,6 +39,7 @@ from nextview.errors import (
     NextviewError,
     ObservationError,
     UsageError,
+    option,
 )
 from nextview.files import regular_file
 from nextview.types import Float, Float32
@@ -139,8 +140,8 @@ def read_bag(
         notes.append(STANDING_CAMERA)
     elif at is not None:
         raise UsageError(
-            f"{path}: tf moves its camera, so all images are used; --at is for one that stands"
-            " still"
+            f"{path}: tf moves its camera, so all images are used; {option('at')} is for one that"
+            " stands still"
         )
     if intrinsics is None:
         intrinsics, source = _intrinsics(bag, topic.topic, first)
@@ -483,8 +484,8 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
     if len(deep) > 1:
         names = _listed([each.topic for each in deep])
         raise DatasetError(
-            f"{bag.path}: holds depth images on {len(deep)} topics; name one with --depth-topic:"
-            f" {names}"
+            f"{bag.path}: holds depth images on {len(deep)} topics; name one with"
+            f" {option('depth_topic')}: {names}"
         )
     return deep[0]
 
@@ -657,7 +658,7 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
         there = _listed([each.topic for each in infos]) if infos else "none"
         raise DatasetError(
             f"{bag.path}: the camera_info of {topic} is missing (there is {there}): give"
-            " --intrinsics FX FY CX CY, or a file with them"
+            f" {option('intrinsics')} FX FY CX CY, or a file with them"
         )
 
     if (info.width, info.height) != image.size:

@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike
 from nextview.captured.check import check_capture, refuse_many
 from nextview.captured.folders import read_box
 from nextview.captured.frames import Capture, CapturedFrame
-from nextview.errors import DatasetError, NoViewLeftError, ObservationError, UsageError
+from nextview.errors import (
+    DatasetError,
+    NoViewLeftError,
+    ObservationError,
+    UsageError,
+    option,
+)
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame
@@ -282,7 +288,7 @@ def camera_of(
         if upwards is None:
             raise UsageError(
                 f"{capture.folder}: a box is upright, and in this layout nothing tells where up is:"
-                " give --up"
+                f" give {option('up')}"
             )
         around = Box(np.array(box[:3]), np.array(box[3:]), upright_axes(upwards))
     return CapturedCamera(capture, vertical, point, around, denoise, life_size)

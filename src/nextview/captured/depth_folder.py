@@ -25,7 +25,7 @@ from nextview.captured.frames import (
     rigid,
 )
 from nextview.checks import did_you_mean
-from nextview.errors import DatasetError, ObservationError
+from nextview.errors import DatasetError, ObservationError, option
 from nextview.files import read_record, regular_file
 from nextview.types import Float
 
@@ -50,10 +50,6 @@ COLOUR_FOLDERS = ("color", "colour", "rgb")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 LINES_OF_A_POSE = (
     5  # in Open3D's log: a line of three numbers, and the rows of the matrix
-)
-ASK_FOR_SCALE = (
-    "nothing says what one step of the depth images stands for: give --depth-scale, in metres"
-    " (0.001 if they are in millimetres)"
 )
 
 
@@ -130,7 +126,7 @@ def read_depth_folder(
         notes.append(f"steps of {1000 * camera.scale:g} mm")
     scale = camera.scale if scale is None else scale
     if scale is None:
-        raise DatasetError(f"{folder}: {ASK_FOR_SCALE}")
+        raise DatasetError(_asked_for_scale(folder))
 
     images = sorted(folder.glob("depth/*.png"))
     poses, unreadable, of_poses = _poses(folder, [path.stem for path in images])
@@ -178,15 +174,23 @@ def read_depth_image(
     """
     if camera is None:
         raise DatasetError(
-            f"{path}: the intrinsics of its camera are missing: give --intrinsics FX FY CX CY, or a"
-            " file with them"
+            f"{path}: the intrinsics of its camera are missing: give {option('intrinsics')} FX FY"
+            " CX CY, or a file with them"
         )
     scale = camera.scale if scale is None else scale
     if scale is None:
-        raise DatasetError(f"{path}: {ASK_FOR_SCALE}")
+        raise DatasetError(_asked_for_scale(path))
     depth = DepthFile(path)
     frame = CapturedFrame(path.stem, depth, scale, camera.intrinsics, np.eye(4))
     return LayoutViews([frame], ["one image: its camera is the world"], z_is_up=False)
+
+
+def _asked_for_scale(path: Path) -> str:
+    """Ask for the depth scale of a file or folder that does not contain it."""
+    return (
+        f"{path}: nothing says what one step of the depth images stands for: give"
+        f" {option('depth_scale')}, in metres (0.001 if they are in millimetres)"
+    )
 
 
 def _camera(folder: Path, given: CameraFile | None) -> tuple[CameraFile, list[str]]:
@@ -213,8 +217,9 @@ def _camera(folder: Path, given: CameraFile | None) -> tuple[CameraFile, list[st
         "",
     )
     raise DatasetError(
-        f"{folder}: the intrinsics of the depth camera are missing: give --intrinsics FX FY CX CY"
-        f" or a file, or put {CAMERA_FILES[0]} or {CAMERA_FILES[3]} into the folder{near}"
+        f"{folder}: the intrinsics of the depth camera are missing: give"
+        f" {option('intrinsics')} FX FY CX CY or a file, or put {CAMERA_FILES[0]} or"
+        f" {CAMERA_FILES[3]} into the folder{near}"
     )
 
 

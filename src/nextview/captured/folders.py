@@ -7,7 +7,6 @@ BOP: Hodan et al., ECCV 2018. TUM RGB-D: Sturm et al., IROS 2012. 7-Scenes: Shot
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -37,11 +36,11 @@ from nextview.captured.frames import (
     rigid,
 )
 from nextview.captured.mat_scenes import META_ENDING, read_graspnet, read_ycb_video
-from nextview.captured.pcd import is_organised, read_clouds, read_pcd_header
+from nextview.captured.pcd import is_organised, read_clouds
+from nextview.captured.unread import why_unread
 from nextview.checks import number
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError, UsageError, option
 from nextview.files import read_record
-from nextview.geometry.mesh import FORMATS
 from nextview.geometry.pinhole import pinhole_matrix
 from nextview.sensing.object_frame import Box
 from nextview.types import Float
@@ -196,7 +195,7 @@ def _layout_of(path: Path) -> str:
         return CLOUDS
     if camera_folders(path):
         return SEVERAL_CAMERAS
-    raise DatasetError(_no_capture(path))
+    raise DatasetError(why_unread(path, is_capture))
 
 
 def _layouts_in(folder: Path) -> list[str]:
@@ -276,23 +275,6 @@ def _matrix(camera: CameraFile | None) -> Float | None:
     return None if camera is None else camera.intrinsics
 
 
-def _no_capture(folder: Path) -> str:
-    """Explain why a folder is not a capture, for example because it contains meshes."""
-    if mesh := next(
-        (f for f in islice(folder.rglob("*"), 1000) if f.suffix.lower() in FORMATS),
-        None,
-    ):
-        look = f"recognise one of them ({mesh}), or teach it them: nextview learn {folder} OUT"
-        return f"{folder}: is a folder of meshes, not of captured views; {look}"
-    if cloud := next(islice(folder.rglob("*.pcd"), 1), None):
-        read_pcd_header(cloud)  # raises an error that says why it is no depth image
-    known = ", ".join(f"{files} ({layout})" for layout, files in LAYOUT_MARKS.items())
-    return (
-        f"{folder}: no captured views are found; there is none of {known}, depth/*.png"
-        f" ({DEPTH_FOLDER}), *.pcd ({CLOUDS}), metadata.yaml or *.mcap ({BAG})"
-    )
-
-
 class _BoxFile(Struct, forbid_unknown_fields=True):
     low: ThreeNumbers
     high: ThreeNumbers
@@ -318,8 +300,8 @@ def _read_tum(folder: Path, camera: CameraFile | None, _: Reading) -> LayoutView
     if intrinsics is None:
         raise DatasetError(
             f"{folder}: the intrinsics are missing, which this layout does not hold; put the"
-            " pinhole matrix into camera-intrinsics.txt or give --intrinsics FX FY CX CY (TUM's"
-            " recordings: 525 525 319.5 239.5)"
+            f" pinhole matrix into camera-intrinsics.txt or give {option('intrinsics')} FX FY CX CY"
+            " (TUM's recordings: 525 525 319.5 239.5)"
         )
 
     times, depths = _images(folder / "depth.txt")

@@ -9,7 +9,7 @@ from nextview import __version__
 from nextview.checks import did_you_mean
 from nextview.cli.commands import COMMANDS, RESUMES
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import MissingExtraError, UsageError
+from nextview.errors import MissingExtraError, UsageError, shell_words
 
 ABOUT = "Active 3D object recognition: what an object is, and where to look next."
 
@@ -20,9 +20,10 @@ def main(arguments: list[str] | None = None) -> None:
     resumes = " ".join(arguments[:2]).startswith(RESUMES)
     # tyro hangs in a narrower terminal
     os.environ["COLUMNS"] = str(min(max(shutil.get_terminal_size().columns, 20), 500))
-    with orderly_end(
+    after_stop = (
         "run the same command again; it resumes" if resumes else "nothing was written"
-    ):
+    )
+    with shell_words(), orderly_end(after_stop):
         _run(arguments)
 
 

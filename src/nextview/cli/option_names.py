@@ -51,11 +51,12 @@ def option_names(function: Callable[..., Any]) -> set[str]:
     defaults: dict[str, Any] = {}
     for parameter in inspect.signature(function).parameters.values():
         default = parameter.default
+        positional = parameter.kind is parameter.POSITIONAL_ONLY
         if is_dataclass(default):
             defaults |= {
                 one.name: getattr(default, one.name) for one in fields(default)
             }
-        elif parameter.kind is not parameter.POSITIONAL_ONLY:
+        elif default is not parameter.empty and not positional:
             defaults[parameter.name] = default
     return {
         f"--{'no-' if default is True else ''}{name.replace('_', '-')}"

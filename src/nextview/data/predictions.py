@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nextview.data.splits import deduplicated, duplicate_groups, some_objects
 from nextview.data.store import ViewStore
-from nextview.errors import DAMAGED, DatasetError, PredictionsError
+from nextview.errors import DAMAGED, DatasetError, PredictionsError, option
 from nextview.files import decode_record, new_file, regular_file
 from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
@@ -206,7 +206,7 @@ class Predictions:
             there = ", ".join(map(repr, names))
             raise PredictionsError(
                 f"these predictions hold no objects of the split {split!r}, only of {there}: take"
-                f" split={names[-1]!r} (--split {names[-1]}), or predict the others with nextview"
+                f" {option('split', names[-1])}, or predict the others with nextview"
                 f" predict STORE OUT --split {split}"
             )
         return self.of_objects(np.flatnonzero(kept))

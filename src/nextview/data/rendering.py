@@ -27,8 +27,8 @@ from nextview.data.store import (
     opened,
     writing,
 )
-from nextview.errors import DatasetError, MeshError, UsageError
-from nextview.files import OVERWRITE, command, sha256_of
+from nextview.errors import DatasetError, MeshError, UsageError, option
+from nextview.files import command, sha256_of
 from nextview.geometry.depth import CLOUD_POINTS
 from nextview.geometry.mesh import (
     FORMATS,
@@ -389,8 +389,8 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
             if overwrite:
                 return ViewStore.create(path, wanted, overwrite)
             raise DatasetError(
-                f"{path}: was begun with other {key}; give another store, or {OVERWRITE} to"
-                " replace it"
+                f"{path}: was begun with other {key}; give another store, or"
+                f" {option('overwrite', True)} to replace it"
             )
     if wanted.unit is not None and there.unit is None:
         store.note(unit=wanted.unit)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import one_line, whole
-from nextview.errors import MeshError
+from nextview.errors import MeshError, option
 from nextview.files import regular_file
 from nextview.geometry.file_content import foreign_content
 from nextview.geometry.mesh_file import READERS
@@ -276,7 +276,7 @@ def load_mesh(
     most = BYTES_PER_FACE * whole(max_faces, "the largest number of faces", 1)
     if path.stat().st_size > most:
         raise MeshError(
-            f"{path}: has more than {most:,} bytes; --max-faces (max_faces) allows more"
+            f"{path}: has more than {most:,} bytes; {option('max_faces')} allows more"
         )
     try:
         data = path.read_bytes()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from nextview.errors import MeshError
+from nextview.errors import MeshError, option
 from nextview.types import Float
 
 # odd, of many bits
@@ -254,12 +254,14 @@ def mesh_doubts(vertices: Float, faces: NDArray[np.integer]) -> tuple[str, ...]:
             "times as large as its main part"
         )
         doubts.append(
-            f"{largest}: does a table or a loose piece belong to it? --largest-part leaves them out"
+            f"{largest}: does a table or a loose piece belong to it?"
+            f" {option('largest_part', True)} leaves them out"
         )
     elif (times := _plane_times(vertices, faces)) >= WIDE_PLANE:
         plane = f"a plane in it is {times:.1f} times as large as all that stands on it"
         doubts.append(
-            f"{plane}: is it a table? Cut it off, or use --largest-part if it is a part of its own"
+            f"{plane}: is it a table? Cut it off, or use {option('largest_part', True)} if it is a"
+            " part of its own"
         )
 
     return tuple(doubts)

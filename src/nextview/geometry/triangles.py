@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nextview.errors import MeshError
+from nextview.errors import MeshError, option
 from nextview.types import Float, Index, Mask
 
 MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
@@ -26,7 +26,7 @@ def check_faces(faces: int, max_faces: int) -> None:
     """
     if faces > max_faces:
         raise MeshError(
-            f"it has {faces:,} triangles, more than {max_faces:,}; --max-faces (max_faces) allows"
+            f"it has {faces:,} triangles, more than {max_faces:,}; {option('max_faces')} allows"
             " more"
         )
 

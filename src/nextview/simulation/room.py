@@ -7,7 +7,7 @@ from zlib import crc32
 
 import numpy as np
 
-from nextview.errors import DatasetError, MeshError
+from nextview.errors import DatasetError, MeshError, option
 from nextview.geometry.mesh import MAX_FACES
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
@@ -109,7 +109,7 @@ def build_room(
         for thing in (layout.target, *layout.objects)
     ]
     if (faces := sum(len(faces) for _, faces in placed)) > max_faces:
-        most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
+        most = f"more than {max_faces:,}; {option('max_faces')} allows more"
         raise MeshError(
             f"room {layout.name}: its meshes have {faces:,} triangles, {most}"
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from nextview.checks import points
-from nextview.errors import DatasetError, MeshError
+from nextview.errors import DatasetError, MeshError, option
 from nextview.files import regular_file, sha256_of
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
 from nextview.geometry.viewsphere import rotation_z
@@ -139,7 +139,7 @@ def build_scene(
             raise DatasetError(f"{path}: is not the mesh that this scene was made with")
         loaded.append(cached_mesh(path, max_faces))
         if (faces := sum(len(mesh.faces) for mesh in loaded)) > max_faces:
-            most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
+            most = f"more than {max_faces:,}; {option('max_faces')} allows more"
             raise MeshError(
                 f"scene {layout.name}: its meshes have {faces:,} triangles, {most}"
             )

@@ -17,9 +17,8 @@ from nextview.checks import one_line
 from nextview.data.pool import GivenItem, Result, WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, in_lines, silently
-from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.errors import DatasetError, NextviewError, UsageError, option
 from nextview.files import (
-    OVERWRITE,
     check_new,
     new_file,
     new_folder,
@@ -317,7 +316,11 @@ def learn_things(
 
         of_classes = _of_classes([*found.things, *(source for source, _ in taught)])
         work = Work(how, part, workers, scheduler, track, of_classes)
-        track(_teach(found.things, work, taught, left_out), len(found.things), "teaching things")
+        track(
+            _teach(found.things, work, taught, left_out),
+            len(found.things),
+            "teaching things",
+        )
         if not taught and nothing_new:
             raise UsageError(
                 f"{out}: no thing would be left; delete the folder instead"
@@ -346,8 +349,8 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
     card = out / CARD
     if card.exists() and not keeps and not overwrite:
         raise UsageError(
-            f"{out}: already knows things; add=True (in a shell: --add) adds others,"
-            f" {OVERWRITE} replaces them"
+            f"{out}: already knows things; {option('add', True)} adds others,"
+            f" {option('overwrite', True)} replaces them"
         )
     check_new(out, keeps or overwrite, folder=True)
     for place in (card, out / LEARNED_PICTURE):
@@ -374,8 +377,8 @@ def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
     for thing in things:
         if thing.name in names:
             raise UsageError(
-                f"{thing.path}: something called {thing.name} is known already; --remove it, or"
-                " rename it"
+                f"{thing.path}: something called {thing.name} is known already;"
+                f" {option('remove')} it, or rename it"
             )
 
 
@@ -422,10 +425,13 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
     known = {source.name: arrays for source, arrays in taught}
     for name, symmetries in named_symmetries(given).items():
         if name not in known:
-            raise UsageError(f"--symmetry: nothing is called {one_line(name)}")
+            raise UsageError(
+                f"{option('symmetry')}: nothing is called {one_line(name)}"
+            )
         if VERTICES not in known[name]:
             raise UsageError(
-                f"--symmetry: {one_line(name)} has no pose without its size; give --unit"
+                f"{option('symmetry')}: {one_line(name)} has no pose without its size; give"
+                f" {option('unit')}"
             )
         known[name][SYMMETRIES] = rows_of(symmetries)
 
@@ -800,7 +806,7 @@ def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
     ]
     if unknown and len(taught) > 1:
         notes.append(
-            f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it"
-            " count"
+            f"the size of {len(unknown)} of {len(taught)} things is not known;"
+            f" {option('unit')} makes it count"
         )
     return tuple(notes)

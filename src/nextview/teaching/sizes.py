@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, option
 from nextview.geometry.mesh import UNITS
 from nextview.types import Floats
 
@@ -43,14 +43,16 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
                 if times > 1
                 else f"{1 / times:,.0f} times smaller"
             )
-            hint = "is it in another unit? --any-size takes it as it is"
+            hint = (
+                f"is it in another unit? {option('any_size', True)} takes it as it is"
+            )
             raise DatasetError(f"{path}: is {how} than most others; {hint}")
 
 
 def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> str:
     """A sentence about things of implausible size, with the unit that makes them usual."""
     middle = int(np.nanargmin(np.abs(radii - median)))
-    size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"
+    size = f"has a radius of {_length(float(radii[middle]))} if {option('unit', unit)} is right"
     who = (
         f"{paths[middle]}: {size}"
         if len(paths) == 1
@@ -61,9 +63,9 @@ def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> 
     for other, metres in UNITS.items():
         radius = median / UNITS[unit] * metres
         if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
-            likely.append(f"--unit {other} ({_length(radius)})")
+            likely.append(f"{option('unit', other)} ({_length(radius)})")
     hint = f"is it {' or '.join(likely)}?" if likely else "is that right?"
-    return f"{who}; {hint} --any-size takes it as it is"
+    return f"{who}; {hint} {option('any_size', True)} takes it as it is"
 
 
 def _length(metres: float) -> str:

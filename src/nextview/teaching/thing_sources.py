@@ -9,7 +9,7 @@ from nextview.captured.folders import is_capture
 from nextview.captured.turntable import is_turntable
 from nextview.checks import one_line
 from nextview.data.folders import Entry, left_out_phrases, read_folder
-from nextview.errors import DatasetError
+from nextview.errors import DatasetError, option
 from nextview.geometry.mesh import FORMATS
 
 RESULT_FOLDER = "is where the result goes"
@@ -179,6 +179,6 @@ def _check_classes(folder: Path, things: list[ThingSource]) -> None:
     all_things = f"all {len(things)} things are of the one class {one_line(label)}"
     inside = one_line(os.path.commonpath([thing.path.parent for thing in things]), 200)
     raise DatasetError(
-        f"{folder}: {all_things}; give {inside} if that holds the things, or --one-class if they"
-        " are one"
+        f"{folder}: {all_things}; give {inside} if that holds the things, or"
+        f" {option('one_class', True)} if they are one"
     )

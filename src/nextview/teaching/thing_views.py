@@ -15,7 +15,7 @@ from nextview.captured.folders import is_capture, read_capture
 from nextview.captured.frames import Capture
 from nextview.captured.turntable import read_turntable
 from nextview.checks import one_of, whole
-from nextview.errors import DatasetError, ObservationError
+from nextview.errors import DatasetError, ObservationError, option
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import resting_poses, rotated
@@ -192,7 +192,8 @@ def _captured(path: Path, how: TeachingOptions) -> Capture:
         return read_capture(path, depth_scale=how.depth_scale)
     if how.turntable is None:
         raise DatasetError(
-            f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned"
+            f"{path}: its frames have no poses; {option('turntable')} ccw or cw says how the thing"
+            " turned"
         )
     return read_turntable(path, how.turntable)
 

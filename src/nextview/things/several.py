@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from nextview.errors import ModelError
+from nextview.errors import ModelError, option
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
@@ -61,7 +61,7 @@ class SeveralRecognisers:
             elif isinstance(member, TaughtRecogniser):
                 what = "knows no geometry of its things, by which they are told from others"
                 raise ModelError(
-                    f"{name}: {what}; teach them again from meshes with --unit"
+                    f"{name}: {what}; teach them again from meshes with {option('unit')}"
                 )
             else:
                 networks[name] = member

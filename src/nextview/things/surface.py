@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from nextview.errors import MeshError
+from nextview.errors import MeshError, option
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import embree_scene
 from nextview.types import Float, Float32, Index
@@ -56,7 +56,7 @@ class Surface:
         """
         if mesh.unit is None:
             raise MeshError(
-                f"{mesh.name}: the unit of length is not known; give --unit"
+                f"{mesh.name}: the unit of length is not known; give {option('unit')}"
             )
 
         vertices = (mesh.vertices * mesh.radius + mesh.centre).astype(np.float32)
