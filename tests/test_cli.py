@@ -1,5 +1,6 @@
 """The command line: its table of commands, how they end, and what they show."""
 
+import ast
 import inspect
 import io
 import json
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
+from functools import wraps
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -19,15 +21,21 @@ import numpy as np
 import pytest
 from pipeline import run_python, some_predictions
 
+from nextview import errors
 from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
-from nextview.cli.call_with_arguments import find
+from nextview.cli.call_with_arguments import call, find
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
+from nextview.cli.option_values import value_word
 from nextview.cli.predict import summed_up
+from nextview.cli.words import EXAMPLES, OTHER_WORDS
+from nextview.data import pool
 from nextview.data.store import ViewStore
-from nextview.errors import MissingExtraError
+from nextview.errors import MissingExtraError, NextviewError, shell_words
+from nextview.files import check_new
 
+ROOT = Path(__file__).parents[1]
 COMMAND = [sys.executable, "-m", "nextview"]
 
 
@@ -47,11 +55,99 @@ def test_every_command_explains_itself(name, capsys):
     shown = capsys.readouterr().out
     assert shown.startswith(f"usage: nextview {name} ")
     assert "(required)" in shown or name in ("demo", "demo-episode", "explore")
-    assert not [
-        line
-        for line in shown.splitlines()
-        if re.search(r"--[\w-]+ \S+\s+\(default", line)
-    ], "no help"
+    assert not re.search(
+        r"^│ --[^│]*?( {2,}\S[^│]*)?│\n│ (--|\(default)", bare(shown), re.M
+    )
+    assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
+    assert shown.splitlines()[-1] == f"example: nextview {EXAMPLES[name]}"
+
+
+def bare(shown: str) -> str:
+    """The options of a help whose explanation begins on the same line are left out."""
+    return re.sub(r"^│ --\S+( \S+)*? {2,}\S.*\n", "", shown, flags=re.M)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_example_of_a_help_is_a_command_line(name, monkeypatch):
+    pytest.importorskip("torch")
+    command = COMMANDS[name]
+    module, _, function = command.function.partition(":")
+    called = []
+
+    @wraps(find(command.function))
+    def run(*arguments, **options):
+        called.append((arguments, options))
+
+    monkeypatch.setattr(f"{module}.{function}", run)
+    words = EXAMPLES[name].split()
+    assert " ".join(words[: len(name.split())]) == name
+    call(name, command, words[len(name.split()) :], None)
+    assert len(called) == 1
+
+
+@pytest.mark.parametrize("name", ["completion", "list", "capture", "demo-episode"])
+def test_the_example_of_a_quick_command_runs(name, monkeypatch, tmp_path):
+    (tmp_path / "samples").symlink_to(ROOT / "samples")
+    monkeypatch.chdir(tmp_path)
+    with suppress(SystemExit):
+        main(EXAMPLES[name].split())
+    assert {path.name for path in tmp_path.iterdir()} - {"samples"} == {
+        "capture": {"captured"},
+        "demo-episode": {"chair.png"},
+    }.get(name, set())
+
+
+@pytest.mark.parametrize(
+    ("kind", "word"),
+    [
+        (float | None, "NUMBER"),
+        (tuple[float, float, float] | Literal["up", "down"] | None, "X Y Z|up|down"),
+        (str | tuple[str, ...], "TEXT ..."),
+        (tuple[int, ...], "INT ..."),
+        (tuple[int, Path], "INT PATH"),
+    ],
+)
+def test_the_placeholder_of_a_value(kind, word):
+    assert value_word(kind) == word
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            "recognise a.off --up 0 1",
+            "Error parsing --up: y|z|X Y Z is expected, not 0 1",
+        ),
+        ("capture a.off out --radius wide", "--radius: NUMBER is expected, not wide"),
+        (
+            "learn a b --remove",
+            "Error parsing --remove: its value is missing: TEXT ...",
+        ),
+        (
+            "check a --intrinsics",
+            "--intrinsics: its value is missing: FX FY CX CY|PATH",
+        ),
+        ("learn a b --turntable left", "Expected one of ('ccw', 'cw')."),
+        ("check a --worker 2", "no option --worker; did you mean '--workers'?"),
+        (
+            "learn --tabletop=no a b",
+            "no option --tabletop; did you mean '--turntable'?",
+        ),
+        ("list models --xyz", "no option --xyz; nextview list --help lists those"),
+        ("explore --no_browse", "no option --no-browse; did you mean '--no-browser'?"),
+    ],
+)
+def test_a_wrong_option_or_value_is_explained(words, said, capsys):
+    status, shown = ended(capsys, *words.split())
+    assert status == 2
+    assert said in " ".join(shown.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("words", ["help look", "look -h"])
+def test_help_is_a_word_too(words, capsys):
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert capsys.readouterr().out.startswith("usage: nextview look ")
 
 
 def test_the_list_of_commands_imports_no_command():
@@ -114,13 +210,93 @@ def test_an_option_has_the_same_type_in_every_command():
 
 @pytest.mark.parametrize(
     ("words", "meant"),
-    [("recognize", "recognise"), ("train recognizer", "train recogniser")],
+    [
+        ("recognize", "recognise"),
+        ("train recognizer", "train recogniser"),
+        ("benchmark thing", "benchmark things"),
+        ("exprot map", "export"),
+    ],
 )
 def test_a_misspelt_command_is_guessed(words, meant, capsys):
     assert ended(capsys, *words.split()) == (
         2,
-        f"nextview: there is no command {words!r}; did you mean {meant!r}?\n",
+        f"nextview: there is no command {words.replace(' map', '')!r}; did you mean"
+        f" {meant!r}?\n",
     )
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("localise", ["look"]),
+        ("Detect", ["look"]),
+        ("serach", ["look"]),
+        ("teach", ["learn"]),
+        ("train-on", ["learn"]),
+        ("train samples", ["learn"]),
+        ("classify", ["recognise"]),
+        ("scan", ["look", "learn"]),
+        ("visualize", ["explore"]),
+        ("quickstart", ["demo"]),
+    ],
+)
+def test_what_a_newcomer_calls_a_command_leads_to_it(word, meant, capsys):
+    status, said = ended(capsys, *word.split())
+    named = [f"{name!r} ({COMMANDS[name].line})" for name in meant]
+    assert status == 2
+    assert f"did you mean {' or '.join(named)}?\n" in said
+
+
+def test_other_words_are_of_commands_and_no_command_themselves():
+    assert COMMANDS.keys() >= OTHER_WORDS.keys()
+    for words in OTHER_WORDS.values():
+        assert not COMMANDS.keys() & set(words.split())
+
+
+def test_messages_name_an_option_as_it_is_typed_where_they_are_read(tmp_path, capsys):
+    """In a shell, in Python, and in a worker process of a command."""
+    (tmp_path / "out").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / name).with_suffix(".off").write_text("OFF\n")
+    with pytest.raises(
+        NextviewError, match="another name, or overwrite=True to"
+    ) as python:
+        check_new(tmp_path / "a.off")
+    said = ended(capsys, "demo-episode", "--figure", tmp_path / "a.off")[1]
+    assert "another name, or --overwrite to" in said
+    assert "--" not in str(python.value)
+
+    with shell_words():
+        assert dict(pool.each(errors.option, ["depth_scale"], 1)) == {
+            "depth_scale": "--depth-scale"
+        }
+    assert dict(pool.each(errors.option, ["depth_scale"], 1)) == {
+        "depth_scale": "depth_scale"
+    }
+
+
+def test_no_message_names_a_python_argument_to_a_shell():
+    """They are named by ``errors.option``, which knows where a message is read."""
+    named = "|".join({one for name in COMMANDS for one in options(name)})
+    python = re.compile(rf"(?<![-\w])({named})=(True|False|None|['\"\n])|in a shell")
+    only_python = ["environments.py"]
+    for path in sorted((ROOT / "src/nextview").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        bodies = [
+            n.body for n in ast.walk(tree) if isinstance(getattr(n, "body", 0), list)
+        ]
+        docs = {id(body[0].value) for body in bodies if isinstance(body[0], ast.Expr)}
+        for node in ast.walk(tree):
+            text = ""
+            if isinstance(node, ast.JoinedStr):
+                text = "".join(
+                    str(v.value) if isinstance(v, ast.Constant) else "\n"
+                    for v in node.values
+                )
+            elif isinstance(node, ast.Constant) and id(node) not in docs:
+                text = str(node.value)
+            if path.name not in only_python and " " in text and "<" not in text:
+                assert not python.search(text), (path, text)
 
 
 @pytest.mark.parametrize("preset", [None, "thesis"])

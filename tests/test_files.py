@@ -30,7 +30,7 @@ def test_a_file_is_written_completely_and_replaces_others_only_on_request(tmp_pa
     with files.new_file(path) as part:
         part.write_text("old")
     with (
-        pytest.raises(ResultsError, match=r"overwrite=True .*--overwrite"),
+        pytest.raises(ResultsError, match=r"overwrite=True to replace it"),
         files.new_file(path),
     ):
         pass

@@ -265,7 +265,8 @@ def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
     summary = scan_dataset(meshes(tmp_path, "Train/a.ply", "plane/b.ply")).summary()
     assert (
         summary
-        == "2 objects: 2 meshes as CLASS/MESH; the folder Train is taken for a class, not for a split"
+        == "2 objects: 2 meshes as CLASS/MESH; the folder Train is taken for a class, not for a"
+        " split"
     )
 
 

@@ -140,7 +140,7 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError, match=r"chair is known already"):
         learn(scans, models, add=True)
-    assert "already knows things; add=True (in a shell: --add)" in refused(
+    assert "already knows things; --add adds others, --overwrite" in refused(
         capsys,
         "learn",
         str(scans),

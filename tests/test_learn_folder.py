@@ -106,7 +106,7 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
     root = scans_in(tmp_path / "things", *places)
     with pytest.raises(
         DatasetError,
-        match=rf"all . things are of the one class .*; give {root / inside} if .*--one-class",
+        match=rf"all . things are of the one class .*; give {root / inside} if .*one_class=True",
     ):
         find_things(root)
     assert len({thing.label for thing in find_things(root / inside).things}) > 1
@@ -200,7 +200,7 @@ def test_from_python_it_tells_how_far_it_is_and_how_a_memory_is_replaced(
     out = tmp_path / "mine"
     learn(root, out, workers=0)
     assert "teaching things: 2 to do\n" in capsys.readouterr().err
-    with pytest.raises(UsageError, match=r"overwrite=True .*--overwrite"):
+    with pytest.raises(UsageError, match=r"add=True adds others, overwrite=True"):
         learn(root, out, workers=0)
     assert capsys.readouterr().err == ""
 
@@ -236,10 +236,10 @@ def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(
         (
             [71.0, 80, 65],
             "m",
-            r"b\.ply: has a radius of 71 m if --unit m is right.* --unit mm \(7\.1 cm\)",
+            r"b\.ply: has a radius of 71 m if unit='m' is right.* unit='mm' \(7\.1 cm\)",
         ),
-        ([71.0], "m", "--unit mm"),
-        ([0.0001, 0.00012], "mm", r"--unit m \("),
+        ([71.0], "m", "unit='mm'"),
+        ([0.0001, 0.00012], "mm", r"unit='m' \("),
         ([0.1, 0.12, 100.0], "m", r"c\.ply: is 833 times larger than most others"),
         ([0.1, 0.12, 0.0001], "m", "times smaller than most others"),
         ([0.1, np.nan, 0.3], "cm", None),
@@ -253,7 +253,7 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
         return check_sizes(names, np.array(radii), unit_given)
     with pytest.raises(DatasetError, match=said) as raised:
         check_sizes(names, np.array(radii), unit_given)
-    assert "--any-size takes it as it is" in str(raised.value)
+    assert "any_size=True takes it as it is" in str(raised.value)
 
 
 @pytest.mark.parametrize(

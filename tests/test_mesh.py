@@ -356,12 +356,12 @@ BROKEN = {
     "too many bytes": (
         "a.off",
         "OFF\n" + " " * 100 * BYTES_PER_FACE,
-        "has more than 6,000 bytes; --max-faces",
+        "has more than 6,000 bytes; max_faces",
     ),
     "too many faces": (
         "a.off",
         off(GOOD, "3 0 1 2\n" * 101),
-        "101 triangles, more than 100; --max-faces",
+        "101 triangles, more than 100; max_faces",
     ),
     "OBJ index too high": (
         "a.obj",
@@ -425,7 +425,7 @@ BROKEN = {
     "GLB mesh too often": (
         "a.glb",
         glb(MANY_TIMES, TRIANGLE),
-        "101 triangles, more than 100; --max-faces",
+        "101 triangles, more than 100; max_faces",
     ),
 }
 for suffix in FORMATS:

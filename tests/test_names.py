@@ -2,8 +2,10 @@
 mean anything.
 """
 
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -11,11 +13,15 @@ import pytest
 import trimesh
 from pipeline import benchmark, refused, some_predictions
 
+import nextview
 from nextview.benchmark.figures import confusion_matrix
 from nextview.benchmark.report import report
+from nextview.cli.episode_table import print_episode
 from nextview.cli.exit_status import printable
+from nextview.cli.look import print_scene
 from nextview.cli.main import main
 from nextview.data.folders import list_dataset
+from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
 from nextview.session.style import to_svg
 
@@ -117,6 +123,57 @@ def test_a_terminal_shows_names_literally(tmp_path, name, shown, capsys):
         refused(capsys, "recognise", tmp_path / name)
         == f"nextview: {tmp_path}/{shown}: no such file or folder"
     )
+
+
+LONG_NAMES = ("phillips_screwdriver_no_2", "hexagon_flange_nut_m8", "b" * 36)
+
+
+def of_name(number: int, name: str) -> SimpleNamespace:
+    """What a table says of an object: all of its columns are as wide as they get."""
+    return SimpleNamespace(
+        number=number,
+        name=name,
+        confidence=0.987,
+        confident=number % 2 == 1,
+        size=np.array([0.1, 0.2, 0.3]),
+        place=np.array([-0.123, -1.234, -0.345]),
+        pose_uncertainty=SimpleNamespace(millimetres=12.3, degrees=123.4),
+        pixels=dict.fromkeys("abcdefghijkl"),
+        touches=(11, 12, 13),
+        result=SimpleNamespace(beliefs={name: 0.987}, doubt=""),
+    )
+
+
+def test_a_table_of_a_scene_keeps_names_whole_in_80_columns(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    objects = [of_name(number, name) for number, name in enumerate(LONG_NAMES, 11)]
+    scene = SimpleNamespace(objects=objects, frames=[None] * 4, remarks=())
+    print_scene(scene, "table")
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in LONG_NAMES)
+    assert "…" not in shown
+    assert "..." not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_a_table_of_views_keeps_names_whole_in_80_columns(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    camera = nextview.SimulatedCamera(sample_mesh("chair"))
+    session = nextview.load(max_views=2, threshold=1).session()
+    while not session.done:
+        session.update(camera.observe(session.pose))
+    names = tuple(f"{name}_of_the_living_room" for name in session.result.classes)
+    result = replace(session.result, classes=names)
+    print_episode(result, "chair", "gain")
+    shown = capsys.readouterr().out
+    table = shown.partition("view: number")[0]
+    assert "chair_of_the_living_room\n" in re.sub(" +", "\n", table)
+    assert "…" not in table
+    assert "travel" not in table
+    assert max(map(len, shown.splitlines())) <= 80
+
+    print_episode(session.result, "chair", "gain")
+    assert "travel" in capsys.readouterr().out.partition("view: number")[0]
 
 
 @pytest.mark.parametrize(

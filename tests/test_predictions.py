@@ -130,8 +130,8 @@ def test_a_split_is_its_objects_and_nothing_else():
     np.testing.assert_array_equal(with_bins.azimuth_bins, azimuth_bins[1::2])
     with pytest.raises(
         PredictionsError,
-        match="no objects of the split 'train', only of 'test': take split='test' "
-        r"\(--split test\), or predict the others with nextview predict STORE OUT --split train",
+        match="no objects of the split 'train', only of 'test': take"
+        r" split='test', or predict the others with nextview predict STORE OUT --split train",
     ):
         test.of_split("train")
 

@@ -195,7 +195,7 @@ def test_one_of_several_topics_is_named_and_the_world_too(tmp_path):
     bag = write_bag(tmp_path / "bag", [*tf_of_an_arm(), *images_at([1.0, 2.0]), *other])
     with pytest.raises(
         DatasetError,
-        match=r"2 topics; name one with --depth-topic: /camera/depth",
+        match=r"2 topics; name one with depth_topic: /camera/depth",
     ):
         read_capture(bag)
     capture = read_capture(bag, depth_topic=DEPTH, world_frame="tool")
@@ -334,7 +334,7 @@ UNUSABLE = {
     "no images": (text, "holds no depth images .* and no others"),
     "no camera_info": (
         lambda: [*tf_of_an_arm(), images_at([1.0])[0]],
-        "camera_info of .* is missing .*give --intrinsics",
+        "camera_info of .* is missing .*give intrinsics",
     ),
     "another size": (
         lambda: [
@@ -822,6 +822,66 @@ def test_depth_images_turned_by_a_quarter_turn_are_named(
         read_capture(folder).frames[0].read()
 
 
+def as_jpeg(folder):
+    for image in (folder / "depth").iterdir():
+        image.rename(image.with_suffix(".jpeg"))
+    return folder
+
+
+def emptied(folder):
+    for image in (folder / "depth").iterdir():
+        image.unlink()
+    return folder / "depth"
+
+
+def without_depth_folder(folder):
+    (folder / "depth").rename(folder / "images")
+    return folder
+
+
+def images_alone(folder):
+    (folder / "depth").rename(folder.parent / "images")
+    return folder.parent / "images"
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        (
+            as_jpeg,
+            "shot: depth/ holds 3 .jpeg files; depth images are 16-bit PNG files",
+        ),
+        (emptied, "shot: depth/ is empty; depth images are 16-bit PNG files"),
+        (
+            lambda folder: folder / "depth",
+            "depth: is only a part of a capture: give the",
+        ),
+        (lambda folder: folder / "poses", "give the folder above, {tmp}/shot"),
+        (lambda folder: folder.parent, "in a folder inside it: give {tmp}/shot"),
+        (images_alone, "images: holds 3 .png files and has no folder depth/; give one"),
+        (
+            without_depth_folder,
+            "shot: no captured views are found; it holds 2 folders and",
+        ),
+    ],
+)
+@pytest.mark.parametrize("command", ["look", "check", "recognise"])
+def test_a_folder_without_frames_says_what_is_there_and_what_is_expected(
+    command, what, said, views, tmp_path, capsys
+):
+    camera = {"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}
+    folder = what(written(tmp_path / "shot", views[:3], camera))
+    told = refused(capsys, command, folder)
+    assert said.format(tmp=tmp_path) in told
+    assert "7-Scenes" not in told
+
+
+def test_a_capture_cannot_be_taught_as_a_folder_of_captures(views, tmp_path, capsys):
+    folder = written(tmp_path / "mug", views[:3], None)
+    told = refused(capsys, "learn", folder, tmp_path / "mine")
+    assert f"{folder}: is the capture of one thing: give the folder above" in told
+
+
 def of_another_size(folder):
     fields = json.loads((folder / "intrinsics.json").read_text()) | {"width": 1280}
     (folder / "intrinsics.json").write_text(json.dumps(fields))
@@ -901,7 +961,7 @@ def test_one_image_with_intrinsics_is_a_capture(views, tmp_path, capsys):
     np.testing.assert_allclose(captured.read().depth, views[0][0] / 1000, atol=1e-6)
     with pytest.raises(DatasetError, match="the intrinsics of its camera are missing"):
         read_capture(image)
-    with pytest.raises(DatasetError, match="give --depth-scale"):
+    with pytest.raises(DatasetError, match="give depth_scale"):
         read_capture(image, (300, 300, 159.5, 119.5))
     with pytest.raises(
         UsageError, match="topics, tf frames and moments are of ROS 2 bags"

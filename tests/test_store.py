@@ -151,7 +151,9 @@ def test_other_settings_and_meshes_are_refused_or_replace_the_store(
         {"size": 16},
         {"options": RenderOptions(split="train")},
     ):
-        with pytest.raises(DatasetError, match=r"was begun with other .*--overwrite"):
+        with pytest.raises(
+            DatasetError, match=r"was begun with other .*overwrite=True"
+        ):
             list(
                 render(furniture, store, SPHERE, **{"size": 32, "workers": 0} | options)
             )

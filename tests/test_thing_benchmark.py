@@ -218,7 +218,7 @@ def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
     tmp_path,
 ):
     scans = scaled(knobs, "cm", tmp_path / "cm")
-    with pytest.raises(DatasetError, match=r"is not in m, .* give --unit cm"):
+    with pytest.raises(DatasetError, match=r"is not in m, .* give unit='cm'"):
         benchmark_things(scans, tmp_path / "out", settings, workers=0)
 
     moved = tmp_path / "moved"

@@ -108,7 +108,7 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, tmp_path):
     shutil.copytree(frames, tmp_path / "things/chair")
     with pytest.raises(
         DatasetError,
-        match=r"chair: its frames have no poses; --turntable ccw or cw says",
+        match=r"chair: its frames have no poses; turntable ccw or cw says",
     ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
     for name in ("chair", "table"):

@@ -11,7 +11,6 @@ from nextview.geometry.mesh import FORMATS
 
 MOST_FILES = 1000  # that are looked at
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".npy", ".pgm")
-EXPECTED = "depth images are 16-bit PNG files, depth/NAME.png"
 
 
 def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
@@ -27,8 +26,9 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
     above = folder / ".." if folder.name in ("", "..") else folder.parent
     if is_capture(above):
         return f"{folder}: is only a part of a capture: give the folder above, {above}"
-    if (folder / "depth").is_dir():
-        return f"{folder}: {_lacks_depth(folder)}"
+    for holder in (folder, above):
+        if (holder / "depth").is_dir() and (holder == folder or folder.name == "depth"):
+            return _lacks_depth(holder)
 
     inside = [path for path in _some(folder, "*") if path.is_dir() and is_capture(path)]
     if inside:
@@ -47,7 +47,10 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
         read_pcd_header(cloud)  # raises an error that says why it is no depth image
 
     if any(file.suffix.lower() in IMAGE_ENDINGS for file in _some(folder, "*")):
-        return f"{folder}: {_content(folder)}, but has no folder depth/; {EXPECTED}"
+        return (
+            f"{folder}: {_content(folder)} and has no folder depth/; give one image, or put 16-bit"
+            " PNG files into depth/"
+        )
     return (
         f"{folder}: no captured views are found; it {_content(folder)}, where depth/NAME.png with"
         " the camera's intrinsics, a ROS 2 bag or another layout of docs/recordings.md is expected"
@@ -57,8 +60,9 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
 def _lacks_depth(folder: Path) -> str:
     """Say what is wrong with a folder that contains ``depth/``."""
     if next((folder / "depth").glob("*.png"), None) is None:
-        return f"depth/ {_content(folder / 'depth')}; {EXPECTED}"
-    return "has mask_visib/ as scenes of BOP have, but scene_camera.json is missing"
+        there = _content(folder / "depth")
+        return f"{folder}: depth/ {there}; depth images are 16-bit PNG files, depth/NAME.png"
+    return f"{folder}: has mask_visib/, as in BOP, but scene_camera.json is missing"
 
 
 def _content(folder: Path) -> str:

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from nextview.captured.check import check_capture, errors_of_cameras
-from nextview.captured.depth_folder import camera_folders
-from nextview.captured.folders import is_capture, read_capture
+from nextview.captured.folders import read_capture
 from nextview.captured.frames import Capture
 from nextview.cli.common_options import Workers, check_there
 from nextview.cli.progress import console, track_all
@@ -38,10 +37,10 @@ def check(
             millimetres; by default read from the folder.
     """
     check_there(path)
-    if path.is_file() or is_capture(path) or camera_folders(path):
-        _check_frames(read_capture(path, intrinsics, depth_scale=depth_scale))
-    else:
+    if path.suffix == ".zarr" or (path / "zarr.json").exists():
         _check_store(path, workers)
+    else:
+        _check_frames(read_capture(path, intrinsics, depth_scale=depth_scale))
 
 
 def _check_frames(read: Capture) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from rich import box
 from rich.console import JustifyMethod
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -12,7 +13,13 @@ from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
 from nextview.session.result import Recognition
 
+UNLIMITED = 10_000  # columns of a terminal
 SHOWN_POSES = 5  # beside the likeliest
+SPARE_COLUMNS = (
+    "stops at",
+    "travel",
+    "next",
+)  # in the order in which they are left out
 
 
 def _angles(view: int, angles: tuple[float, float]) -> str:
@@ -41,9 +48,17 @@ def print_episode(
     has_threshold = bool(np.isfinite(stops).any())
 
     console = Terminal()
-    console.print(
-        _table_of_views(result, name, policy, frames, stops if has_threshold else [])
-    )
+    columns = ["step", "view", "this view alone", "belief, top 3", "next", "travel"]
+    if has_threshold:
+        columns.insert(4, "stops at")
+    table = _table_of_views(result, name, policy, frames, stops, columns)
+    for spare in SPARE_COLUMNS:
+        unlimited = console.options.update_width(UNLIMITED)
+        if Measurement.get(console, unlimited, table).maximum <= console.width:
+            break
+        columns = [column for column in columns if column != spare]
+        table = _table_of_views(result, name, policy, frames, stops, columns)
+    console.print(table)
     for step, view in enumerate(result.views, 1):
         for warning in view.warnings:
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
@@ -71,8 +86,9 @@ def _table_of_views(
     policy: str,
     frames: Sequence[str],
     stops: Sequence[float],
+    columns: Sequence[str],
 ) -> Table:
-    """Make a table with a row for each view; ``stops`` holds the threshold of each, or nothing."""
+    """Make a table with a row for each view; ``stops`` holds the threshold of each."""
     table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
     table.title = f"Looking at {name}, next views by {policy}"
     table.caption = (
@@ -80,9 +96,6 @@ def _table_of_views(
         f"stops by {result.stopping}"
     )
 
-    columns = ["step", "view", "this view alone", "belief, top 3", "next", "travel"]
-    if stops:
-        columns.insert(4, "stops at")
     for column in columns:
         justify: JustifyMethod = "right" if column in ("step", "travel") else "left"
         table.add_column(column, justify=justify, no_wrap=True)
@@ -104,19 +117,19 @@ def _table_of_views(
 
         top = np.argsort(-view.belief)[:3]
         belief = "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top)
-        stop = [f"{stops[row]:.2f}"] if stops else []
         after = "stop"
         if view.next_view is not None:
             after = _angles(view.next_view, result.sphere.angles(view.next_view))
-        table.add_row(
-            str(row + 1),
-            looked,
-            alone,
-            belief,
-            *stop,
-            after,
-            f"{np.degrees(view.arc):.0f}°",
-        )
+        cells = {
+            "step": str(row + 1),
+            "view": looked,
+            "this view alone": alone,
+            "belief, top 3": belief,
+            "stops at": f"{stops[row]:.2f}",
+            "next": after,
+            "travel": f"{np.degrees(view.arc):.0f}°",
+        }
+        table.add_row(*(cells[column] for column in columns))
     return table
 
 

@@ -30,6 +30,7 @@ def show(
         from nextview.data.measures import all_measures
 
         table = Table("measure", "needs", "better views", "source")
+        table.columns[0].no_wrap = True
         for key, measure in all_measures().items():
             table.add_row(
                 key,

@@ -35,6 +35,8 @@ from nextview.session.result_json import plain
 from nextview.session.system import load
 from nextview.types import Float
 
+WHOLE_NAME = 40  # letters of the longest name that is not folded in the table
+
 
 @dataclass(frozen=True)
 class LookOptions:
@@ -262,13 +264,17 @@ def print_scene(scene: Scene, name: str) -> None:
     table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     frames = len(scene.frames)
     table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
-    for column in REPORT_COLUMNS:
+    rows = [row_of(thing) for thing in objects]
+    for column, *cells in zip(REPORT_COLUMNS, *rows, strict=True):
+        longest = max(map(len, cells))
         table.add_column(
             column,
             justify="right" if column in ("", "frames") else "left",
+            overflow="fold",
+            no_wrap=column == "name" and longest <= WHOLE_NAME,
         )
-    for thing in objects:
-        table.add_row(*row_of(thing))
+    for row in rows:
+        table.add_row(*row)
 
     console.print(table)
     for line in (*doubts_of(scene), *remarks):

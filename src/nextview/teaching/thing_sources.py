@@ -102,6 +102,11 @@ def find_things(
     )
     things = [_of_frames(path) for path in captures]
     things += [ThingSource(entry.name, entry.label, entry.path) for entry in entries]
+    if not things and is_capture(folder):
+        raise DatasetError(
+            f"{folder}: is the capture of one thing: give the folder above, with a folder for each"
+            " thing"
+        )
     if not things:
         text = (
             f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder or bag of depth"
