@@ -10,7 +10,7 @@ demo: .venv/installed  ## name everything on a bundled table, with the base inst
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
 	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # for two cores, as tests wait, too; one file is run by one process, of one thread; what it imports is compiled once
 
-# Folder with clones of the repositories in ros2/environment.py; those that are missing are cloned.
+# Folder with clones of the ten repositories in ros2/environment.py; those that are missing are cloned from GitHub.
 ROS_SOURCES ?= .venv-ros/src
 
 test-ros: .venv-ros/installed  ## run the ROS 2 node; Python 3.11, CMake and a C++ compiler, no ROS installation

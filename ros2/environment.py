@@ -4,8 +4,8 @@
 
 Installs rclpy and what it needs from wheels, and nextview. Builds what has no wheels with CMake and
 a C++ compiler: nextview_msgs, tf2_msgs, vision_msgs, moveit_msgs and the commands ros2 and
-ros2 launch. Their repositories are cloned into the folder SOURCES (ENVIRONMENT/src by default);
-those that are already there are not. Then
+ros2 launch. Their repositories are cloned into the folder SOURCES (ENVIRONMENT/src by default)
+first; those that are already there are not, so that a folder with all of them needs no GitHub. Then
 
     source .venv-ros/bin/activate
     export AMENT_PREFIX_PATH=$VIRTUAL_ENV
@@ -114,11 +114,38 @@ def mend_paths(environment: Path) -> None:
             path.write_text(mended)
 
 
-def clone(repository: str, tag: str, folder: Path) -> None:
-    """Clone a repository of GitHub, unless it is there."""
-    if not folder.exists():
-        where = ("--depth", "1", "--branch", tag, f"https://github.com/{repository}")
-        run("git", "clone", "--quiet", *where, folder)
+def folder_of(repository: str, sources: Path) -> Path:
+    """Where a repository is cloned."""
+    return sources / repository.split("/")[1]
+
+
+def clone(sources: Path) -> None:
+    """Clone the repositories that are not there; without GitHub, say which ones are missing."""
+    for repository, tag, _ in SOURCES:
+        folder = folder_of(repository, sources)
+        if folder.exists():
+            continue
+        address = f"https://github.com/{repository}"
+        try:
+            done = subprocess.run(
+                ["git", "clone", "-q", "--depth", "1", "-b", tag, address, str(folder)],
+                capture_output=True,
+                text=True,
+                env=os.environ | {"GIT_TERMINAL_PROMPT": "0"},
+            )
+        except FileNotFoundError:
+            raise SystemExit("git is not installed, and this script clones") from None
+        if done.returncode:
+            missing = [
+                f"{name} ({branch})"
+                for name, branch, _ in SOURCES
+                if not folder_of(name, sources).exists()
+            ]
+            raise SystemExit(
+                f"{address} cannot be cloned: where GitHub is not reached, put clones of"
+                f" {', '.join(missing)} into a folder, and name it: make test-ros"
+                f" ROS_SOURCES=FOLDER, or {Path(sys.argv[0]).name} ENVIRONMENT FOLDER"
+            )
 
 
 def build(environment: Path, package: Path) -> None:
@@ -207,14 +234,15 @@ def main() -> None:
     # CMake takes relative paths from the folder of each build
     environment = Path(sys.argv[1]).resolve()
     sources = Path(sys.argv[2]) if len(sys.argv) == 3 else environment / "src"
+    print("repositories ...", flush=True)
+    clone(sources)
     for name, step in (("wheels", install), ("paths", mend_paths)):
         print(f"{name} ...", flush=True)
         step(environment)
     print("nextview_msgs ...", flush=True)
     build(environment, ROOT / "ros2" / "nextview_msgs")
-    for repository, tag, packages in SOURCES:
-        folder = sources / repository.split("/")[1]
-        clone(repository, tag, folder)
+    for repository, _, packages in SOURCES:
+        folder = folder_of(repository, sources)
         for package in packages:
             print(f"{(folder / package).resolve().name} ...", flush=True)
             build(environment, (folder / package).resolve())

@@ -4,7 +4,8 @@ ROS itself is not here; ``rosbags`` is.
 """
 
 import ast
-import importlib
+import importlib.util
+import re
 import sys
 import threading
 import xml.etree.ElementTree as ET
@@ -38,6 +39,7 @@ from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.sensing import Frame, ObservedObject
 
 ROS = Path(__file__).parents[1] / "ros2"
+PAGE = (ROS.parent / "docs/ros2.md").read_text(encoding="utf-8")
 sys.path.insert(0, str(ROS / "nextview_ros"))
 from nextview_ros import conversion
 
@@ -754,3 +756,82 @@ def test_its_packages_are_of_this_version(package):
     root = ET.parse(ROS / package / "package.xml").getroot()
     assert root.findtext("name") == package
     assert root.findtext("version") == nextview.__version__
+
+
+@pytest.fixture
+def environment(monkeypatch, tmp_path):
+    """The script that makes an environment, where GitHub is not reached."""
+    spec = importlib.util.spec_from_file_location("environment", ROS / "environment.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    git = tmp_path / "bin/git"
+    git.parent.mkdir()
+    git.write_text(
+        "#!/bin/sh\necho 'fatal: Could not resolve host: github.com' >&2; exit 128\n"
+    )
+    git.chmod(0o755)
+    monkeypatch.setenv("PATH", str(git.parent), prepend=":")
+    monkeypatch.setattr(script, "PYTHON", sys.version_info[:2])
+    monkeypatch.setattr(
+        sys, "argv", ["environment.py", "venv", str(tmp_path / "clones")]
+    )
+    return script
+
+
+def test_without_github_the_environment_ends_at_once_with_one_sentence(
+    environment, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(environment, "install", MagicMock(side_effect=AssertionError))
+    (tmp_path / "clones/launch").mkdir(parents=True)
+    with pytest.raises(SystemExit) as end:
+        environment.main()
+    said = str(end.value.code)
+    assert "\n" not in said
+    assert "https://github.com/ros2/geometry2 cannot be cloned" in said
+    assert "moveit/moveit_msgs (2.6.0)" in said
+    assert "ros2/launch (" not in said
+    assert "make test-ros ROS_SOURCES=FOLDER" in said
+
+
+def test_clones_that_are_there_need_no_github(environment, tmp_path, monkeypatch):
+    for repository, *_ in environment.SOURCES:
+        environment.folder_of(repository, tmp_path / "clones").mkdir(parents=True)
+    steps = {
+        name: MagicMock() for name in ("install", "mend_paths", "build", "link_node")
+    }
+    for name, step in steps.items():
+        monkeypatch.setattr(environment, name, step)
+    environment.main()
+    assert all(step.called for step in steps.values())
+    assert len(environment.SOURCES) == 10
+    assert PAGE.count("clones ten repositories") == 2
+
+
+def test_the_page_names_the_type_and_the_qos_of_each_topic_that_it_shows():
+    """``ros2 topic echo`` knows neither before it has found the node."""
+    types = {
+        "/detections": ("vision_msgs/msg/Detection3DArray", True),
+        "/planning_scene": ("moveit_msgs/msg/PlanningScene", True),
+        "/next_pose": ("geometry_msgs/msg/PoseStamped", True),
+        "/tf": ("tf2_msgs/msg/TFMessage", False),
+    }
+    shown = [
+        line.partition("#")[0].split()
+        for line in PAGE.splitlines()
+        if line.startswith("ros2 topic echo")
+    ]
+    assert {words[-2] for words in shown} == types.keys()
+    source = (ROS / "nextview_ros/nextview_ros/node.py").read_text(encoding="utf-8")
+    for words in shown:
+        kind, latched = types[words[-2]]
+        assert words[-1] == kind
+        name = kind.rpartition("/")[2]
+        published = (
+            rf"create_publisher\(\s*{name},\s*\"{words[-2].strip('/')}\",\s*LATCHED"
+        )
+        assert bool(re.search(published, source)) == latched
+        for option in (
+            "--qos-durability transient_local",
+            "--qos-reliability reliable",
+        ):
+            assert (option in " ".join(words)) == latched
