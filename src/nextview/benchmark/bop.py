@@ -167,7 +167,7 @@ def look_for_models(
         dataset: folder of a whole BOP dataset: models/, test/ and the file of its targets.
         out: file to write, .csv; BOP wants METHOD_DATASET-SPLIT.csv, such as
             nextview_lmo-test.csv.
-        how: what is looked for.
+        how: models and images.
         overwrite: replace OUT.
         track: follows the images, and the models that are taught.
 

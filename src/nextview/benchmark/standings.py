@@ -188,13 +188,13 @@ def leaderboard_of(
     the images, episode by episode.
 
     Args:
-        folder: of the files of results, .json.
+        folder: with the result files of nextview submit (.json).
         archive: folder of the archive, with its truth.
         out: folder to write, with leaderboard.html and leaderboard.md.
         reference: method with which the others are compared; by default the blind one that is right
             most often after the first view.
         samples: number of bootstrap samples.
-        seed: of the bootstrap.
+        seed: seed of the bootstrap.
         overwrite: replace the two files in OUT.
         track: follows the files.
 

@@ -165,7 +165,7 @@ def submit(
     Args:
         archive: folder of the archive, such as nextview-bench-1.0.
         out: file of results to write, .json.
-        how: which method runs.
+        how: method and number of views.
         overwrite: replace OUT.
         track: follows the episodes.
 

@@ -54,7 +54,7 @@ COARSER = 0.002
 
 @dataclass(frozen=True)
 class TeachingOptions:
-    """Options of the teaching.
+    """Meshes, camera and symmetries.
 
     Attributes:
         unit: unit of length of the mesh files; with it, size counts as evidence, and things are
