@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -24,9 +25,10 @@ from pipeline import run_python, some_predictions
 from nextview import errors
 from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
-from nextview.cli.call_with_arguments import call, find
+from nextview.cli.call_with_arguments import call, entry, find
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
+from nextview.cli.option_names import option_names
 from nextview.cli.option_values import value_word
 from nextview.cli.predict import summed_up
 from nextview.cli.words import EXAMPLES, OTHER_WORDS
@@ -55,16 +57,16 @@ def test_every_command_explains_itself(name, capsys):
     shown = capsys.readouterr().out
     assert shown.startswith(f"usage: nextview {name} ")
     assert "(required)" in shown or name in ("demo", "demo-episode", "explore")
-    assert not re.search(
-        r"^│ --[^│]*?( {2,}\S[^│]*)?│\n│ (--|\(default)", bare(shown), re.M
-    )
+    rows = [row.replace("│", " ").rstrip() for row in shown.splitlines()]
+    for row, following in pairwise(rows):  # each option has a help, beside it or below
+        beside = re.search(r"\S {2,}(\S)", row) or re.match(r" +(\S)", following)
+        if re.match(r"  --[a-z]", row):
+            assert beside, row
+            assert beside[1] not in "-(", row
     assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
+    explained = {row.split()[0] for row in rows if re.match(r"  --[a-z]", row)}
+    assert explained == option_names(entry(COMMANDS[name])[0])
     assert shown.splitlines()[-1] == f"example: nextview {EXAMPLES[name]}"
-
-
-def bare(shown: str) -> str:
-    """The options of a help whose explanation begins on the same line are left out."""
-    return re.sub(r"^│ --\S+( \S+)*? {2,}\S.*\n", "", shown, flags=re.M)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

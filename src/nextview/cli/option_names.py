@@ -1,7 +1,7 @@
 """The names of the options of a command."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from itertools import takewhile
 from typing import Any
@@ -48,17 +48,21 @@ def option_names(function: Callable[..., Any]) -> set[str]:
     Args:
         function: of the command, see ``entry``.
     """
-    defaults: dict[str, Any] = {}
-    for parameter in inspect.signature(function).parameters.values():
-        default = parameter.default
-        positional = parameter.kind is parameter.POSITIONAL_ONLY
-        if is_dataclass(default):
-            defaults |= {
-                one.name: getattr(default, one.name) for one in fields(default)
-            }
-        elif default is not parameter.empty and not positional:
-            defaults[parameter.name] = default
-    return {
-        f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
-        for name, default in defaults.items()
+    parameters = inspect.signature(function).parameters.values()
+    defaults = {
+        one.name: one.default
+        for one in parameters
+        if one.default is not one.empty and one.kind is not one.POSITIONAL_ONLY
     }
+    return set(_typed(defaults))
+
+
+def _typed(defaults: dict[str, Any]) -> Iterator[str]:
+    """Yield the options for some parameters, and for those inside of dataclasses."""
+    for name, default in defaults.items():
+        if is_dataclass(default):
+            yield from _typed(
+                {f.name: getattr(default, f.name) for f in fields(default)}
+            )
+        else:
+            yield f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
