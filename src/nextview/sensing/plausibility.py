@@ -9,7 +9,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.lean import Lean
-from nextview.sensing.mistakes import mistakes_in_poses
+from nextview.sensing.mistakes import focal_that_levels, mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
@@ -28,6 +28,8 @@ FARTHEST_POINT_ASIDE = 3.0
 # metres: few depth cameras measure nearer than the first, and hardly any nearer than the second
 NEAR_RANGE = 0.25
 NEAREST_RANGE = 0.1
+# degrees by which few poses and tables lean
+FAR_FROM_LEVEL = 6.0
 CHANGED = 0.04
 CHANGED_SHARE = 0.03
 """Relative change of a changed pixel's depth, and share of changed pixels in a changed image."""
@@ -59,6 +61,28 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
         )
         found.append(ViewWarning("unit", message, holds=False))
     return found
+
+
+def check_level(frame: Frame, normal: Float, upwards: Float) -> list[ViewWarning]:
+    """Warn if the support plane would be level with another focal length.
+
+    Args:
+        frame: with a pose.
+        normal: of the plane, (3,), world.
+        upwards: direction against gravity, (3,), world.
+    """
+    leans = np.degrees(np.arccos(np.clip(normal @ upwards, -1, 1)))
+    mistake = focal_that_levels(frame, normal, upwards)
+    if mistake is None or leans < FAR_FROM_LEVEL:
+        return []
+    return [
+        ViewWarning(
+            "intrinsics",
+            f"the support plane leans by {leans:.0f} degrees, and if it is level,"
+            f" {mistake.sentence}",
+            holds=False,
+        )
+    ]
 
 
 def check_sizes(
