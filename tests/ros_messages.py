@@ -6,7 +6,12 @@ from io import BytesIO
 
 import numpy as np
 from PIL import Image
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+)
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -128,13 +133,17 @@ def tf_message(*transforms):
     return message(TF, transforms=list(transforms))
 
 
-def write_bag(path, messages, mcap=True, empty=()):
+def write_bag(path, messages, mcap=True, empty=(), compressed=None):
     """Write messages, each a topic, seconds at which it was recorded, and the message itself.
 
-    ``empty`` are the types of topics without any, by name.
+    ``empty`` are the types of topics without any, by name; ``compressed`` is "file" or "message".
     """
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as bag:
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compressed is not None:
+        mode = CompressionMode[compressed.upper()]
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer as bag:
         connections = {}
         for topic, kind in dict(empty).items():
             bag.add_connection(topic, kind, typestore=STORE)

@@ -28,6 +28,7 @@ from nextview.benchmark.pose_recall import (
     symmetries_of,
 )
 from nextview.captured.bop_dataset import BopModelInfo, ContinuousSymmetry
+from nextview.captured.folders import is_capture, read_capture
 from nextview.cli.main import main
 from nextview.errors import NextviewError
 
@@ -234,6 +235,105 @@ def test_models_are_taught_once_where_no_memory_is_named(tmp_path):
     assert look_for_models(dataset, out, overwrite=True).learned is None
     assert (card.read_bytes(), card.stat().st_mtime_ns) == before
 
+    # the same names are not the same models, and another camera is not the same memory
+    with pytest.raises(
+        NextviewError, match="taught for the sensor wrist, not for kinect"
+    ):
+        look_for_models(dataset, out, BopOptions(sensor="kinect"), overwrite=True)
+    path = dataset / "models/obj_000014.ply"
+    model = trimesh.load(path)
+    model.apply_scale((1, 1, 1.2))
+    model.export(path)
+    with pytest.raises(
+        NextviewError, match=r"another file than \S+obj_000014.ply is now"
+    ):
+        look_for_models(dataset, out, overwrite=True)
+    assert read_results(out)[0]["obj_id"] == NUMBERS["mug"]
+
+
+def test_objects_without_a_model_are_listed_and_do_not_count(own, tmp_path, capsys):
+    path = own / SCENE / "scene_gt.json"
+    objects = json.loads(path.read_text())
+    for image, number in (("3", 77), ("7", 77), ("7", 41)):
+        objects[image].insert(0, {**objects[image][0], "obj_id": number})
+    path.write_text(json.dumps(objects))
+    out = tmp_path / "out.csv"
+    main(["bop", str(own), str(out), "--models", "ycb", "--ids", *IDS])
+    said = capsys.readouterr()
+    assert (
+        "object 41 has no model and does not count: it is in the images 1 time"
+        in said.err
+    )
+    assert (
+        "object 77 has no model and does not count: it is in the images 2 times"
+        in said.err
+    )
+    (row,) = [row for row in said.out.splitlines() if row.split()[:1] == ["all"]]
+    assert row.split()[:2] == ["all", "4"]
+
+
+def test_round_models_without_symmetries_are_told(own, tmp_path, capsys):
+    """The scan of a can stands for model 14; models_info.json then gets its axis."""
+    ids = ("--ids", "cracker_box=2", "tomato_soup_can=14", "--frames", "1")
+    main(["bop", str(own), str(tmp_path / "a.csv"), "--models", "ycb", *ids])
+    assert "has no symmetries_continuous of round models (14)" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    info = json.loads((own / INFO).read_text())
+    info["14"]["symmetries_continuous"] = [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]
+    (own / INFO).write_text(json.dumps(info))
+    main(["bop", str(own), str(tmp_path / "b.csv"), "--models", "ycb", *ids])
+    assert "round models" not in capsys.readouterr().err
+
+
+def of_camera(dataset: Path, *cameras: str) -> None:
+    """Give the files of the scene to cameras, as BOP's datasets of several sensors name them."""
+    scene = dataset / SCENE
+    for camera in cameras:
+        for kind in ("scene_camera", "scene_gt"):
+            shutil.copy(scene / f"{kind}.json", scene / f"{kind}_{camera}.json")
+        shutil.copytree(scene / "depth", scene / f"depth_{camera}")
+    for kind in ("scene_camera", "scene_gt"):
+        (scene / f"{kind}.json").unlink()
+    shutil.rmtree(scene / "depth")
+
+
+def test_files_of_one_of_several_cameras_are_read(own, tmp_path, capsys):
+    of_camera(own, "photoneo")
+    shutil.copy(
+        own / SCENE / "scene_camera_photoneo.json",
+        own / SCENE / "scene_camera_cam1.json",
+    )
+    run = look_for_models(own, tmp_path / "out.csv", HOW)
+    assert {line["im_id"] for line in read_results(run.out)} == {3, 7}
+    assert sum(one.objects for one in run.hits.values()) == 4
+
+    capture = read_capture(own / SCENE)
+    assert [frame.name for frame in capture.frames] == ["000003", "000007"]
+    assert is_capture(own / SCENE)
+
+    shutil.copytree(own / SCENE / "depth_photoneo", own / SCENE / "depth_cam1")
+    out = tmp_path / "new.csv"
+    options = ("--models", "ycb", "--ids", *IDS)
+    found = refused(capsys, "bop", own, out, *options)
+    assert "--camera names one of cam1, photoneo" in found
+    found = refused(capsys, "bop", own, out, *options, "--camera", "xyz")
+    assert "no scene_camera_xyz.json; there are cam1, photoneo" in found
+    one = BopOptions(models="ycb", ids=IDS, camera="cam1", frames=1)
+    assert look_for_models(own, out, one).images == 1
+    both = read_capture(own / SCENE)
+    assert both.cameras == ("cam1", "photoneo")
+    assert [len(together) for together in both.moments] == [2, 2]
+
+
+def test_cameras_without_depth_are_told(own, tmp_path, capsys):
+    of_camera(own, "gray1", "gray2")
+    for camera in ("gray1", "gray2"):
+        shutil.rmtree(own / SCENE / f"depth_{camera}")
+    found = refused(capsys, "bop", own, tmp_path / "new.csv")
+    assert "none of its cameras (gray1, gray2) has depth images (depth_gray1/" in found
+    assert "none of its cameras (gray1, gray2)" in refused(capsys, "look", own / SCENE)
+
 
 # What users do wrong
 
@@ -284,11 +384,6 @@ MISTAKES = {
         put(f"{SCENE}/scene_camera.json", "{}"),
         (),
         "has no camera of the image 3",
-    ),
-    "an unknown object": (
-        put(f"{SCENE}/scene_gt.json", '{"3": [{"obj_id": 5}]}'),
-        (),
-        "the object 5 is none of models_info.json",
     ),
     "an object without a pose": (
         put(f"{SCENE}/scene_gt.json", '{"3": [{"obj_id": 2}]}'),

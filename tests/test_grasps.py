@@ -1,5 +1,6 @@
 """Grasps of things, and those that are free in a scene, against closed forms and plain loops."""
 
+import json
 import re
 import sys
 import types
@@ -124,6 +125,14 @@ def test_a_file_of_grasps_is_read_as_it_was_written(proposed, tmp_path):
         load_grasps(path)
     with pytest.raises(NextviewError, match="rigid"):
         Grasp(np.diag([2.0, 1, 1, 1]), 0.01)
+    with pytest.raises(UsageError, match=r"width of a grasp.* above 0"):
+        Grasp(np.eye(4), 0.0)
+    rows = np.eye(4).tolist()
+    path.write_text(
+        json.dumps({"grasps": {"box": [{"pose": rows, "width": w} for w in (0.1, 0)]}})
+    )
+    with pytest.raises(DatasetError, match=r"things.grasps: grasp 2 of box: the width"):
+        load_grasps(path)
     with pytest.raises(UsageError):
         Gripper(opening=0.0)
 
@@ -303,6 +312,22 @@ def test_the_arm_is_asked_for_the_best_grasps_only(lonely):
     )
     assert len(turned) == 1
     assert scene.grasps(names["grasps"], names["GRIPPER"], lambda pose: False) == []
+
+
+def test_grasps_in_millimetres_are_refused(lonely):
+    names, scene, *_ = lonely
+    in_millimetres = {}
+    for name, some in names["grasps"].items():
+        poses = [one.pose.copy() for one in some]
+        for pose in poses:
+            pose[:3, 3] *= 1000
+        in_millimetres[name] = [
+            replace(one, pose=pose) for one, pose in zip(some, poses, strict=True)
+        ]
+    with pytest.raises(
+        UsageError, match=r"no finger touches it: are their .* millimetres"
+    ):
+        scene.grasps(in_millimetres, names["GRIPPER"])
 
 
 def test_a_neighbour_and_a_larger_clearance_leave_fewer_grasps(lonely, parts):

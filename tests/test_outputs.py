@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -183,6 +184,89 @@ def test_no_command_is_forgotten():
     assert {
         name.partition(" --")[0] for name in WRITES
     } == COMMANDS.keys() - FITS - others
+
+
+NOWHERE = {
+    "recognise": (
+        "recognise none.off --figure {}.png",
+        "recognise none.off --record {}.rrd",
+    ),
+    "look": (
+        "look none --figure {}.png",
+        "look none --explorer {}.html",
+        "look none --record {}.rrd",
+    ),
+    "demo": ("demo --out {}",),
+    "demo-episode": ("demo-episode --figure {}.svg",),
+    "learn": ("learn none {}",),
+    "capture": ("capture none.off {}",),
+    "download": ("download modelnet10 {}",),
+    "scenes": ("scenes none {}",),
+    "render": ("render none {}.zarr",),
+    "measure": ("measure {}.zarr",),
+    "train recogniser": ("train recogniser none {}",),
+    "train map": ("train map none {}",),
+    "train segmentation": ("train segmentation {}",),
+    "train gain": ("train gain none.npz {}.json",),
+    "export recogniser": ("export recogniser none none {}",),
+    "export map": ("export map none none {}",),
+    "export segmentation": ("export segmentation none {}",),
+    "predict": ("predict none {}.npz",),
+    "fit calibration": ("fit calibration none.npz {}.json",),
+    "fit size": ("fit size none none.npz {}.json",),
+    "fit unknown": ("fit unknown none {}.json",),
+    "fit valleys": ("fit valleys none.npz {}.json",),
+    "evaluate": ("evaluate none.npz {}", "evaluate none.npz good --figures {}"),
+    "benchmark classes": ("benchmark classes none.npz {}",),
+    "benchmark things": ("benchmark things none {}",),
+    "benchmark tables": ("benchmark tables none none {}",),
+    "bop": ("bop none {}.csv",),
+    "submit": ("submit none {}.json",),
+    "leaderboard": ("leaderboard none none {}",),
+    "report": ("report none {}.html", "report none good.html --figures {}"),
+}
+"""The outputs of each command, all of whose inputs are missing."""
+WRITE_NOTHING = {"check", "completion", "explore", "list"}
+
+
+def test_every_output_of_every_command_is_in_the_table():
+    assert NOWHERE.keys() == COMMANDS.keys() - WRITE_NOTHING
+
+
+@pytest.mark.parametrize("line", [line for lines in NOWHERE.values() for line in lines])
+def test_an_output_that_cannot_be_written_is_refused_before_an_input_is_read(
+    line, tmp_path, monkeypatch, capsys
+):
+    """In a file; in a folder that takes no files, whatever one's rights are; by too long a name."""
+    if line.startswith(("train", "export", "fit unknown")):
+        pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("mine")
+    places = ["/proc/out"]
+    if line.startswith("look"):
+        places += ["file/out", "x" * 300]
+    for place in places:
+        said = refused(capsys, *line.format(place).split())
+        assert f"{place[:100]}" in said
+        assert "cannot be written (" in said
+    assert contents(tmp_path) == {tmp_path / "file": b"mine"}
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "package"),
+    [
+        ("recognise none.off --record e.rrd", "rerun"),
+        ("look none --record e.rrd", "rerun"),
+        ("look none --explorer e.html", "viser"),
+    ],
+)
+def test_a_package_that_an_output_needs_is_missed_before_an_input_is_read(
+    line, package, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert f"needs the package {package}" in refused(capsys, *line.split())
 
 
 def test_the_demo_draws_over_its_own_picture_and_no_other(

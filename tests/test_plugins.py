@@ -9,6 +9,9 @@ import nextview
 from nextview import checks
 from nextview.data.samples import sample_mesh
 from nextview.errors import PolicyError, UsageError
+from nextview.scene.grasps import FreeGrasp, within_reach
+from nextview.segmentation.instances import instances_of
+from nextview.sensing.frame import Frame
 
 LONGEST = 300
 
@@ -104,11 +107,38 @@ def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_
     assert len(session.views) == 1
 
 
-def test_what_a_callable_of_a_program_raises_is_the_programs():
-    """It is called by whoever handed it in, who may be waiting for that very error."""
+def test_what_a_callable_of_a_program_raises_is_named_and_kept():
+    """Whoever handed it in may be waiting for that very error: it is the cause."""
     camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
     session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
-    session.reachable = lambda pose: {}["the arm is off"]
-    with pytest.raises(KeyError, match="the arm is off"):
-        session.update(camera.observe(session.pose))
-    assert session.views == []
+    for name, asked_for in (
+        ("reachable", "whether a view can be reached"),
+        ("travel_cost", "what a move costs"),
+    ):
+        setattr(session, name, lambda *poses: {}["the arm is off"])
+        sentence = (
+            f"asked {asked_for}, the function raised .*arm is off.* at test_plugins"
+        )
+        with pytest.raises(UsageError, match=sentence) as raised:
+            session.update(camera.observe(session.pose))
+        assert isinstance(raised.value.__cause__, KeyError)
+        assert session.views == []
+        setattr(session, name, None)
+
+
+def test_what_a_segmentation_or_the_arm_raises_is_named():
+    def of_mine(*given):
+        raise OSError("the camera is off")
+
+    frame = Frame(np.ones((48, 64)), [[60, 0, 32], [0, 60, 24], [0, 0, 1]])
+    with pytest.raises(
+        UsageError, match=r"the segmentation raised OSError.* at test_pl"
+    ):
+        instances_of(of_mine, frame)
+    grasp = FreeGrasp(1, "mug", np.eye(4), 0.04, 0.06, 0.0, 1.0)
+    with pytest.raises(
+        UsageError, match=r"a grasp can be reached.* OSError.* at test_pl"
+    ):
+        within_reach([grasp], of_mine, None)
+    with pytest.raises(UsageError, match="is true or false, not None"):
+        within_reach([grasp], lambda pose: None, None)

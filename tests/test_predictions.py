@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import SPHERE, some_predictions
+from pipeline import SPHERE, refused, some_predictions
 from scipy.special import softmax
 
+from nextview.cli.main import main
 from nextview.data.predicting import predict
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import render
@@ -235,6 +236,21 @@ def test_the_same_mesh_under_two_labels_is_marked_across_splits(
         "chair_4": True,
         "monitor_4": False,
     }
+
+
+def test_maps_of_other_viewpoints_are_left_out_or_refused_before_any_work(
+    furniture, models, tmp_path, capsys
+):
+    """One ring of 12 views; the networks of the tests are of the 40."""
+    store, out = tmp_path / "views.zarr", tmp_path / "p.npz"
+    meshes = Path(shutil.copytree(furniture / "chair/test", tmp_path / "m/chair/test"))
+    list(render(meshes.parents[1], store, ViewSphere.named("12"), 32, workers=0))
+    begin = ["predict", str(store), str(out), "--models", str(models), "--workers", "0"]
+    assert "of other views than the 12" in refused(capsys, *begin, "--maps", "lem")
+    assert not list(tmp_path.glob(".p.npz*"))
+    main(begin)
+    assert "lem" in capsys.readouterr().err
+    assert Predictions.load(out).maps == {}
 
 
 KILLED = """

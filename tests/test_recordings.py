@@ -17,6 +17,7 @@ from ros_messages import (
     DEPTH,
     SHAPE,
     K,
+    at,
     compressed_message,
     header,
     image_message,
@@ -246,8 +247,8 @@ def test_the_image_of_a_standing_camera_can_be_chosen(
     bag = write_bag(tmp_path / "bag", standing(times))
     assert len(read_capture(bag).frames) == min(most, 6)
     chosen = {"first": 0, "last": 5, 0: 0, 2.5: 1, 2.6: 2, 7.1: 5}
-    for at, number in chosen.items():
-        capture = read_capture(bag, at=at)
+    for when, number in chosen.items():
+        capture = read_capture(bag, at=when)
         (captured,) = capture.frames
         depth = depth_image(number)
         np.testing.assert_allclose(captured.read().depth, depth, atol=1e-6)
@@ -419,6 +420,32 @@ def test_a_damaged_bag_is_named(what, mcap, tmp_path):
     ):
         for frame in read_capture(bag).frames:
             frame.read()
+
+
+@pytest.mark.parametrize("mcap", [True, False])
+def test_a_compressed_file_of_a_bag_expands_within_limits(mcap, tmp_path, monkeypatch):
+    """Noise shrinks to no hundredth; images of one distance do, and fill no disk."""
+    said = [*tf_of_an_arm(), *images_at([1.0, 2.0])]
+    bag = write_bag(tmp_path / "bag", said, mcap, compressed="file")
+    plain = write_bag(tmp_path / "plain", said, mcap)
+    assert not [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
+    for one, other in zip(
+        read_capture(bag).frames, read_capture(plain).frames, strict=True
+    ):
+        np.testing.assert_array_equal(one.read().depth, other.read().depth)
+
+    monkeypatch.setattr(bag_reader, "LARGEST_BAG_CHUNK", 2**16)
+    assert len(read_capture(bag).frames) == 2
+    flat = image_message(
+        np.full((480, 640), 700), "16UC1", header=header("optical", 0.0)
+    )
+    times = START + 0.1 * np.arange(40)
+    many = [(DEPTH, time, at(flat, time)) for time in times]
+    bomb = write_bag(tmp_path / "bomb", [*said, *many], mcap, compressed="file")
+    with pytest.raises(
+        DatasetError, match=r"bomb: the bag is damaged.* holds more than"
+    ):
+        read_capture(bomb)
 
 
 def test_a_bag_without_metadata_is_read_by_its_only_file(tmp_path):

@@ -1,6 +1,7 @@
 """All things on a table: found, named and placed in one frame or several, and what goes wrong."""
 
 import json
+import re
 from copy import copy
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
+from nextview.sensing.plausibility import check_sizes
 from nextview.simulation.tables import SimulatedTable, TableCamera
 
 
@@ -100,6 +102,45 @@ def test_a_frame_without_a_plane_is_refused(ycb):
     with pytest.raises(ObservationError, match="no support plane"):
         scene.update(Frame(depth, [[300, 0, 160], [0, 300, 120], [0, 0, 1]], view(20)))
     assert scene.frames == ()
+
+
+@pytest.mark.parametrize("times", [0.7, 1.6])
+def test_a_focal_length_of_another_camera_is_named_and_not_the_pose(
+    times, ycb, ycb_meshes
+):
+    """It is refused where nothing level is left in sight, and warned of where it may be right."""
+    frame = camera_over([ycb_meshes["cracker_box"]]).frame(view(20))
+    k = frame.intrinsics.copy()
+    right = k[0, 0]
+    k[[0, 1], [0, 1]] *= times
+    try:
+        warnings = (
+            nextview.Scene(ycb, (0, 0, 1)).update(replace(frame, intrinsics=k)).warnings
+        )
+        told = next(one.message for one in warnings if one.name == "intrinsics")
+    except ObservationError as error:
+        told = str(error)
+    assert "the focal length is some" in told
+    (fits,) = re.findall(r"about (\d+) fit", told)
+    assert float(fits) == pytest.approx(right, rel=0.08)
+
+
+def test_depth_nearer_than_a_camera_measures_is_told(ycb, ycb_meshes):
+    frame = camera_over([ycb_meshes["mug"]]).frame(view(20))
+    look = nextview.Scene(ycb).update(frame.with_depth(frame.depth / 10))
+    assert [
+        warning.name for warning in look.warnings if "so near" in warning.message
+    ] == ["unit"]
+    assert not nextview.Scene(ycb).update(frame).warnings
+
+    # a fourth of a distance is measured by some cameras: what is seen has to be too small, too
+    quarter = frame.with_depth(frame.depth / 4)
+    small = [np.array([0.02, 0.02, 0.025])]
+    (warning,) = check_sizes(quarter, small, 0.1)
+    assert "several times too small" in warning.message
+    assert check_sizes(quarter, small, 0.05) == []
+    assert check_sizes(frame, small, 0.1) == []
+    assert check_sizes(quarter, [], 0.1) == []
 
 
 def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):

@@ -204,6 +204,33 @@ def test_an_invalid_own_segmentation_is_rejected(given):
         instances_of(lambda frame: given, frame)
 
 
+def _labels_with(none, beside):
+    labels = np.full((48, 64), none)
+    labels[10:20, 10:20] = beside
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (np.ones((1, 48, 64), bool), "covers the whole image"),
+        (np.full((48, 64), 7), "covers the whole image"),
+        (_labels_with(255, 3), "seem to be 255 there"),
+        (_labels_with(-1, 0), "seem to be -1 there"),
+    ],
+)
+def test_background_that_is_taken_for_a_thing_is_told(given, sentence):
+    frame = level_frame(np.ones((48, 64), np.float32))
+    with pytest.raises(ObservationError, match=sentence):
+        instances_of(lambda frame: given, frame)
+
+
+def test_a_thing_with_the_number_255_is_one():
+    frame = level_frame(np.ones((48, 64), np.float32))
+    assert len(instances_of(lambda frame: _labels_with(0, 255), frame).masks) == 1
+    assert len(instances_of(lambda frame: _labels_with(-1, 4), frame).masks) == 1
+
+
 def test_learned_segmenter_needs_its_card(tmp_path):
     with pytest.raises(ModelError, match=r"none\.json"):
         LearnedSegmenter(tmp_path / "none.json")

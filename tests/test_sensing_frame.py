@@ -187,6 +187,7 @@ WRONG = {
     "millimetres?": {"depth": DEPTH * 1000},
     "inches": {"depth": DEPTH * 39.37},
     "scaled to 0 .. 1": {"depth": DEPTH / 1000},
+    "measures so near": {"depth": DEPTH / 20},
     "nothing is seen": {"depth": np.full(SHAPE, np.nan)},
     "transposed, or with a skew": {"intrinsics": INTRINSICS.T},
     "in pixels, not in millimetres": {"intrinsics": np.diag([3.6, 3.6, 1])},

@@ -207,6 +207,13 @@ def test_wrong_use_is_refused(ycb, watched):
     tracker.update(frame, 2.0)
     with pytest.raises(UsageError, match="the time"):
         tracker.update(frame, 1.0)
+    with pytest.raises(UsageError, match=r"in seconds, and 1.7e.18 is none"):
+        nextview.Tracker(scene).update(frame, 1.7e18)
+    with pytest.raises(
+        UsageError, match=r"in seconds, and 3.333e.07 after the last one"
+    ):
+        tracker.update(frame, 2.0 + 1e9 / 30)
+    tracker.update(frame, 2.0 + 1 / 30)
 
 
 def test_predicted_motion_agrees_with_simulated_motions():

@@ -57,6 +57,38 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
         overwrite: whether a file that exists may be replaced.
         folder: whether the output is a folder.
     """
+    check_writable(path)
+    _check_free(path, overwrite, folder)
+
+
+def check_writable(path: Path) -> None:
+    """Refuse, before any work is done, an output whose place cannot be written.
+
+    It is tried: rights alone do not tell it, as for the administrator or a read-only disk.
+    ResultsError: nothing can be written in the folder, or where it would have to be made.
+
+    Args:
+        path: of a file or folder, which may be there.
+    """
+    try:
+        os.path.lexists(path)
+        place = path.absolute()
+        place = place if path.is_dir() and not path.is_symlink() else place.parent
+        place = next(p for p in (place, *place.parents) if p.exists())
+        if not place.is_dir():
+            raise ResultsError(f"{path}: cannot be written ({place} is not a folder)")
+        os.rmdir(tempfile.mkdtemp(prefix=".nextview-", dir=place))
+    except PermissionError:
+        raise ResultsError(
+            f"{path}: cannot be written (no permission to write in {place})"
+        ) from None
+    except OSError as error:
+        shown = one_line(str(path), LONGEST_PATH)
+        raise ResultsError(f"{shown}: cannot be written ({error.strerror})") from None
+
+
+def _check_free(path: Path, overwrite: bool, folder: bool = False) -> None:
+    """Refuse an output that exists and must not be replaced, see ``check_new``."""
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
 
@@ -72,14 +104,6 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
             raise ResultsError(
                 f"{path}: exists; give another name, or {option('overwrite', True)} to replace it"
             )
-
-    above = next(p for p in path.absolute().parents if p.exists())
-    if not above.is_dir():
-        raise ResultsError(f"{path}: cannot be written ({above} is not a folder)")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise ResultsError(
-            f"{path}: cannot be written (no permission to write in {above})"
-        )
 
 
 @contextmanager
@@ -97,7 +121,7 @@ def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
         part = temporary / path.name
         yield part
         _sync(part)
-        check_new(path, overwrite)  # it may have appeared meanwhile
+        _check_free(path, overwrite)  # it may have appeared meanwhile
         os.replace(part, path)
 
 
@@ -140,7 +164,7 @@ def new_folder(
             _sync(part / file)
 
         if not there:
-            check_new(path, overwrite, folder=True)
+            _check_free(path, overwrite, folder=True)
             if not path.exists():
                 os.rename(part, path)
                 _sync_folder(path.parent)
@@ -174,7 +198,7 @@ def _check_inside(folder: Path, file: Path, overwrite: bool) -> None:
     for above in file.parents:
         if (folder / above).is_symlink() and above != Path():
             raise ResultsError(f"{folder / above}: is a link; give what it points to")
-    check_new(folder / file, overwrite)
+    _check_free(folder / file, overwrite)
 
 
 class Unfinished(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -3,8 +3,9 @@
 import csv
 import hashlib
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -35,10 +36,12 @@ from nextview.files import (
     new_file,
     only_one,
     read_record,
+    sha256_of,
     unfinished,
     write_record,
 )
 from nextview.geometry.mesh import load_mesh
+from nextview.recognition.model_card import Taught
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
 from nextview.teaching.learn import CARD, Learned, learn_things
@@ -64,6 +67,8 @@ class BopOptions:
         split: folder of the scenes, such as test_primesense.
         targets: file that lists the images; by default DATASET/test_targets_bop19.json, or
             test_targets_bop24.json.
+        camera: the one whose images are looked at, where each has files of its own:
+            photoneo of scene_camera_photoneo.json; by default the only one with depth images.
         frames: number of images to look at, evenly spread over those of the targets, for a first
             try; by default all.
         camera_poses: use the poses of the cameras in scene_camera.json, in whose world z points
@@ -79,6 +84,7 @@ class BopOptions:
     ids: tuple[str, ...] = ()
     split: str = "test"
     targets: Path | None = None
+    camera: str | None = None
     frames: int | None = None
     camera_poses: bool = False
     unknown: float | None = None
@@ -135,6 +141,9 @@ class BopRun:
         hits: of each model that is in the images, by its number; None where the truth is not known.
         not_known: models that the memory does not know, by their numbers.
         learned: what was taught; None where a memory was there.
+        without_model: how often objects without a model are in the images, by their numbers.
+        round_ones: models that can be turned by any angle, of which models_info.json says nothing,
+            by their numbers.
     """
 
     out: Path
@@ -146,6 +155,8 @@ class BopRun:
     hits: dict[int, Hits] | None
     not_known: tuple[int, ...] = ()
     learned: Learned | None = None
+    without_model: dict[int, int] = field(default_factory=dict)
+    round_ones: tuple[int, ...] = ()
 
 
 def look_for_models(
@@ -185,7 +196,7 @@ def look_for_models(
         raise UsageError(f"{out}: the name ends in .csv")
     if how.frames is not None and how.frames < 1:
         raise UsageError(f"at least one frame is looked at, not {how.frames}")
-    read = read_bop_dataset(dataset, how.split, how.targets)
+    read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
     # a mistake in them is told before any work is done
@@ -225,6 +236,8 @@ def look_for_models(
         hits,
         tuple(sorted(set(read.models) - set(numbers.values()))),
         learned,
+        dict(sorted(Counter(n for i in images for n in read.without_model(i)).items())),
+        _round_ones(memory, numbers, read),
     )
 
 
@@ -269,21 +282,61 @@ def _memory(
         models = dataset.folder / MODELS_FOLDER
         return str(folder), learn_things(models, folder, options, track=track)
 
-    known = _things_of(str(folder))
-    names = {path.stem for path in dataset.models.values()}
-    if strange := sorted(set(known) - names):
+    if reason := _out_of_date(folder, dataset, how.sensor):
         raise UsageError(
-            f"{folder}: holds the memory of another dataset ({strange[0]}); remove it, or name the"
-            " right one with --models"
+            f"{folder}: {reason}; remove it, and the models are taught again, or name the right"
+            " one with --models"
         )
     return str(folder), None
 
 
-def _things_of(memory: str) -> list[str]:
-    """Names of the things that a memory knows."""
+def _out_of_date(folder: Path, dataset: BopDataset, sensor: str) -> str:
+    """Why the memory that an earlier run taught is not that of the models; "" if it is.
+
+    Models that are not in it may be some that could not be taught: they are told at the end.
+    """
+    taught = _taught(str(folder))
+    if not taught.sensor:
+        return "was taught by an earlier version"
+    if taught.sensor != sensor:
+        return f"was taught for the sensor {taught.sensor}, not for {sensor}"
+    models = {path.stem: path for path in dataset.models.values()}
+    for thing in taught.things:
+        if thing.name not in models:
+            return f"holds the memory of another dataset ({thing.name})"
+        if thing.sha256 != sha256_of(models[thing.name]):
+            return f"was taught with another file than {models[thing.name]} is now"
+    return ""
+
+
+def _taught(memory: str) -> Taught:
+    """What a memory is of."""
     card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
     assert card.memory is not None
-    return [thing.name for thing in card.memory.things]
+    return card.memory
+
+
+def _things_of(memory: str) -> list[str]:
+    """Names of the things that a memory knows."""
+    return [thing.name for thing in _taught(memory).things]
+
+
+def _round_ones(
+    memory: str,
+    numbers: dict[str, int],
+    dataset: BopDataset,
+) -> tuple[int, ...]:
+    """Models that can be turned by any angle, of which ``models_info.json`` says nothing."""
+    turned = {
+        numbers[thing.name]
+        for thing in _taught(memory).things
+        if thing.name in numbers and any(not one.order for one in thing.symmetries)
+    }
+    return tuple(
+        number
+        for number in sorted(turned)
+        if not dataset.info[number].symmetries_continuous
+    )
 
 
 def _numbers_of_things(
@@ -326,6 +379,7 @@ def _key(dataset: BopDataset, memory: str, how: BopOptions) -> str:
     depends = [
         str(dataset.folder.resolve()),
         how.split,
+        how.camera,
         card.sha256,
         sorted(how.ids),
         how.camera_poses,

@@ -7,12 +7,13 @@ by one; a long bag is sampled.
 import io
 import os
 import weakref
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -68,6 +69,9 @@ LARGEST_METADATA = 2**24  # bytes of metadata.yaml
 # bytes, largest decompressed size of a chunk or a message. Recorders write chunks of a few
 # megabytes, and the largest images and point clouds are below a hundred
 LARGEST_BAG_CHUNK = 2**28
+# times its size to which a compressed file of a bag may expand. Depth images shrink to a fifth or a
+# tenth, an empty scene to a fiftieth
+MOST_EXPANSION = 100
 # nanoseconds, first interval in which the last image is searched; doubled until one is found
 FIRST_REACH = 1_000_000_000
 # image of a static camera: first, last, or seconds after the bag's first message; None for all
@@ -189,7 +193,7 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         self.path = path
         self._types = get_typestore(Stores.ROS2_JAZZY)
-        _bound_chunks()
+        _bound_unpacking()
         with _damage_named(path):
             self._reader = Reader(_BoundedPath(_opened(path)))
             _check_metadata(path)
@@ -341,16 +345,47 @@ def _connections(reader: "Reader") -> list["Connection"]:
 
 
 @cache
-def _bound_chunks() -> None:
-    """Patch rosbags to decompress no more of a chunk than its declared size.
+def _bound_unpacking() -> None:
+    """Patch rosbags to decompress no more of a chunk than its declared size, nor of a whole file.
 
     By default it decompresses everything before comparing the size, and ten bytes on the disk can
     expand to gigabytes.
     """
     with extras():
+        from rosbags.rosbag2 import reader
         from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
     DECOMPRESSORS["zstd"] = _bounded_zstd
     DECOMPRESSORS["lz4"] = _bounded_lz4
+    whole: Any = reader
+    # the only two uses of both: to unpack a compressed file, and to name what is unpacked
+    whole.zstd = SimpleNamespace(open=partial(_bounded_file, whole.zstd.open))
+    whole.Path = _BoundedPath
+
+
+@contextmanager
+def _bounded_file(
+    opened: Callable[..., Any],
+    packed: io.BufferedReader,
+    mode: str,
+) -> Iterator[SimpleNamespace]:
+    """Open a compressed file whose content is read up to ``MOST_EXPANSION`` times its size.
+
+    Raises:
+        ValueError: when more is read.
+    """
+    size = os.fstat(packed.fileno()).st_size
+    most = max(LARGEST_BAG_CHUNK, MOST_EXPANSION * size)
+    with opened(packed, mode) as content:
+
+        def read(length: int) -> bytes:
+            found: bytes = content.read(length)
+            if content.tell() > most:
+                raise ValueError(
+                    f"a compressed file of {size} bytes holds more than {most}"
+                )
+            return found
+
+        yield SimpleNamespace(read=read)
 
 
 def _bounded_zstd(data: bytes, size: int = LARGEST_BAG_CHUNK) -> bytes:

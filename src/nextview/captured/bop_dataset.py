@@ -15,13 +15,13 @@ import numpy as np
 from msgspec import Meta, Struct, field
 
 from nextview.captured.bop_scene import (
-    SCENE_CAMERAS,
-    SCENE_OBJECTS,
+    EVERY_SCENE_CAMERAS,
     BopCamera,
+    BopFiles,
     BopObject,
     ThreeNumbers,
+    bop_files,
     camera_to_world,
-    picture_beside,
     read_bop_cameras,
     read_bop_objects,
 )
@@ -116,25 +116,25 @@ class BopScene:
     """A scene, as yet unread.
 
     Attributes:
-        folder: of its files.
+        files: of the camera that is used.
     """
 
-    folder: Path
+    files: BopFiles
 
     @cached_property
     def cameras(self) -> dict[int, BopCamera]:
         """By the numbers of the images; a DatasetError if they cannot be read."""
-        return read_bop_cameras(self.folder)
+        return read_bop_cameras(self.files)
 
     @cached_property
     def objects(self) -> dict[int, list[BopObject]]:
         """By the numbers of the images, empty if they are not known."""
-        return read_bop_objects(self.folder)
+        return read_bop_objects(self.files)
 
     @cached_property
     def visible(self) -> dict[int, list[float]]:
         """Visible share of each object by the numbers of the images, if it is known."""
-        path = self.folder / "scene_gt_info.json"
+        path = self.files.visible_file
         if not path.exists():
             return {}
         what = "what is visible of the objects of a BOP scene"
@@ -174,7 +174,7 @@ class BopDataset:
         scene = self.scenes[image.scene]
         if image.image not in scene.cameras:
             raise DatasetError(
-                f"{scene.folder / SCENE_CAMERAS}: has no camera of the image {image.image}"
+                f"{scene.files.camera_file}: has no camera of the image {image.image}"
             )
         return scene.cameras[image.image]
 
@@ -189,11 +189,11 @@ class BopDataset:
         Raises:
             DatasetError: its camera is not known.
         """
-        folder = self.scenes[image.scene].folder
+        files = self.scenes[image.scene].files
         camera = self.camera(image)
         pose = np.eye(4)
         if in_world:
-            where = f"image {image.image} of {folder / SCENE_CAMERAS}"
+            where = f"image {image.image} of {files.camera_file}"
             if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
                 raise DatasetError(
                     f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); leave out"
@@ -204,45 +204,51 @@ class BopDataset:
         name = f"{image.image:06d}"
         return CapturedFrame(
             image.name,
-            DepthFile(folder / f"depth/{name}.png"),
+            DepthFile(files.depth(name)),
             camera.depth_scale * MILLIMETRES,
             camera.intrinsics,
             pose,
-            image=picture_beside(folder, name),
+            image=files.picture(name),
         )
 
     def true_objects(self, image: BopImage) -> tuple[TrueObject, ...] | None:
-        """The objects of an image; None where ``scene_gt.json`` says nothing of it.
+        """The objects of an image with a model; None where ``scene_gt.json`` says nothing of it.
 
         Args:
             image: one of ``images``.
 
         Raises:
-            DatasetError: a pose is missing or not rigid, or an object has no model.
+            DatasetError: a pose is missing or not rigid.
         """
         scene = self.scenes[image.scene]
         objects = scene.objects.get(image.image)
         if objects is None:
             return None
         visible = scene.visible.get(image.image, [1.0] * len(objects))
-        where = f"image {image.image} of {scene.folder / SCENE_OBJECTS}"
+        where = f"image {image.image} of {scene.files.object_file}"
         if len(visible) != len(objects):
             raise DatasetError(
-                f"{where}: has {len(objects)} objects, and scene_gt_info.json"
+                f"{where}: has {len(objects)} objects, and {scene.files.visible_file.name}"
                 f" {len(visible)}"
             )
 
         return tuple(
             TrueObject(one.obj_id, self._true_pose(one, where), shown >= LEAST_VISIBLE)
             for one, shown in zip(objects, visible, strict=True)
+            if one.obj_id in self.models
         )
+
+    def without_model(self, image: BopImage) -> tuple[int, ...]:
+        """Numbers of the objects of an image that have no model, in order.
+
+        Args:
+            image: one of ``images``.
+        """
+        objects = self.scenes[image.scene].objects.get(image.image, [])
+        return tuple(one.obj_id for one in objects if one.obj_id not in self.models)
 
     def _true_pose(self, one: BopObject, where: str) -> Float:
         """The pose of an object in the camera, (4, 4), millimetres."""
-        if one.obj_id not in self.info:
-            raise DatasetError(
-                f"{where}: the object {one.obj_id} is none of {MODELS_INFO}"
-            )
         if one.cam_R_m2c is None or one.cam_t_m2c is None:
             raise DatasetError(
                 f"{where}: the object {one.obj_id} has no pose (cam_R_m2c, cam_t_m2c)"
@@ -268,6 +274,7 @@ def read_bop_dataset(
     folder: Path,
     split: str = "test",
     targets: Path | None = None,
+    camera: str | None = None,
 ) -> BopDataset:
     """Read what a dataset has, without its images.
 
@@ -275,6 +282,8 @@ def read_bop_dataset(
         folder: the whole dataset.
         split: folder of the scenes in it.
         targets: file that lists the images; by default one of ``TARGETS_FILES``.
+        camera: the one whose files are read, where each has its own; by default the only one with
+            depth images.
 
     Raises:
         DatasetError: a file is missing or damaged, or lists nothing.
@@ -286,7 +295,7 @@ def read_bop_dataset(
     models = _models(folder)
     info = _info(folder, models)
     images = _images(folder, targets)
-    scenes = _scenes(folder, split, {image.scene for image in images})
+    scenes = _scenes(folder, split, {image.scene for image in images}, camera)
     return BopDataset(folder, models, info, images, scenes)
 
 
@@ -340,21 +349,34 @@ def _images(folder: Path, targets: Path | None) -> tuple[BopImage, ...]:
     return tuple(dict.fromkeys(BopImage(one.scene_id, one.im_id) for one in listed))
 
 
-def _scenes(folder: Path, split: str, numbers: set[int]) -> dict[int, BopScene]:
+def _scenes(
+    folder: Path,
+    split: str,
+    numbers: set[int],
+    camera: str | None,
+) -> dict[int, BopScene]:
     """The scenes of some numbers in a split."""
     if Path(split).name != split:
         raise UsageError(f"--split is the name of a folder of {folder}, not {split!r}")
     if not (folder / split).is_dir():
         there = sorted(
-            path.parents[1].name for path in folder.glob(f"*/*/{SCENE_CAMERAS}")
+            path.parents[1].name for path in folder.glob(f"*/*/{EVERY_SCENE_CAMERAS}")
         )
         named = ", ".join(dict.fromkeys(there))
         hint = f"--split names one of {named}" if there else "are its images unpacked?"
         raise DatasetError(f"{folder / split}: there is no such folder; {hint}")
-    scenes = {number: BopScene(folder / split / f"{number:06d}") for number in numbers}
-    for scene in scenes.values():
-        if not scene.folder.is_dir():
+    scenes = {}
+    for number in sorted(numbers):
+        scene = folder / split / f"{number:06d}"
+        if not scene.is_dir():
             raise DatasetError(
-                f"{scene.folder}: the targets name this scene, and there is no such folder"
+                f"{scene}: the targets name this scene, and there is no such folder"
             )
+        files = bop_files(scene, camera)
+        if len(files) > 1:
+            named = ", ".join(one.camera for one in files)
+            raise DatasetError(
+                f"{scene}: has depth images of several cameras: --camera names one of {named}"
+            )
+        scenes[number] = BopScene(files[0])
     return scenes

@@ -15,7 +15,11 @@ from msgspec import Meta, Struct
 from scipy.spatial.transform import Rotation
 
 from nextview.captured.bag import At, is_bag, read_bag
-from nextview.captured.bop_scene import ThreeNumbers, read_bop_scene
+from nextview.captured.bop_scene import (
+    EVERY_SCENE_CAMERAS,
+    ThreeNumbers,
+    read_bop_scene,
+)
 from nextview.captured.camera_file import CameraFile, check_size, read_camera_file
 from nextview.captured.depth_folder import (
     camera_folders,
@@ -388,7 +392,7 @@ def _read_seven_scenes(
 
 
 LAYOUT_MARKS = {  # a file that identifies each layout
-    "BOP": "scene_camera.json",
+    "BOP": EVERY_SCENE_CAMERAS,
     "TUM RGB-D": "depth.txt",
     "7-Scenes": "frame-*.depth.png",
     "YCB-Video": f"*{META_ENDING}",

@@ -148,7 +148,11 @@ class CapturedFrame:
                 f"the depth has a median of {middle:.3g} m with "
                 f"steps of {1000 * self.scale:.3g} mm"
             )
-            raise ObservationError(f"{self.depth}: {what}: the depth scale is wrong")
+            far = "near" if middle < NEAREST_MEDIAN else "far"
+            raise ObservationError(
+                f"{self.depth}: {what}, and no depth camera measures so {far}: the depth scale is"
+                " wrong"
+            )
 
 
 @dataclass

@@ -29,6 +29,21 @@ def print_bop(run: BopRun) -> None:
             style="yellow",
             soft_wrap=True,
         )
+    for model, count in run.without_model.items():
+        console.print(
+            f"object {model} has no model and does not count: it is in the images"
+            f" {number_of(count, 'time')}",
+            style="yellow",
+            soft_wrap=True,
+        )
+    if run.round_ones:
+        numbers = ", ".join(map(str, run.round_ones))
+        console.print(
+            f"models_info.json has no symmetries_continuous of round models ({numbers}): the recall"
+            " takes each turn about their axis for an error",
+            style="yellow",
+            soft_wrap=True,
+        )
     for name, reason in run.left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
     for name, count in run.others.items():

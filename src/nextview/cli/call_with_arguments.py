@@ -2,16 +2,19 @@
 
 import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from nextview.cli.commands import Command
+from nextview.cli.commands import OUTPUTS, Command
 from nextview.cli.option_names import GROUPS, HELP, check_options
 from nextview.cli.option_values import CONFIG, VALUES, described, explained
 from nextview.cli.words import EXAMPLES
+from nextview.files import check_writable
 
 PRESET = "recipe that sets the defaults of the recipe options"
 
@@ -105,6 +108,8 @@ def entry(
 
     def run(*positional: Any, preset: str = "default", **options: Any) -> Any:
         called.update(signature.bind_partial(*positional, **options).arguments)
+        for path in written(called, command):
+            check_writable(path)
         return function(*positional, **options, **given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -113,3 +118,19 @@ def entry(
     }
     run.__doc__ = about
     return run, called
+
+
+def written(arguments: Mapping[str, Any], command: Command) -> list[Path]:
+    """Return the paths of what a command writes.
+
+    Args:
+        arguments: of its function, by name.
+        command: the command.
+    """
+    groups = [
+        arguments,
+        *(vars(each) for each in arguments.values() if is_dataclass(each)),
+    ]
+    names = (*OUTPUTS, command.changes)
+    found = [group.get(name) for group in groups for name in names]
+    return [path for path in found if isinstance(path, Path)]

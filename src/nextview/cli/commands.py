@@ -14,6 +14,7 @@ class Command:
             value of the function.
         show: MODULE:NAME of the function that prints the return value.
         thesis: MODULE:NAME of the recipe that --preset thesis selects.
+        changes: name of the parameter of a file or folder that is changed; see also ``OUTPUTS``.
     """
 
     function: str
@@ -21,8 +22,11 @@ class Command:
     then: str = ""
     show: str = ""
     thesis: str = ""
+    changes: str = ""
 
 
+# parameters, and fields of parameters, that name what a command writes
+OUTPUTS = ("out", "figure", "figures", "explorer", "record")
 CLI = "nextview.cli"
 TEACHING = "nextview.teaching"
 TRAINING = "nextview.training"
@@ -79,6 +83,7 @@ COMMANDS = {  # by name, in the order of the printed list
     "render": Command(
         f"{CLI}.stores:render",
         "render every view of a dataset into a view store",
+        changes="store",
     ),
     "check": Command(
         f"{CLI}.check:check",
@@ -87,6 +92,7 @@ COMMANDS = {  # by name, in the order of the printed list
     "measure": Command(
         f"{CLI}.stores:measure",
         "compute measures of the views in a store",
+        changes="store",
     ),
     "train recogniser": Command(
         f"{TRAINING}.recogniser_training:train_recogniser",
@@ -139,6 +145,7 @@ COMMANDS = {  # by name, in the order of the printed list
         "{found.objects} objects: temperature of one view {found.calibration.temperature},"
         " correlation of two views {found.calibration.correlation}; negative log-likelihood over 1"
         " to 5 views {found.before:.3f} before, {found.after:.3f} after",
+        changes="card",
     ),
     "fit size": Command(
         f"{TRAINING}.card_fits:fit_size",
@@ -146,17 +153,20 @@ COMMANDS = {  # by name, in the order of the printed list
         "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits"
         " {found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by"
         " shape alone, {found.after:.3f} with the size",
+        changes="card",
     ),
     "fit unknown": Command(
         f"{TRAINING}.unknown:fit_unknown",
         "fit the detection of objects of unknown classes",
         "views of {found.objects} known objects; false-alarm rates by {found.held_out} others; "
         "meshes left out: {found.left_out}",
+        changes="card",
     ),
     "fit valleys": Command(
         f"{TRAINING}.card_fits:fit_valleys",
         "choose the classes that use the valley of a map",
         "{found.objects} objects: the valley is better for these classes: {found.classes}",
+        changes="card",
     ),
     "evaluate": Command(
         "nextview.benchmark.evaluation_page:write_evaluation",

@@ -8,6 +8,7 @@ from nextview.cli.common_options import NamedSplit, Workers
 from nextview.cli.progress import console, follow
 from nextview.data import predicting
 from nextview.data.predictions import Predictions
+from nextview.data.store import ViewStore
 from nextview.errors import ModelError, UsageError
 from nextview.recognition.model_card import find_card, find_models
 
@@ -37,7 +38,7 @@ def predict(
         recogniser: recogniser to use instead: name of a bundled model, or path of a card.
         held_out: predict only objects that this model (name or card) held out of its training.
         maps: maps to predict with these models, or NAME=CARD for other networks; by default all
-            maps of the models.
+            maps of the models that are of the viewpoints of the store.
         by_shape: ignore the size of the objects. By default size counts as evidence if the store
             has it (nextview render --unit) and the card of the recogniser has a size model
             (nextview fit size).
@@ -56,6 +57,17 @@ def predict(
                 f" {', '.join(found.maps)}"
             )
         cards[name] = find_card(card or found.maps[name])
+    if maps is None:
+        views = ViewStore.open(store)
+        every = list(cards)
+        cards = predicting.fitting(cards, views)
+        if left_out := ", ".join(name for name in every if name not in cards):
+            console.print(
+                f"the maps {left_out} of {models} are of other views than the {len(views.sphere)}"
+                f" of {store}: they are not predicted",
+                style="yellow",
+                soft_wrap=True,
+            )
 
     what = (
         find_card(recogniser or found.recogniser),

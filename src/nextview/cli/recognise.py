@@ -72,7 +72,7 @@ def recognise(
         )
 
     check_file(output.figure, output.overwrite)
-    check_file(output.record, output.overwrite, (".rrd",))
+    check_file(output.record, output.overwrite, (".rrd",), "rerun")
     system = load(**vars(looking))
 
     failed = []

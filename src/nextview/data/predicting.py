@@ -61,12 +61,19 @@ def predict(
     Raises:
         DatasetError: there are no such objects, the recogniser does not know a class, or an object
             kills its process.
+        PredictionsError: the maps of a network are of other views.
         ResultsError: the file exists or cannot be written.
     """
     path = Path(path)
     out = Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
+    unfit = sorted(set(maps) - set(fitting(maps, store)))
+    if unfit:
+        raise PredictionsError(
+            f"{path}: the map {unfit[0]} of {maps[unfit[0]].name} is of other views than the"
+            f" {len(store.sphere)} of the store; leave it out with --maps"
+        )
     objects = some_objects(store, split, held_out)
     plan = _plan(store, objects, recogniser, maps)
     radii = store.radii[objects]
@@ -114,6 +121,20 @@ def predict(
             azimuth_bins=bins,
             maps=maps_found,
         ).save(out, overwrite)
+
+
+def fitting(maps: Cards, store: ViewStore) -> Cards:
+    """Return the map networks whose maps are of the views of a store.
+
+    Args:
+        maps: cards of map networks by the names of their maps.
+        store: the views.
+    """
+    return {
+        name: card
+        for name, card in maps.items()
+        if MapNetwork(card.card_path, threads=1).fits(store.sphere)
+    }
 
 
 def _plan(

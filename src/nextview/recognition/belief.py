@@ -473,6 +473,11 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         """Radius of the largest objects of any class, but for rare ones, metres."""
         return float(np.exp(self._usual[1].max()))
 
+    @property
+    def smallest(self) -> float:
+        """Radius of the smallest objects of any class, but for rare ones, metres."""
+        return float(np.exp(self._usual[0].min()))
+
     def impossible(self, radius: float, much: float = MUCH) -> Mask:
         """Return the classes of which an object of this radius is far too small or too large.
 

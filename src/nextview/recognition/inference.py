@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import direction_of, elevation_of
+from nextview.geometry.viewsphere import ViewSphere, direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE_SUFFIX, maps_among
 from nextview.recognition.model_card import (
@@ -223,8 +223,9 @@ class MapNetwork:
 
     Its input is the geometry seen or the partial cloud, as its card says.
 
-    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments
-    as of ``NetworkRecogniser``.
+    ``rings`` is how many rings of views the map has, and ``azimuths`` how many views on each ring
+    that of the whole sphere has; None if its file leaves that open, or without such a map.
+    Arguments as of ``NetworkRecogniser``.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
@@ -234,10 +235,17 @@ class MapNetwork:
                 f"model {self.card.name} is a recogniser, not a map network"
             )
         self._session = open_weights(self.card, threads)
-        rings = next(
-            end.shape[1] for end in self._session.get_outputs() if end.name == "map"
+        shapes = {end.name: end.shape for end in self._session.get_outputs()}
+        self.rings = _fixed(shapes["map"][1])
+        whole = shapes["sphere"] if self.card.output == "sphere" else (None,)
+        self.azimuths = _fixed(whole[-1])
+
+    def fits(self, sphere: ViewSphere) -> bool:
+        """Whether the maps have the views of a sphere."""
+        return self.rings in (None, sphere.rings) and self.azimuths in (
+            None,
+            sphere.azimuths,
         )
-        self.rings: int | None = rings if isinstance(rings, int) else None
 
     def __call__(self, observations: Sequence[Observation]) -> dict[str, Float32]:
         """Maps of views from one camera, by name: see ``Evidence.maps``."""
@@ -253,6 +261,11 @@ class MapNetwork:
                 strict=True,
             )
         )
+
+
+def _fixed(size: int | str | None) -> int | None:
+    """Size of an output; None where the file leaves it open."""
+    return size if isinstance(size, int) else None
 
 
 @dataclass(frozen=True)

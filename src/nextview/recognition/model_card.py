@@ -118,6 +118,7 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         symmetries: Of its surface; () for none, and where its geometry is not known.
         near_symmetries: Turns after which it hardly looks different; its symmetries are among them.
         upright: Whether it is known only as it stands: it was taught so, or captured.
+        sha256: Hash of its mesh file; None for captured frames, and in cards of earlier versions.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
@@ -126,6 +127,7 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     symmetries: tuple[Symmetry, ...] = ()
     near_symmetries: tuple[Symmetry, ...] = ()
     upright: bool = False
+    sha256: HashText | None = None
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -142,6 +144,8 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             not fitted.
         usual: See ``novelty.Quantiles``; () if that was not fitted.
         verification: What was fitted to surfaces; None if nothing was.
+        sensor: Camera that the fits are for, NAME or NAME:STRENGTH; "" in cards of earlier
+            versions.
     """
 
     things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
@@ -151,6 +155,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     novelty: tuple[tuple[float, ...], ...] = ()
     usual: tuple[tuple[float, ...], ...] = ()
     verification: Verification | None = None
+    sensor: str = ""
 
     def __post_init__(self) -> None:
         names = {thing.name for thing in self.things}

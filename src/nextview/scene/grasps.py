@@ -22,8 +22,8 @@ from msgspec import Meta
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from nextview.checks import number, whole
-from nextview.errors import DatasetError
+from nextview.checks import number, one_line, plugin_errors, whole
+from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import read_record, write_record
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import checked_pose
@@ -31,6 +31,7 @@ from nextview.geometry.ray_caster import embree_scene
 from nextview.scene.objects import SceneObject
 from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import TableTop
+from nextview.session.reach import truth_of
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats, Index, Mask
 
@@ -52,6 +53,7 @@ OWN_PIXELS = 0.01  # the same for points in its mask, which noise has displaced
 FINGER_STEPS = (3, 3, 9)
 # share of the fingers' space; less needs more views, more touches more
 MOST_UNSEEN = 0.25
+MILLIMETRE = 0.001
 APPROACH = 0.10  # metres of the straight way to a grasp
 COARSE_STEP = 16  # of so many points one is tested first
 
@@ -118,7 +120,8 @@ class Grasp:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", checked_pose(self.pose))
-        number(self.width, "the width of a grasp", 0, 1)
+        # fingers without a gap between them hold nothing
+        number(self.width, "the width of a grasp, in metres,", above=0, most=1)
         number(self.quality, "the quality of a grasp", 0, 1)
 
 
@@ -204,14 +207,20 @@ def load_grasps(path: str | Path) -> dict[str, tuple[Grasp, ...]]:
         The grasps of each thing, by its name.
 
     Raises:
-        DatasetError: the file is missing or invalid.
-        ObservationError: a pose is not rigid.
+        DatasetError: the file is missing or invalid, or one of the grasps is.
     """
     record = read_record(Path(path), _GraspsFile, "a file of grasps", DatasetError)
-    return {
-        name: tuple(Grasp(np.array(one.pose), one.width, one.quality) for one in some)
-        for name, some in record.grasps.items()
-    }
+    found = {}
+    for name, some in record.grasps.items():
+        grasps = []
+        for place, one in enumerate(some, 1):
+            try:
+                grasps.append(Grasp(np.array(one.pose), one.width, one.quality))
+            except NextviewError as error:
+                where = f"grasp {place} of {one_line(name)}"
+                raise DatasetError(f"{path}: {where}: {error}") from None
+        found[name] = tuple(grasps)
+    return found
 
 
 # Proposals
@@ -499,6 +508,7 @@ def _free_of(
         most_unseen: share.
     """
     assert one.pose is not None
+    _check_lengths(one, grasps, gripper)
     poses = one.pose @ np.stack([grasp.pose for grasp in grasps])
     widths = np.array([grasp.width for grasp in grasps])
     openings = np.minimum(widths + 4 * clearance, gripper.opening)
@@ -531,6 +541,41 @@ def _free_of(
     ]
 
 
+def _check_lengths(
+    one: SceneObject,
+    grasps: Sequence[Grasp],
+    gripper: Gripper,
+) -> None:
+    """Refuse grasps so far from what is seen of a thing that no finger touches it.
+
+    Raises:
+        UsageError: most are farther away than the thing and the gripper are long.
+    """
+    assert one.pose is not None
+    places = np.stack([grasp.pose[:3, 3] for grasp in grasps])
+    to_thing = np.linalg.inv(one.pose)
+    seen = one.seen_points @ to_thing[:3, :3].T + to_thing[:3, 3]
+    # a thing is hardly ten times as long as the part that is seen
+    reach = 10 * float(np.linalg.norm(np.ptp(seen, axis=0)))
+    reach += gripper.finger_length + gripper.opening
+    away = float(np.median(np.linalg.norm(places - seen.mean(0), axis=1)))
+    if away <= reach:
+        return
+    places = places * MILLIMETRE
+    nearer = np.median(np.linalg.norm(places - seen.mean(0), axis=1)) <= reach
+    hint = ": are their poses in millimetres? Metres are expected" if nearer else ""
+    raise UsageError(
+        f"the grasps of {one.name} are {away:.3g} m away from it, where no finger touches it{hint}"
+    )
+
+
+def _not_asked(said: str) -> UsageError:
+    """The error of a function that is asked whether a grasp can be reached."""
+    return UsageError(
+        f"asked whether a grasp can be reached, the function raised {said}"
+    )
+
+
 def within_reach(
     found: Sequence[FreeGrasp],
     reachable: Callable[[Float], bool],
@@ -550,7 +595,9 @@ def within_reach(
             break
         for turn in (np.eye(4), HALF_TURN):
             pose = grasp.pose @ turn
-            if reachable(pose):
+            with plugin_errors(_not_asked):
+                reached = reachable(pose)
+            if truth_of(reached):
                 kept.append(replace(grasp, pose=pose))
                 break
     return kept

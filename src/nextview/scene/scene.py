@@ -41,7 +41,9 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
 from nextview.sensing.masks import inside_box, touching
+from nextview.sensing.mistakes import focal_that_levels
 from nextview.sensing.object_frame import Box
+from nextview.sensing.plausibility import check_sizes
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
@@ -75,10 +77,11 @@ if TYPE_CHECKING:
 
 
 ENOUGH_FRAMES = 2  # frames after which a settled object is not judged again
-WRONG_POSE = (
-    "this frame does not fit the others and is left out: most objects are not where they were, so"
-    " its pose is likely to be wrong"
+NOT_WHERE_THEY_WERE = (
+    "this frame does not fit the others and is left out: most objects are not where they"
+    " were"
 )
+WRONG_POSE = "so its pose is likely to be wrong"
 NOTHING_AGAIN = (
     "this frame shows neither the plane that things stand on nor any object where they were: check"
     " its pose, or aim the camera at them"
@@ -461,6 +464,11 @@ class Scene:
         state, look = self._after(before, top)
         self._state = state
         self._changed()
+        smallest = self._judge.narrowest
+        if look.taken and smallest is not None:
+            sizes = [one.size for one in self.objects]
+            small = check_sizes(frame, sizes, smallest)
+            look = replace(look, warnings=(*look.warnings, *small))
         return look
 
     def grasps(
@@ -493,7 +501,8 @@ class Scene:
             The grasps, the best first; [] before the first frame.
 
         Raises:
-            UsageError: a number is out of range, or the scene knows no thing of a name.
+            UsageError: a number is out of range, the scene knows no thing of a name, a grasp is far
+                from its thing, or ``reachable`` raises.
         """
         known = self.system.models.classes
         for name in grasps:
@@ -596,7 +605,7 @@ class Scene:
         # the pose of a camera that has not moved is as right as before
         stands = self._known_frames.stands(top.frame)
         if not stands and wrong_pose(found, camera):
-            return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
+            return before, Look(False, warnings=(self._why_wrong(top),))
         seen_again = any(one.confirms for one in found)
         if before.tops and not (top.shows_ground or seen_again):
             raise ObservationError(NOTHING_AGAIN)
@@ -606,6 +615,15 @@ class Scene:
         if look.moved and not (seen_again or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
+
+    def _why_wrong(self, top: TableTop) -> ViewWarning:
+        """Say what is wrong with a frame in which most objects are not where they were."""
+        if self.up is not None:
+            mistake = focal_that_levels(top.frame, top.plane.normal, self.up)
+            if mistake is not None:
+                message = f"{NOT_WHERE_THEY_WERE}: {mistake.sentence}"
+                return ViewWarning("intrinsics", message)
+        return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {WRONG_POSE}")
 
     def _taken(
         self,

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nextview.checks import number
-from nextview.errors import SessionError
+from nextview.errors import SessionError, UsageError
 from nextview.scene.body import Body, Tracked
 from nextview.scene.body_pixels import BodyPixels, registered
 from nextview.scene.changes import SURPRISE
@@ -23,6 +23,8 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
+LATEST_TIME = 1e11  # seconds: since 1970, the year 5138
+LONGEST_GAP = 1e5  # seconds, a day: nothing is followed so long without a frame
 
 
 class Tracker:
@@ -112,12 +114,21 @@ class Tracker:
             The things that are followed, by their numbers.
 
         Raises:
-            UsageError: the time is before that of the last frame.
+            UsageError: the time is before that of the last frame, or not in seconds.
         """
         before = self._time
         if time is None:
             time = 0.0 if before is None else before + FRAME_SECONDS
         time = number(time, "the time", least=-np.inf if before is None else before)
+        gap = 0.0 if before is None else time - before
+        if abs(time) > LATEST_TIME or gap > LONGEST_GAP:
+            told = (
+                f"{time:.4g}" if gap <= LONGEST_GAP else f"{gap:.4g} after the last one"
+            )
+            raise UsageError(
+                f"the time of a frame is in seconds, and {told} is none: nanoseconds, or"
+                " microseconds?"
+            )
         seconds = FRAME_SECONDS if before is None else time - before
         self._time = time
 

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import one_line
-from nextview.errors import ObservationError
+from nextview.checks import one_line, plugin_errors
+from nextview.errors import ObservationError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.observation import array_of
 from nextview.segmentation.features import features, quarter_turns, shrink, turned
@@ -28,6 +28,9 @@ from nextview.segmentation.parting import (
     surface_of,
 )
 from nextview.types import Float, Float32, Index, Mask
+
+NO_LABEL = 255  # of no thing, in many images of labels
+WHOLE_IMAGE = 0.99  # share of an image of which nothing is left around a thing
 
 
 class MeasuredFrame(Protocol):
@@ -174,12 +177,19 @@ def instances_of(
 
     Raises:
         ObservationError: what it returned are no masks or labels of the frame.
+        UsageError: it raises.
     """
     learned = LearnedSegmenter(up=up)
-    given = learned(frame) if segmentation is None else segmentation(frame)
+    if segmentation is None:
+        given = learned(frame)
+    else:
+        with plugin_errors(lambda said: UsageError(f"the segmentation raised {said}")):
+            given = segmentation(frame)
     if not isinstance(given, Segmentation):
         given = Segmentation(given)
     masks = _masks(given.labels, frame)
+    if segmentation is not None:
+        _check_covered(masks)
     pieces = None if given.pieces is None else _labels(given.pieces, frame)
 
     if given.surface is None or given.background is None:
@@ -197,6 +207,37 @@ def instances_of(
         surface = surface & ~mask
         background = background & ~mask
     return Instances(masks, surface, background, pieces)
+
+
+def _check_none(labels: Index) -> None:
+    """Refuse labels with a usual number other than 0 for no thing.
+
+    Raises:
+        ObservationError: there are numbers below 0 beside 0, or 255 on most of the image.
+    """
+    others = None
+    if labels.min() < 0 and (labels == 0).any():
+        others = int(labels.min())
+    elif 2 * np.count_nonzero(labels == NO_LABEL) > labels.size:
+        others = NO_LABEL
+    if others is not None:
+        raise ObservationError(
+            f"the labels of a segmentation are 0 where there is no thing, and these seem to be"
+            f" {others} there"
+        )
+
+
+def _check_covered(masks: Sequence[Mask]) -> None:
+    """Refuse a thing that is all there is to see: what stands on something leaves it in sight.
+
+    Raises:
+        ObservationError: a mask covers the whole image.
+    """
+    if any(np.mean(mask) > WHOLE_IMAGE for mask in masks):
+        raise ObservationError(
+            "a mask of the segmentation covers the whole image, as that of the background does:"
+            " a thing leaves what is around it in sight"
+        )
 
 
 def _pixels(given: Any, what: str, frame: MeasuredFrame) -> Mask:
@@ -243,6 +284,7 @@ def _masks(given: Any, frame: MeasuredFrame) -> tuple[Mask, ...]:
     if values.dtype == bool and values.shape[1:] == frame.shape:
         return tuple(values)
     if np.issubdtype(values.dtype, np.integer) and values.shape == frame.shape:
+        _check_none(values)
         return tuple(values == number for number in np.unique(values[values > 0]))
     raise ObservationError(
         "a segmentation returns masks, (N, H, W) bool, or labels, (H, W) int, of the frame,"

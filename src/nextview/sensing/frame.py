@@ -22,7 +22,7 @@ WHOLE = slice(None), slice(None)
 FARTHEST_DEPTH = 65.0
 # metres; a depth image with a larger median is in another unit, such as inches
 LARGEST_MEDIAN = 20.0
-NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
+NEAREST_MEDIAN = 0.05  # metres; no depth camera measures nearer
 ASPECTS = (
     4 / 3,
     16 / 9,
@@ -320,7 +320,10 @@ def _metres(depth: NDArray) -> Float32:
     elif middle > LARGEST_MEDIAN:
         wrong = "m, and no depth camera measures so far: is it in inches or feet?"
     elif 0 < middle < NEAREST_MEDIAN:
-        wrong = "m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
+        wrong = (
+            "m, and no depth camera measures so near: scaled to 0 .. 1, divided twice, or uint16"
+            " of another unit?"
+        )
     if wrong:
         raise ObservationError(f"the depth has a median of {middle:.4g} {wrong}")
     metres = np.where(metres < FARTHEST_DEPTH, metres, np.float32(0))

@@ -18,6 +18,7 @@ from nextview.sensing.agreement import compare, quick_view
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.mistakes import (
+    LEVEL_ERROR,
     Mistake,
     PosedViews,
     Stored,
@@ -54,7 +55,6 @@ UNKNOWN_LENGTHS = np.log(
 )  # range of lengths of which nothing is known, 1 mm to 1 km
 HEIGHT_ERROR = 0.03  # relative error of the height of a camera above a plane
 TARGET_ERROR = 0.15  # relative distance of an object's surface from its centre
-LEVEL_ERROR = np.radians(3.0)  # tilt of a level plane by errors of pose and depth
 LEVEL_NATS = -2 * np.log(LEVEL_ERROR)  # of a plane that is exactly level
 OBLIQUE = 3e-4  # share of frames whose largest plane is neither level nor vertical
 LARGE_SHARE = 1 / 3  # of the samples on a plane, so that no other one has twice as many

@@ -19,6 +19,7 @@ from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
     check_frame,
     check_lean,
+    check_level,
     check_pose_moved,
     check_views,
 )
@@ -93,6 +94,8 @@ class KnownFrames:
             warnings += check_pose_moved(frame, own[-1])
         if frame.pose is None:
             return warnings
+        if plane is not None and self.up is not None:
+            warnings += check_level(frame, plane.normal, self.up)
         warnings += self._check_cameras(frame)
         return warnings + self._check_lean(frame, plane)
 

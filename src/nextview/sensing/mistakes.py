@@ -19,7 +19,7 @@ from nextview.sensing.agreement import (
     SurfaceView,
     compare,
 )
-from nextview.sensing.frame import CAMERA_AXES, SAME_POSE
+from nextview.sensing.frame import CAMERA_AXES, SAME_POSE, Frame
 from nextview.types import Float, Index, Mask
 
 # A mistake explains contradictions if undoing it leaves at most this share of them, ...
@@ -71,6 +71,7 @@ MOST_FITTED = (
 MOST_TRIALS = 120  # tried magnitudes
 # first tried logarithms of the focal length, from a half to twice
 FOCAL_STEPS = 0.05 * np.arange(-14, 15)
+LEVEL_ERROR = np.radians(3.0)  # tilt of a level plane by errors of pose and depth
 LEAST_FOCAL_CHANGE = 0.05  # relative; smaller changes are calibration errors
 LEAST_OFFSET = 0.02  # metres; smaller offsets are calibration errors
 FEWEST_STANDING = 10  # least number of points whose mean locates the object
@@ -602,6 +603,36 @@ def _wrong_focal_length(log_times: float, given: float) -> Mistake:
         return replace(posed, views=views)
 
     return Mistake("focal length", "intrinsics", sentence, undone)
+
+
+def focal_that_levels(frame: Frame, normal: Float, upwards: Float) -> Mistake | None:
+    """Find the focal length with which a plane that is not level would be.
+
+    The points of an image are x = (u - c) z / f: another focal length stretches them across the
+    optical axis, and what is flat stays flat.
+
+    Args:
+        frame: with a pose.
+        normal: of the plane with the focal length as given, (3,), world.
+        upwards: direction against gravity, (3,), world.
+
+    Returns:
+        The mistake; None if no plausible focal length makes the plane level.
+    """
+    to_camera = frame.camera_to_world[:3, :3].T
+    normal, up = to_camera @ normal, to_camera @ upwards
+    across, expected = np.hypot(*normal[:2]), np.hypot(*up[:2])
+    if not (normal[2] * up[2] > 0 and across > 0 and expected > 0):
+        return None
+    times = float(expected / across * normal[2] / up[2])
+    right = normal * [times, times, 1.0]
+    right /= np.linalg.norm(right)
+    log_times = float(np.log(times))
+    if np.abs(log_times) > FOCAL_STEPS.max() or np.abs(log_times) < LEAST_FOCAL_CHANGE:
+        return None
+    if right @ up < np.cos(LEVEL_ERROR):
+        return None
+    return _wrong_focal_length(log_times, float(frame.intrinsics[0, 0]))
 
 
 def _offset_camera(offset: Float) -> Mistake:

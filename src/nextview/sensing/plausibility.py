@@ -9,7 +9,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import Frame, one_stand
 from nextview.sensing.lean import Lean
-from nextview.sensing.mistakes import mistakes_in_poses
+from nextview.sensing.mistakes import focal_that_levels, mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
@@ -25,6 +25,11 @@ COMPARED_VIEWS = 3  # earlier views with which the last one is compared
 OFF_CENTRE = 0.25
 # object radii, largest horizontal distance of the selecting point from the object
 FARTHEST_POINT_ASIDE = 3.0
+# metres: few depth cameras measure nearer than the first, and hardly any nearer than the second
+NEAR_RANGE = 0.25
+NEAREST_RANGE = 0.1
+# degrees by which few poses and tables lean
+FAR_FROM_LEVEL = 6.0
 CHANGED = 0.04
 CHANGED_SHARE = 0.03
 """Relative change of a changed pixel's depth, and share of changed pixels in a changed image."""
@@ -48,7 +53,68 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
             " larger one"
         )
         found.append(ViewWarning("intrinsics", message))
+    middle = _median(frame)
+    if middle < NEAREST_RANGE:
+        message = (
+            f"the depth has a median of {100 * middle:.1f} cm, and hardly any depth camera measures"
+            " so near: is it ten times too small, as by a wrong depth scale?"
+        )
+        found.append(ViewWarning("unit", message, holds=False))
     return found
+
+
+def check_level(frame: Frame, normal: Float, upwards: Float) -> list[ViewWarning]:
+    """Warn if the support plane would be level with another focal length.
+
+    Args:
+        frame: with a pose.
+        normal: of the plane, (3,), world.
+        upwards: direction against gravity, (3,), world.
+    """
+    leans = np.degrees(np.arccos(np.clip(normal @ upwards, -1, 1)))
+    mistake = focal_that_levels(frame, normal, upwards)
+    if mistake is None or leans < FAR_FROM_LEVEL:
+        return []
+    return [
+        ViewWarning(
+            "intrinsics",
+            f"the support plane leans by {leans:.0f} degrees, and if it is level,"
+            f" {mistake.sentence}",
+            holds=False,
+        )
+    ]
+
+
+def check_sizes(
+    frame: Frame, sizes: Sequence[Float], smallest: float
+) -> list[ViewWarning]:
+    """Warn if all that is seen is both too near and too small for what is known.
+
+    Either alone may be right: a camera for short distances, or a table of small strangers.
+
+    Args:
+        frame: that shows the objects.
+        sizes: extents of each object, (3,), metres; none for no warning.
+        smallest: diameter of the smallest known thing, metres.
+    """
+    middle = _median(frame)
+    largest = max((float(np.linalg.norm(size)) for size in sizes), default=np.inf)
+    # a thing may be seen from its small end
+    if not NEAREST_RANGE <= middle < NEAR_RANGE or largest > smallest / 2:
+        return []
+    message = (
+        f"the depth has a median of {100 * middle:.0f} cm, and the largest object in sight measures"
+        f" {100 * largest:.1f} cm, the smallest known one {100 * smallest:.1f} cm: is the depth"
+        " several times too small, as by a wrong depth scale?"
+    )
+    return [ViewWarning("unit", message, holds=False)]
+
+
+def _median(frame: Frame) -> float:
+    """Median depth of a frame, metres; infinity without any."""
+    few = frame.depth[::4, ::4]
+    few = few[few > 0]
+    return float(np.median(few)) if len(few) else np.inf
 
 
 def check_point(aside: Float, radius: float) -> list[ViewWarning]:

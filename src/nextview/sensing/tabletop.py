@@ -12,7 +12,8 @@ from nextview.errors import ObservationError
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.masks import TOUCHING_GAP, above_plane
-from nextview.sensing.planes import Plane
+from nextview.sensing.mistakes import focal_that_levels
+from nextview.sensing.planes import Plane, find_plane, sample
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.view_warning import ViewWarning
@@ -91,7 +92,7 @@ class TableTop:
         elif earlier is not None:
             plane = earlier
         else:
-            raise ObservationError(NO_SUPPORT)
+            raise ObservationError(_without_support(seen, up))
 
         height, above = _heights(seen, plane)
         upright = plane.normal if up is None or frame.pose is None else up
@@ -187,6 +188,22 @@ class TableTop:
         apart = np.maximum(low[:, None] - high, low - high[:, None]).max(-1)
         pairs = np.argwhere(np.triu(apart <= reach, 1))
         return [(shown[one], shown[other]) for one, other in pairs]
+
+
+def _without_support(seen: SegmentedFrame, up: Float | None) -> str:
+    """Say why no support plane is seen: a focal length with which one would be, or the pose."""
+    frame = seen.frame
+    if up is not None and frame.pose is not None:
+        samples = sample(frame, frame.depth > 0, seen.noise)
+        largest = find_plane(samples, np.random.default_rng(0))
+        if largest is not None:
+            wrong = focal_that_levels(frame, largest.normal, up)
+            if wrong is not None:
+                return (
+                    "no support plane is seen below the camera, and without this mistake there"
+                    f" would be one: {wrong.sentence}"
+                )
+    return NO_SUPPORT
 
 
 def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:

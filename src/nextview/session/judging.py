@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of, direction_of
-from nextview.recognition.belief import Stopping, log_evidence_of
+from nextview.recognition.belief import SizeEvidence, Stopping, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.protocol import JointBelief, JudgesTogether
@@ -162,7 +162,15 @@ class Judge:
     @property
     def widest(self) -> float | None:
         """Diameter of the largest taught thing, metres; None if no sizes are known."""
+        return None if self._sizes is None else 2 * float(self._sizes.largest)
+
+    @property
+    def narrowest(self) -> float | None:
+        """Diameter of the smallest taught thing, metres; None if no sizes are known."""
+        return None if self._sizes is None else 2 * float(self._sizes.smallest)
+
+    @property
+    def _sizes(self) -> SizeEvidence | None:
+        """Sizes of the taught things, if they are known."""
         card = getattr(self.models.recogniser, "card", None)
-        if card is None or card.size is None:
-            return None
-        return 2 * float(card.size.largest)
+        return None if card is None else card.size

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number, one_line
+from nextview.checks import number, one_line, plugin_errors
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, travel_from
@@ -52,7 +52,9 @@ class Reach:
         if callable(self.reachable):
             at = poses()
             for k in np.flatnonzero(there):
-                there[k] = truth_of(self.reachable(at[views[k]]))
+                with plugin_errors(_failed("whether a view can be reached")):
+                    answer = self.reachable(at[views[k]])
+                there[k] = truth_of(answer)
         elif self.reachable is not None:
             there &= self.reachable[views]
         return there
@@ -80,8 +82,11 @@ class Reach:
         if self.cost is None:
             return views, None
         if callable(self.cost):
-            costs = [cost_of(self.cost(here, pose)) for pose in poses()[views]]
-            cost = np.array(costs, np.float64)
+            cost = np.zeros(len(views))
+            for row, pose in enumerate(poses()[views]):
+                with plugin_errors(_failed("what a move costs")):
+                    answer = self.cost(here, pose)
+                cost[row] = cost_of(answer)
         else:
             cost = self.cost[start, views]
         return views[cost < np.inf], cost[cost < np.inf]
@@ -121,6 +126,11 @@ class Reach:
         if reachable[state.free[0]].all() and cost is None:
             return state
         return replace(state, reachable=reachable[None])
+
+
+def _failed(asked: str) -> Callable[[str], UsageError]:
+    """What makes the error of a user's function that raises."""
+    return lambda said: UsageError(f"asked {asked}, the function raised {said}")
 
 
 def cost_of(answer: Any) -> float:

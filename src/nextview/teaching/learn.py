@@ -53,6 +53,7 @@ from nextview.teaching.sizes import check_sizes
 from nextview.teaching.symmetries import named_symmetries
 from nextview.teaching.thing_sources import Found, ThingSource, find_things
 from nextview.teaching.thing_views import (
+    CONTENT,
     FACES,
     LEFT_OUT,
     NEAR_SYMMETRIES,
@@ -404,6 +405,8 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
         arrays["radii"] = arrays["radii"].reshape(1)
         arrays[UPRIGHT] = np.array([thing.upright])
+        if thing.sha256 is not None:
+            arrays[CONTENT] = np.frombuffer(bytes.fromhex(thing.sha256), np.uint8)
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
             arrays |= {
@@ -575,6 +578,7 @@ def _write(
         memory,
         fit,
         () if old is None else old.training.commands,
+        work.how.sensor,
     )
     verified = _verified(card, memory, old, work)
     if verified is not None:

@@ -25,6 +25,7 @@ from nextview.teaching.memory_fit import (
 )
 from nextview.teaching.thing_sources import ThingSource
 from nextview.teaching.thing_views import (
+    CONTENT,
     FACES,
     NEAR_SYMMETRIES,
     SYMMETRIES,
@@ -96,6 +97,7 @@ def card_of(
     memory: Memory,
     fit: Fit,
     commands: tuple[str, ...],
+    sensor: str,
 ) -> ModelCard:
     """Create the card of a memory, without the hash of its file.
 
@@ -106,6 +108,7 @@ def card_of(
         memory: the memory.
         fit: fit to the memory.
         commands: commands that produced the earlier content of the memory.
+        sensor: camera that the fits are for.
 
     Returns:
         The card.
@@ -119,6 +122,7 @@ def card_of(
             _symmetries_of(arrays, SYMMETRIES),
             _symmetries_of(arrays, NEAR_SYMMETRIES),
             bool(arrays[UPRIGHT][0]),
+            arrays[CONTENT].tobytes().hex() if CONTENT in arrays else None,
         )
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
@@ -153,6 +157,7 @@ def card_of(
             fit.weight,
             novelty=novelty,
             usual=usual,
+            sensor=sensor,
         ),
     ).made_by(command())
 

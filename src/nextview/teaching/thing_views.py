@@ -16,6 +16,7 @@ from nextview.captured.frames import Capture
 from nextview.captured.turntable import read_turntable
 from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError, option
+from nextview.files import sha256_of
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import resting_poses, rotated
@@ -43,6 +44,8 @@ from nextview.types import Float
 LEFT_OUT = "left_out"
 # key of a flag, (1,) bool: whether the thing is known in its upright pose only
 UPRIGHT = "upright"
+# key of the SHA-256 of its mesh file, (32,) uint8
+CONTENT = "content"
 # keys of its surface, if its size is known
 VERTICES = "vertices"
 FACES = "faces"
@@ -125,8 +128,8 @@ def teach(
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
         its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
-        SYMMETRIES and NEAR_SYMMETRIES. If some of the frames were not used, a phrase about them
-        under LEFT_OUT.
+        SYMMETRIES and NEAR_SYMMETRIES. Of a mesh file, its hash under CONTENT. If some of the
+        frames were not used, a phrase about them under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: the reason why it cannot be taught, in one
@@ -147,6 +150,7 @@ def teach(
     return {
         **views,
         UPRIGHT: np.array([how.upright]),
+        CONTENT: np.frombuffer(bytes.fromhex(sha256_of(path)), np.uint8),
         "rotations": (rotations @ to_mesh).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
         "doubts": np.frombuffer(

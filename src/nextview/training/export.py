@@ -276,6 +276,8 @@ def export_recogniser(
     """
     folders = run, *ensemble
     views = ViewStore.open(store)
+    name = name or f"recogniser-{views.dataset}"
+    check_new_model(out, name, overwrite)
     runs = [read_run(each) for each in folders]
     recipes = [read_recipe(each, RecogniserRecipe) for each in folders]
 
@@ -300,7 +302,7 @@ def export_recogniser(
     shipped = ShippedRecogniser(networks).eval()
 
     card = ModelCard(
-        name or f"recogniser-{views.dataset}",
+        name,
         "recogniser",
         spec,
         "",
@@ -323,7 +325,7 @@ def export_recogniser(
     )
     scores = partial(recogniser_scores, labels=views.labels[judging])
     made = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
-    return _export(made, out, bits, overwrite, track)
+    return _export(made, out, bits, track)
 
 
 def run_network(
@@ -372,6 +374,8 @@ def export_map(
     recipe = read_recipe(run, MapRecipe)
     noted = read_run(run)
     kind = map_name(recipe.measure)
+    name = name or f"{kind.replace(':', '-')}-{views.dataset}"
+    check_new_model(out, name, overwrite)
     shape = (-1, views.sphere.rings, 3)
     good: Good = (
         "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
@@ -395,7 +399,7 @@ def export_map(
     shipped = ShippedMap(load_run(map_network(recipe, views.sphere), run)).eval()
     spec = InputSpec(recipe.input, 0 if recipe.input == "cloud" else recipe.size)
     card = ModelCard(
-        name or f"{kind.replace(':', '-')}-{views.dataset}",
+        name,
         kind,
         spec,
         "",
@@ -424,7 +428,7 @@ def export_map(
         seen,
         lambda maps: map_scores(maps.reshape(shape), true),
     )
-    return _export(made, out, bits, overwrite, track)
+    return _export(made, out, bits, track)
 
 
 def _training(
@@ -445,20 +449,33 @@ def _training(
     return Training(about, tuple(asdict(recipe) for recipe in recipes))
 
 
+def check_new_model(out: Path, name: str, overwrite: bool) -> None:
+    """Refuse, before any work is done, a model that exists or cannot be written.
+
+    Args:
+        out: folder of the model.
+        name: of the model.
+        overwrite: whether a model that exists may be replaced.
+
+    Raises:
+        UsageError: the name is a path.
+        ResultsError: the model exists, or cannot be written.
+    """
+    if Path(name).name != name:
+        raise UsageError(f"--name is the name of a model, not a path: {name}")
+    for suffix in (".json", ".onnx"):
+        check_new(out / f"{name}{suffix}", overwrite)
+
+
 def _export(
     candidate: _Candidate,
     out: Path,
     bits: int,
-    overwrite: bool,
     track: TrackProgress,
 ) -> Exported:
     """Write ONNX file and card if the file agrees with the network; both or neither."""
     name = candidate.card.name
     sample = candidate.sample
-    if Path(name).name != name:
-        raise UsageError(f"--name is the name of a model, not a path: {name}")
-    for suffix in (".json", ".onnx"):
-        check_new(out / f"{name}{suffix}", overwrite)
     with new_folder(out, overwrite=True, last=f"{name}.json") as folder:
         part = folder / f"{name}.json"
         weights = folder / f"{name}.onnx"

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from nextview.checks import extras
 from nextview.data.labelled_frames import LabelledFrames, output_scores
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import ModelError, UsageError
-from nextview.files import check_new, command, new_folder, sha256_of
+from nextview.errors import ModelError
+from nextview.files import command, new_folder, sha256_of
 from nextview.segmentation.features import SIDE_MULTIPLE
 from nextview.segmentation.network import (
     PICTURE_INPUT,
@@ -22,7 +22,7 @@ from nextview.segmentation.network import (
     write_segmentation_card,
 )
 from nextview.training.architectures import SegmentationNet
-from nextview.training.export import Exported, export_onnx
+from nextview.training.export import Exported, check_new_model, export_onnx
 from nextview.training.recipes import SegmentationRecipe
 from nextview.training.runs import load_run, read_recipe, read_run
 from nextview.training.segmentation_training import files_of
@@ -60,10 +60,7 @@ def export_segmentation(
         DatasetError: the frames for validation are missing.
         ResultsError: the network exists.
     """
-    if Path(name).name != name:
-        raise UsageError(f"--name is the name of a model, not a path: {name}")
-    for suffix in (".json", ".onnx"):
-        check_new(out / f"{name}{suffix}", overwrite)
+    check_new_model(out, name, overwrite)
     recipe = read_recipe(run, SegmentationRecipe)
     network = folded(load_run(SegmentationNet(recipe.width), run))
     frames = LabelledFrames.load([file.path for file in files_of(run, recipe)[1]])
