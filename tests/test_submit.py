@@ -342,6 +342,10 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
             lambda v: v["episodes"][0]["said"][0].update(pose=[[1.0] * 4] * 4),
             "episode 0000: ",
         ),
+        (
+            lambda v: v["episodes"][0]["said"][0].update(pose=[[0.0] * 10**6] * 4),
+            "].pose[0]",
+        ),
         (lambda v: v.update(method="nextview geometry"), "another file has the method"),
         (lambda v: v.update(method="nextview  geometry\n"), "another file has the"),
         (lambda v: v.update(views=10**9), "$.views"),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -38,6 +38,9 @@ from nextview.types import Float, Mask
 
 WORLD_UP = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
 STRAIGHT_DOWN = 0.99  # cosine, above which a camera looks from above
+
+Row = tuple[float, float, float, float]
+PoseRows = tuple[Row, Row, Row, Row]  # nothing longer is read
 
 
 class FrozenLook(msgspec.Struct, frozen=True):
@@ -87,7 +90,7 @@ class MethodAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str | None
     confidence: float
     confident: bool
-    pose: Matrix | None = None
+    pose: PoseRows | None = None
     next: int | None = None
 
 
@@ -261,7 +264,7 @@ class NextviewMethod:
             name,
             result.confidence,
             bool(reached) and not result.doubt,
-            None if pose is None else as_matrix(pose),
+            None if pose is None else cast(PoseRows, as_matrix(pose)),
             chosen,
         )
 
@@ -385,7 +388,7 @@ def check_answer(answer: MethodAnswer, look: FrozenLook, where: str) -> None:
 def check_said(
     name: str | None,
     confidence: float,
-    pose: Matrix | None,
+    pose: PoseRows | None,
     things: Sequence[str],
     where: str,
 ) -> None:

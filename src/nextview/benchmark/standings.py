@@ -444,8 +444,8 @@ def _main_table(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
         " of things that are named right. CPU time is that of all processes of a method."
-        " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where all"
-        " episodes agree.",
+        " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where"
+        " all episodes agree.",
         (
             "method",
             *(heading for heading, _, _ in columns),

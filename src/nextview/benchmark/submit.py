@@ -10,12 +10,13 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from nextview.benchmark.frozen import LARGEST_FROZEN_VIEWS, FrozenArchive, Matrix
+from nextview.benchmark.frozen import LARGEST_FROZEN_VIEWS, FrozenArchive
 from nextview.benchmark.methods import (
     CommandMethod,
     FrozenLook,
     Method,
     NextviewMethod,
+    PoseRows,
     check_answer,
 )
 from nextview.checks import number, number_of, one_line, whole
@@ -95,7 +96,7 @@ class SaidAfterView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: FileName | None
     confidence: Probability
     confident: bool
-    pose: Matrix | None
+    pose: PoseRows | None
     cpu_seconds: Seconds | None
 
 
