@@ -4,22 +4,27 @@ import json
 import re
 import shutil
 import sys
+from contextlib import closing
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
+from markdown_it import MarkdownIt
 from PIL import Image
-from pipeline import refused
+from pipeline import refused, run_python
 from scipy.spatial.transform import Rotation
 
 from nextview.benchmark.frozen import FrozenArchive
+from nextview.benchmark.line_process import LineProcess
 from nextview.benchmark.methods import FrozenLook, MethodAnswer, aimed_at
 from nextview.benchmark.standings import KnownShape, leaderboard_of
 from nextview.benchmark.submit import SubmitOptions, submit
 from nextview.cli.main import main
+from nextview.cli.submit import print_leaderboard
 from nextview.errors import DatasetError, ResultsError
 
 ROOT = Path(__file__).parents[1]
@@ -151,7 +156,7 @@ def test_what_is_no_answer_is_refused(archive, tmp_path, answer, said):
 
 
 def test_a_method_that_ends_is_named(archive, tmp_path):
-    greets = as_command(tmp_path, "print('my method'); input()")
+    greets = as_command(tmp_path, "input(); print('my method')")
     how = replace(answering(tmp_path), command=greets)
     with pytest.raises(ResultsError, match="'my method' is not an answer, a line of"):
         submit(archive, tmp_path / "out.json", how)
@@ -165,6 +170,145 @@ def test_a_method_that_says_nothing_is_not_waited_for(archive, tmp_path):
     how = replace(answering(tmp_path), command=command, wait=0.2)
     with pytest.raises(ResultsError, match=r"no answer in 0\.2 s"):
         submit(archive, tmp_path / "out.json", how)
+
+
+def asked(tmp_path, code, wait=60.0, line=b"x" * 100_000):
+    """What a process that runs some code answers to a line, longer than a pipe, given twice."""
+    head = "import os, subprocess, sys, time\nread = sys.stdin.buffer.readline\n"
+    with closing(LineProcess(as_command(tmp_path, head + code))) as process:
+        return [process.ask(line, wait, "method") for _ in range(2)]
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (
+            "read()\nfor _ in range(10**6): print('yes', flush=True)",
+            "'yes' was written before this view was sent",
+        ),
+        (
+            "print('first\\nsecond', flush=True); read(); time.sleep(3)",
+            "was written before this view was sent",
+        ),
+        (
+            "read(); print('a\\n', flush=True); read()",
+            "an empty line was written before",
+        ),
+        (
+            "read(); os.write(1, 'gr\u00fc\u00df'.encode('latin-1')); time.sleep(3)",
+            r"'gr\\xfc\\xdf' is not UTF-8 \(byte 0xfc\)",
+        ),
+        ("read(); os.write(1, b'half \\xc3\\n'); time.sleep(3)", "is not UTF-8"),
+        (
+            "read()\nwhile True: os.write(1, b'z' * 70000)",
+            "'zzz.*' is a line of more than 1 MB",
+        ),
+        ("read(); os.write(1, b'{\"name'); os._exit(7)", "has ended with status 7"),
+        ("read(); os.kill(os.getpid(), 9)", "has ended with status -9"),
+        (
+            "read(); subprocess.Popen(['sleep', '60']); os._exit(3)",
+            "has ended with status 3",
+        ),
+        ("os.close(0); time.sleep(3)", "closed its input or its output"),
+        ("read(); os.close(1); time.sleep(3)", "closed its input or its output"),
+    ],
+)
+def test_a_process_that_breaks_the_protocol_is_told_at_once(tmp_path, code, said):
+    with pytest.raises(ResultsError, match=said) as raised:
+        asked(tmp_path, code)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "time.sleep(3)",
+        "read(1000); time.sleep(3)",
+        "read()\nwhile True: os.write(1, b' '); time.sleep(0.01)",
+    ],
+    ids=["never reads", "reads a part", "never ends its line"],
+)
+def test_a_line_of_any_length_is_waited_for_no_longer_than_told(tmp_path, code):
+    with pytest.raises(ResultsError, match=r"no answer in 0\.5 s"):
+        asked(tmp_path, code, 0.5)
+
+
+def test_a_long_line_and_an_answer_in_single_bytes_arrive(tmp_path):
+    code = (
+        "while line := read():\n"
+        "    for byte in str(len(line)).encode() + b'\\r\\n': os.write(1, bytes([byte]))"
+    )
+    line = b"y" * (3 * 10**6)
+    assert asked(tmp_path, code, line=line) == [b"3000001\r"] * 2
+
+
+def test_what_follows_the_last_answer_is_refused(archive, tmp_path):
+    bye = ANSWERS_ALWAYS + "print('bye')\n"
+    how = replace(answering(tmp_path), command=as_command(tmp_path, bye))
+    with pytest.raises(ResultsError, match="'bye' was written after the last view"):
+        submit(archive, tmp_path / "out.json", how)
+
+    # each answer is that of the view before
+    ahead = (
+        "while True:\n"
+        '    print(\'{"name": null, "confidence": 0, "confident": false}\', flush=True)\n'
+        "    if not sys.stdin.readline(): break\n"
+        "    time.sleep(0.5)\n"
+    )
+    command = as_command(tmp_path, "import sys, time\n" + ahead)
+    with pytest.raises(ResultsError, match=r"was written (before this|after the last)"):
+        submit(
+            archive, tmp_path / "out.json", replace(how, command=command, max_views=1)
+        )
+    assert not (tmp_path / "out.json").exists()
+
+
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="needs /proc"
+)
+BURNS = "'import time\\nwhile time.process_time() < 0.3: pass'"
+
+
+@needs_proc
+@pytest.mark.parametrize(
+    "code",
+    [
+        f"subprocess.run([sys.executable, '-c', {BURNS}])",
+        f"subprocess.run(['sh', '-c', sys.executable + ' -c \"$0\"; true', {BURNS}])",
+        f"exec({BURNS})",
+    ],
+    ids=["child", "child of a child", "itself"],
+)
+def test_the_cpu_time_is_that_of_all_processes(tmp_path, code):
+    code = (
+        f"import subprocess, sys\ninput(); {code}; print('done', flush=True); input()"
+    )
+    with closing(LineProcess(as_command(tmp_path, code))) as process:
+        process.ask(b"", 60, "method")
+        assert process.cpu_seconds() > 0.25
+
+
+@needs_proc
+def test_the_cpu_time_of_what_nobody_waited_for_is_not_known(tmp_path):
+    code = (
+        "import os\n"
+        "held, end = os.pipe()\n"
+        "told, tell = os.pipe()\n"
+        "if os.fork() == 0:\n"
+        "    if os.fork() == 0:\n"  # which has no parent from here on
+        "        os.close(end); os.write(tell, str(os.getpid()).encode())\n"
+        "        os.read(held, 1)\n"
+        "    os._exit(0)\n"
+        "os.wait(); orphan = os.read(told, 20).decode()\n"
+        "input(); print('begun', flush=True); input(); os.close(end)\n"
+        "while os.path.exists(f'/proc/{orphan}'): pass\n"
+        "print('ended', flush=True); input()"
+    )
+    with closing(LineProcess(as_command(tmp_path, code))) as process:
+        process.ask(b"", 60, "method")
+        assert process.cpu_seconds() >= 0
+        process.ask(b"", 60, "method")
+        assert np.isnan(process.cpu_seconds())
 
 
 def test_a_changed_image_is_found(own, tmp_path, capsys):
@@ -198,7 +342,26 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
             lambda v: v["episodes"][0]["said"][0].update(pose=[[1.0] * 4] * 4),
             "episode 0000: ",
         ),
+        (
+            lambda v: v["episodes"][0]["said"][0].update(pose=[[0.0] * 10**6] * 4),
+            "].pose[0]",
+        ),
         (lambda v: v.update(method="nextview geometry"), "another file has the method"),
+        (lambda v: v.update(method="nextview  geometry\n"), "another file has the"),
+        (lambda v: v.update(views=10**9), "$.views"),
+        (lambda v: v.update(views=0), "$.views"),
+        (lambda v: v.update(method=""), "$.method"),
+        (lambda v: v.update(version="7" * 100_000), "$.version"),
+        (lambda v: v["episodes"][1]["said"][0].update(view=-1), "].view"),
+        (lambda v: v["episodes"][1]["said"][1].update(view=10**12), "].view"),
+        (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=-0.5), "].cpu_sec"),
+        (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=1e300), "].cpu_sec"),
+        (lambda v: v["episodes"][0]["said"][0].update(confidence=-1e9), "].confidence"),
+        (lambda v: v["episodes"][0]["said"][0].update(name="mug" * 10**6), "].name"),
+        (
+            lambda v: v["episodes"].extend([v["episodes"][1]] * 50_000),
+            "episode 0001 50001 times",
+        ),
     ],
 )
 def test_a_file_of_results_that_is_not_valid_is_refused(
@@ -210,6 +373,87 @@ def test_a_file_of_results_that_is_not_valid_is_refused(
     assert "mug.json" in heard
     assert said in heard
     assert not (tmp_path / "board").exists()
+
+
+NASTY = "<script>alert('a')</script> \x1b[31m|`rm` \u202e_*~$x$ [l](https://a.b)\n# two"
+
+
+def test_names_are_text_in_markdown_html_and_terminals(
+    archive, submitted, tmp_path, capsys
+):
+    folder = shutil.copytree(submitted, tmp_path / "submitted")
+    edited(folder / "fixed.json", lambda v: v.update(method=NASTY, version="<b>|"))
+    board = leaderboard_of(folder, archive, tmp_path / "board", samples=100)
+    print_leaderboard(board)
+    in_terminal = capsys.readouterr()
+    markdown = (tmp_path / "board/leaderboard.md").read_text(encoding="utf-8")
+    page = (tmp_path / "board/leaderboard.html").read_text(encoding="utf-8")
+    rendered = MarkdownIt("gfm-like", {"linkify": False}).render(markdown)
+    for text in (in_terminal.out, in_terminal.err, markdown, page):
+        assert not set(text) & {"\x1b", "\u202e"}
+        assert "# two" not in text.splitlines()
+    for text in (markdown, page, rendered):
+        assert "<script" not in text
+        assert "<b>" not in text
+
+    name = NASTY.replace("\x1b", "\\x1b").replace("\u202e", "\\u202e")
+    name = name.replace("\n", " ")
+    for text in (page, rendered):
+        read = Texts(text)
+        assert f"{name} (<b>|)" in read.of("th", "td")
+        assert f"Differences to {name}" in read.of("h2")
+        assert len(read.of("td", "th")) == sum(
+            len(table.headings) * (1 + len(table.rows)) for table in board.tables
+        )
+        assert not {"script", "b", "em", "code", "del"} & {tag for tag, _ in read.found}
+    assert "a" not in {tag for tag, _ in Texts(rendered).found}
+
+
+class Texts(HTMLParser):
+    """The elements of a page of HTML, and the text in each."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, ""))
+
+    def handle_data(self, data):
+        if self.found:
+            tag, before = self.found[-1]
+            self.found[-1] = (tag, before + data)
+
+    def of(self, *tags):
+        """The texts of some elements."""
+        return [text.strip() for tag, text in self.found if tag in tags]
+
+
+def test_scores_are_whole_in_80_columns(
+    submitted, archive, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    folder = shutil.copytree(submitted, tmp_path / "submitted")
+    edited(folder / "mug.json", lambda v: v.update(method="a long name " * 6))
+    out = tmp_path / "board"
+    main(["leaderboard", str(folder), str(archive), str(out), "--samples", "100"])
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 80
+    assert "…" not in said
+    (row,) = re.findall("^.nextview geometry .*$", said, re.M)[:1]
+    assert re.findall(r"\d\.\d{3}", row)[:5] == ["1.000"] * 3 + ["0.000"] * 2
+
+
+def test_the_leaderboard_needs_no_other_package(submitted, archive, tmp_path):
+    arguments = ["leaderboard", str(submitted), str(archive), str(tmp_path / "board")]
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('pandas', 'jinja2', 'pyarrow')));"
+        f" from nextview.cli.main import main; main({[*arguments, '--samples', '100']!r})"
+    )
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "board/leaderboard.html").exists()
 
 
 def test_the_method_of_the_page_runs(archive, tmp_path):
@@ -247,6 +491,10 @@ def test_the_example_of_icp_runs(archive, tmp_path):
 def test_a_command_needs_a_name_for_the_table(archive, tmp_path, capsys):
     command = ("submit", archive, tmp_path / "o.json")
     assert "--name" in refused(capsys, *command, "--command", "true")
+    names = ("--name", "a\nb", "--version", "1")
+    assert "--name: is one line" in refused(
+        capsys, *command, "--command", "true", *names
+    )
     assert "are for a --command" in refused(capsys, *command, "--name", "mine")
 
 

@@ -1,12 +1,13 @@
 """Compare policies: one format of measures and tests for all benchmarks."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from nextview.benchmark import statistics as st
+from nextview.benchmark.sums import SIGNIFICANT, Key, Sums, too_few_families
 from nextview.checks import extras
 from nextview.types import Float, Index
 
@@ -14,25 +15,6 @@ with extras():
     import pandas as pd
 
 ALL = "all"  # the set of all objects
-# significance level of differences after Holm's correction
-SIGNIFICANT = 0.05
-
-
-class Key(NamedTuple):
-    """Identifies a number.
-
-    Attributes:
-        policy: its name.
-        threshold: of the belief, at which episodes stop; None without a threshold.
-        views: number of views; 0 for whole episodes.
-        measure: its name.
-    """
-
-    policy: str
-    threshold: float | None
-    views: int
-    measure: str
-
 
 MEASURE_COLUMNS = ["set", *Key._fields, "value", "low", "high"]
 TEST_COLUMNS = ["set", *Key._fields, "reference", "difference", "low", "high", "p"]
@@ -66,42 +48,8 @@ class Tables:
         return {name: table for name, table in there if isinstance(table, pd.DataFrame)}
 
 
-@dataclass(frozen=True, eq=False)
-class Counted:
-    """M measures of policies on N objects, each a ratio of sums over the objects.
-
-    Attributes:
-        keys: of the measures.
-        top: numerators, (N, M) float64.
-        bottom: denominators, (N, M) float64.
-        families: family index of each object, (N,) int64; families are resampled as a whole.
-    """
-
-    keys: tuple[Key, ...]
-    top: Float
-    bottom: Float
-    families: Index
-
-    @classmethod
-    def of(
-        cls,
-        sums: Mapping[Key, tuple[Float, Float]],
-        families: Index,
-    ) -> "Counted":
-        """Combine numerators and denominators, (N,) each, as columns.
-
-        Args:
-            sums: of each measure.
-            families: family index of each object, (N,).
-        """
-        tops, bottoms = zip(*sums.values(), strict=True)
-        return cls(tuple(sums), np.stack(tops, 1), np.stack(bottoms, 1), families)
-
-    def only(self, measures: Sequence[str]) -> "Counted":
-        """Select measures by name."""
-        kept = [i for i, key in enumerate(self.keys) if key.measure in measures]
-        keys = tuple(self.keys[i] for i in kept)
-        return Counted(keys, self.top[:, kept], self.bottom[:, kept], self.families)
+class Counted(Sums):
+    """The same sums, whose measures and differences are rows of ``Tables``."""
 
     def measures(
         self,
@@ -116,9 +64,8 @@ class Counted:
             weights: bootstrap weight of each object in each sample, (S, N).
             labels: class of each object, (N,), for means over classes; None for sums over objects.
         """
-        value, drawn = st.estimate(self.top, self.bottom, weights, labels)
-        numbers = zip(self.keys, value, *st.interval(drawn), strict=True)
-        return measures_of(name, [(*key, *number) for key, *number in numbers])
+        numbers = self.estimates(weights, labels)
+        return measures_of(name, [(*key, *number) for key, number in numbers.items()])
 
     def tests(
         self,
@@ -135,25 +82,8 @@ class Counted:
             reference: the policy; its measures have the same denominators.
             tested: selects the measures to compare.
         """
-        place = {key: i for i, key in enumerate(self.keys)}
-        pairs = [
-            (place[key], place[rival])
-            for key in self.keys
-            if key.policy != reference and tested(key)
-            if (rival := key._replace(policy=reference)) in place
-        ]
-        if not pairs:
-            return tests_of(name, reference, [])
-
-        own, theirs = np.array(pairs).T
-        apart = self.top[:, own] - self.top[:, theirs]
-        value, drawn = st.estimate(apart, self.bottom[:, own], weights)
-        p = st.sign_flip_p(st.by_family(apart, self.families))
-
-        count = int(self.families.max()) + 1
-        numbers = zip(own, value, *st.interval(drawn), p, strict=True)
-        rows = [(self.keys[i], *number, count) for i, *number in numbers]
-        return tests_of(name, reference, rows)
+        found = self.differences(weights, reference, tested)
+        return tests_of(name, reference, [(*one, self.family_count) for one in found])
 
 
 def measures_of(name: str, rows: Sequence[tuple]) -> "pd.DataFrame":
@@ -207,21 +137,9 @@ def too_few(tests: "pd.DataFrame") -> dict[str, str]:
     tested = tests[tests["p"].notna()]
     found = {}
     for name, rows in tested.groupby("set", sort=False):
-        families = int(rows["families"].iloc[0])
-
-        # two-sided sign flips of n families have p-values of 2^(1 - n) and more
-        wanted = families
-        while (
-            wanted < st.EXACT_FAMILIES
-            and len(tested) * 2.0 ** (1 - wanted) >= SIGNIFICANT
-        ):
-            wanted += 1
-        if wanted > families:
-            found[str(name)] = (
-                f"Too few to tell: no p-value of {families} is below {2.0 ** (1 - families):.2g},"
-                f" and {len(tested)} tests are corrected together, so that no difference can be"
-                f" significant; it takes {wanted} or more."
-            )
+        sentence = too_few_families(int(rows["families"].iloc[0]), len(tested))
+        if sentence is not None:
+            found[str(name)] = sentence
     return found
 
 

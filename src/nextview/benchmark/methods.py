@@ -4,23 +4,19 @@ A method gets a ``FrozenLook`` for each view and returns a ``MethodAnswer``. Ano
 the same as one line of JSON on its standard input, and answers with one on its standard output.
 """
 
-import os
-import queue
-import shlex
-import subprocess
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any, Protocol, cast
 
 import msgspec
 import numpy as np
 
 from nextview import __version__
 from nextview.benchmark.frozen import FrozenView, Matrix, as_matrix, read_view
+from nextview.benchmark.line_process import ONE_LINE, LineProcess, quoted
 from nextview.benchmark.published_policies import PredictedEntropy, SampledInformation
 from nextview.benchmark.thing_policies import BLIND_RULES, RingSteps
 from nextview.checks import did_you_mean, one_line
@@ -41,9 +37,10 @@ from nextview.session.system import load
 from nextview.types import Float, Mask
 
 WORLD_UP = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
-LONGEST_LINE = 1 << 20  # characters of a line
-ENDING = 5.0  # seconds that a process has to end when its input does
 STRAIGHT_DOWN = 0.99  # cosine, above which a camera looks from above
+
+Row = tuple[float, float, float, float]
+PoseRows = tuple[Row, Row, Row, Row]  # nothing longer is read
 
 
 class FrozenLook(msgspec.Struct, frozen=True):
@@ -93,7 +90,7 @@ class MethodAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str | None
     confidence: float
     confident: bool
-    pose: Matrix | None = None
+    pose: PoseRows | None = None
     next: int | None = None
 
 
@@ -119,7 +116,11 @@ class Method(Protocol):
         ...
 
     def cpu_seconds(self) -> float:
-        """Return the CPU time that the method has taken so far, seconds."""
+        """Return the CPU time that the method has taken so far, seconds; NaN if not known."""
+        ...
+
+    def finish(self) -> None:
+        """Say that no view follows; ResultsError where the method has said too much."""
         ...
 
     def close(self) -> None:
@@ -195,6 +196,9 @@ class NextviewMethod:
         """Return the CPU time of this process, seconds."""
         return time.process_time()
 
+    def finish(self) -> None:
+        """Do nothing: each answer is of its view."""
+
     def close(self) -> None:
         """Do nothing: this process goes on."""
 
@@ -260,7 +264,7 @@ class NextviewMethod:
             name,
             result.confidence,
             bool(reached) and not result.doubt,
-            None if pose is None else as_matrix(pose),
+            None if pose is None else cast(PoseRows, as_matrix(pose)),
             chosen,
         )
 
@@ -289,10 +293,7 @@ def _never(believed: Any, threshold: float) -> Mask:
 
 
 class CommandMethod:
-    """A method in another process, which reads and writes lines of JSON.
-
-    Its CPU time is that of the process with its threads, not of its children. What it writes to
-    standard error is shown.
+    """A method in another process, which reads and writes lines of JSON; see ``LineProcess``.
 
     Attributes:
         name: of the method in tables.
@@ -324,26 +325,7 @@ class CommandMethod:
         self.version = version
         self.blind = blind
         self._wait = wait
-        self._command = one_line(command)
-
-        try:
-            self._process = subprocess.Popen(
-                shlex.split(command),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-                encoding="utf-8",
-                bufsize=1,
-            )
-        except (OSError, ValueError, IndexError) as error:
-            raise UsageError(f"{self._command}: cannot be started ({error})") from None
-
-        self._lines: queue.Queue[str] = queue.Queue()
-        assert self._process.stdout is not None
-        self._listener = threading.Thread(
-            target=_listen, args=(self._process.stdout, self._lines), daemon=True
-        )
-        self._listener.start()
+        self._process = LineProcess(command)
 
     def answer(self, look: FrozenLook) -> MethodAnswer:
         """Answer a view; see ``Method``.
@@ -352,59 +334,38 @@ class CommandMethod:
             look: the view.
 
         Raises:
-            ResultsError: the process has ended, says nothing in time, or what it says is no answer.
+            ResultsError: see ``LineProcess.ask``; or what it says is no answer.
         """
-        where = f"{self._command}, episode {look.episode}, view {look.step}"
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(msgspec.json.encode(look).decode() + "\n")
-            self._process.stdin.flush()
-            line = self._lines.get(timeout=self._wait)
-        except BrokenPipeError:
-            line = ""
-        except queue.Empty:
-            raise ResultsError(
-                f"{where}: no answer in {self._wait:g} s (--wait)"
-            ) from None
-
-        if not line:
-            raise ResultsError(f"{where}: the process has ended; see what it said")
-        said = f"{one_line(line)!r} is not an answer"
+        where = f"{self._process.command}, episode {look.episode}, view {look.step}"
+        line = self._process.ask(msgspec.json.encode(look), self._wait, where)
         wanted = "a line of JSON with name, confidence and confident"
         return decode_record(
-            line.encode(), MethodAnswer, f"{where}: {said}, {wanted}", ResultsError
+            line,
+            MethodAnswer,
+            f"{where}: {quoted(line)} is not an answer, {wanted}",
+            ResultsError,
         )
 
     def cpu_seconds(self) -> float:
-        """Return the CPU time of the process, seconds; NaN where the system does not tell."""
-        try:
-            text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8")
-        except OSError:
-            return float("nan")
-        user, kernel = text.rpartition(")")[2].split()[11:13]
-        return (int(user) + int(kernel)) / os.sysconf("SC_CLK_TCK")
+        """Return the CPU time of all of its processes; see ``LineProcess.cpu_seconds``."""
+        return self._process.cpu_seconds()
+
+    def finish(self) -> None:
+        """See that it has said nothing but its answers, and end it.
+
+        Raises:
+            ResultsError: it has.
+        """
+        rest = self._process.close()
+        if rest:
+            raise ResultsError(
+                f"{self._process.command}: {quoted(rest)} was written after the last view:"
+                f" its answers may be those of other views; {ONE_LINE}"
+            )
 
     def close(self) -> None:
-        """End the process: its input ends, and after 5 s it is stopped."""
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(ENDING)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._listener.join(ENDING)
-        if not self._listener.is_alive():
-            assert self._process.stdout is not None
-            self._process.stdout.close()
-
-
-def _listen(output: IO[str], lines: "queue.Queue[str]") -> None:
-    """Pass on the lines of a process; an empty one is its end."""
-    while line := output.readline(LONGEST_LINE):
-        lines.put(line)
-    lines.put("")
+        """End the process."""
+        self._process.close()
 
 
 def check_answer(answer: MethodAnswer, look: FrozenLook, where: str) -> None:
@@ -427,7 +388,7 @@ def check_answer(answer: MethodAnswer, look: FrozenLook, where: str) -> None:
 def check_said(
     name: str | None,
     confidence: float,
-    pose: Matrix | None,
+    pose: PoseRows | None,
     things: Sequence[str],
     where: str,
 ) -> None:

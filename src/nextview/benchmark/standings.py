@@ -1,26 +1,36 @@
 """The leaderboard of a frozen archive: files of results are checked, compared and put on a page."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import binomtest
 
 from nextview.benchmark import statistics as st
-from nextview.benchmark.comparison import ALL, Counted, Key, corrected, too_few
+from nextview.benchmark.board_page import (
+    NONE,
+    Leaderboard,
+    WrittenTable,
+    as_html,
+    as_markdown,
+    plain,
+)
 from nextview.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview.benchmark.methods import check_said
-from nextview.benchmark.page import NONE, points, render
 from nextview.benchmark.submit import (
     SUBMISSION_FORMAT,
     SaidAfterView,
     Submission,
     SubmittedEpisode,
+    mean_seconds,
 )
+from nextview.benchmark.sums import Difference, Key, Sums, too_few_families
 from nextview.checks import number_of, one_line, whole
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ResultsError, UsageError
@@ -37,42 +47,9 @@ CONFIDENT_WRONG = "confident_wrong"
 UNKNOWN_SAID = "unknown"
 SURFACE_POINTS = 20_000  # among which the nearest is looked for
 JUDGED_POINTS = 2_000  # of the true surface
+MOST_SAMPLES = 100_000  # of the bootstrap
 PAGE_FILE = "leaderboard.html"
 TEXT_FILE = "leaderboard.md"
-
-
-@dataclass(frozen=True)
-class WrittenTable:
-    """A table of the leaderboard.
-
-    Attributes:
-        title: above it.
-        about: what it shows, a sentence or two.
-        headings: of the columns.
-        rows: cells, as many as headings in each.
-    """
-
-    title: str
-    about: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Leaderboard:
-    """Methods that are compared on an archive.
-
-    Attributes:
-        archive: its name.
-        reference: the method with which the others are compared; None without a blind one.
-        tables: all of them, the most important first.
-        notes: what a reader has to know.
-    """
-
-    archive: str
-    reference: str | None
-    tables: tuple[WrittenTable, ...]
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +184,7 @@ def leaderboard_of(
         UsageError: there is no such reference.
     """
     check_new(Path(out), overwrite, folder=True)
-    whole(samples, "the samples of the bootstrap", 100)
+    whole(samples, "the samples of the bootstrap", 100, MOST_SAMPLES)
     frozen = FrozenArchive(archive)
     read = read_submissions(Path(folder), frozen)
     if reference is not None and reference not in [one.method for one in read]:
@@ -224,7 +201,7 @@ def leaderboard_of(
 
     board = _board(frozen, scored, list(truths.values()), reference, samples, seed)
     with new_folder(Path(out), overwrite) as part:
-        page = render("leaderboard.html", board=board, sha256=frozen.sha256)
+        page = as_html(board, frozen.sha256)
         (part / PAGE_FILE).write_text(page, encoding="utf-8")
         (part / TEXT_FILE).write_text(as_markdown(board), encoding="utf-8")
     return board
@@ -248,7 +225,11 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
     for file in files:
         one = read_record(file, Submission, "a file of results", ResultsError)
         _check_submission(one, frozen, str(file))
-        if one.method in read:
+        # no episode has more: what was asked for beyond is no work
+        longest = max(len(each.said) for each in one.episodes)
+        one = msgspec.structs.replace(one, views=longest)
+        shown = one_line(one.method)
+        if shown in read:
             raise ResultsError(f"{file}: another file has the method {one.method}, too")
 
         first = next(iter(read.values()), one)
@@ -257,7 +238,7 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
                 f"{file}: has {number_of(one.views, 'view')} of each episode,"
                 f" {first.method} {first.views}; they are compared after equally many"
             )
-        read[one.method] = one
+        read[shown] = one
     return list(read.values())
 
 
@@ -274,9 +255,9 @@ def _check_submission(one: Submission, frozen: FrozenArchive, file: str) -> None
             f" {frozen.sha256[:12]}"
         )
 
-    numbers = [each.episode for each in one.episodes]
-    for number in dict.fromkeys((*frozen.numbers, *numbers)):
-        count = numbers.count(number)
+    counts = Counter(each.episode for each in one.episodes)
+    for number in dict.fromkeys((*frozen.numbers, *counts)):
+        count = counts[number]
         if number not in frozen.numbers or count != 1:
             raise ResultsError(
                 f"{file}: answers episode {one_line(number)} {number_of(count, 'time')};"
@@ -390,12 +371,8 @@ def _board(
     families = np.array([order[name] for name in things])
     weights = st.resample_families(families, samples, np.random.default_rng(seed))
     sums = {key: pair for one in scored for key, pair in one.shares().items()}
-    counted = Counted.of(sums, families)
-    measures = counted.measures(ALL, weights)
-    numbers: dict[Key, tuple[float, float, float]] = {}
-    values = measures[["value", "low", "high"]].to_numpy(np.float64).tolist()
-    for key, (value, low, high) in zip(counted.keys, values, strict=True):
-        numbers[key] = (value, low, high)
+    counted = Sums.of(sums, families)
+    numbers = counted.estimates(weights)
 
     compared = best_blind_method(scored) if reference is None else reference
     tables = [
@@ -409,19 +386,21 @@ def _board(
         " of the told poses of the cameras.",
     ]
     if compared is not None and len(scored) > 1:
-        tests = counted.tests(
-            ALL, weights, compared, lambda key: key.measure == RIGHT and key.views > 1
+        tests = counted.differences(
+            weights, compared, lambda key: key.measure == RIGHT and key.views > 1
         )
-        if len(tests):
-            tests = corrected([tests])
+        if tests:
             tables.insert(1, _differences_table(tests, compared))
-            notes += too_few(tests).values()
+            few = too_few_families(len(order), len(tests))
+            notes += [] if few is None else [few]
             if reference is None:
                 notes.append(
                     f"The reference, {compared}, is the best blind method on these same episodes,"
                     " which favours it."
                 )
-    return Leaderboard(frozen.manifest.name, compared, tuple(tables), tuple(notes))
+    return plain(
+        Leaderboard(frozen.manifest.name, compared, tuple(tables), tuple(notes))
+    )
 
 
 def _main_table(
@@ -450,23 +429,23 @@ def _main_table(
             for _, measure, at in columns
         ]
 
-        times = [said.cpu_seconds for each in one.said for said in each]
-        known = [seconds for seconds in times if seconds is not None]
+        seconds = mean_seconds(one.submission.episodes)
         rows.append(
             (
                 f"{name} ({one.submission.version})",
                 *cells,
                 _median(one.distances, one.posed, weights),
                 _median(one.turns, one.posed, weights),
-                f"{np.mean(known):.2f}" if known else NONE,
+                NONE if seconds is None else f"{seconds:.2f}",
             )
         )
 
     return WrittenTable(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
-        " of things that are named right. In brackets: 95 % bootstrap intervals; Wilson's, with as"
-        " many samples as things, where all episodes agree.",
+        " of things that are named right. CPU time is that of all processes of a method."
+        " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where"
+        " all episodes agree.",
         (
             "method",
             *(heading for heading, _, _ in columns),
@@ -504,15 +483,20 @@ def _median(values: Float, rows: Index, weights: Float) -> str:
     return f"{medians[0]:.1f} ({low:.1f} to {high:.1f})"
 
 
-def _differences_table(tests: Any, reference: str) -> WrittenTable:
+def _differences_table(tests: Sequence[Difference], reference: str) -> WrittenTable:
     """Return the table of differences to the reference."""
+    together = st.holm(np.array([test.p for test in tests])).tolist()
     rows = []
-    for row in tests.itertuples(index=False):
-        p_values = (f"{p:.3g}" for p in (row.p, row.p_holm))
-        between = f"({points(row.low)} to {points(row.high)})"
-        views = number_of(row.views, "view")
+    for test, corrected in zip(tests, together, strict=True):
+        between = f"({_points(test.low)} to {_points(test.high)})"
         rows.append(
-            (row.policy, views, f"{points(row.difference)} {between}", *p_values)
+            (
+                test.key.policy,
+                number_of(test.key.views, "view"),
+                f"{_points(test.value)} {between}",
+                f"{test.p:.3g}",
+                f"{corrected:.3g}",
+            )
         )
     return WrittenTable(
         f"Differences to {reference}",
@@ -521,6 +505,11 @@ def _differences_table(tests: Any, reference: str) -> WrittenTable:
         ("method", "after", "difference", "p", "p, corrected"),
         tuple(rows),
     )
+
+
+def _points(difference: float) -> str:
+    """Format a difference of shares in percentage points."""
+    return f"{round(100 * difference, 1) + 0.0:+.1f}"
 
 
 def _places_table(
@@ -540,22 +529,3 @@ def _places_table(
         ("method", *counts),
         tuple(rows),
     )
-
-
-def as_markdown(board: Leaderboard) -> str:
-    """Return a leaderboard as Markdown.
-
-    Args:
-        board: the leaderboard.
-    """
-    lines = [f"# {board.archive}", ""]
-    for table in board.tables:
-        lines += [f"## {table.title}", "", table.about, ""]
-        lines.append(f"| {' | '.join(table.headings)} |")
-        lines.append("|---" * len(table.headings) + "|")
-        for row in table.rows:
-            cells = (one_line(cell, 200).replace("|", "\\|") for cell in row)
-            lines.append(f"| {' | '.join(cells)} |")
-        lines.append("")
-    lines += [f"- {note}" for note in board.notes]
-    return "\n".join(lines) + "\n"

@@ -1,23 +1,25 @@
 """Run a method over a frozen archive, and write its answers into one file of results."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from nextview.benchmark.frozen import FrozenArchive, Matrix
+from nextview.benchmark.frozen import LARGEST_FROZEN_VIEWS, FrozenArchive
 from nextview.benchmark.methods import (
     CommandMethod,
     FrozenLook,
     Method,
     NextviewMethod,
+    PoseRows,
     check_answer,
 )
-from nextview.checks import number, number_of, whole
+from nextview.checks import number, number_of, one_line, whole
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import UsageError
 from nextview.files import (
@@ -31,6 +33,18 @@ from nextview.files import (
 
 SUBMISSION_FORMAT = 1
 COMMON_VIEWS = 3  # of an episode
+LONGEST_NAME = 80  # letters of a method's name, of its version, and of a policy
+LONGEST_VIEW = 1e7  # seconds of CPU
+
+# what a field of a file of results may be: more would be no result, but work
+ViewNumber = Annotated[int, msgspec.Meta(ge=0, lt=LARGEST_FROZEN_VIEWS)]
+ViewCount = Annotated[int, msgspec.Meta(ge=1, le=LARGEST_FROZEN_VIEWS)]
+Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=LONGEST_VIEW)]
+ShortText = Annotated[
+    str, msgspec.Meta(min_length=1, max_length=len("nextview ") + LONGEST_NAME)
+]
+FileName = Annotated[str, msgspec.Meta(max_length=255)]
 
 
 @dataclass(frozen=True)
@@ -78,12 +92,12 @@ class SaidAfterView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         cpu_seconds: that it took; None where it is not known.
     """
 
-    view: int
-    name: str | None
-    confidence: float
+    view: ViewNumber
+    name: FileName | None
+    confidence: Probability
     confident: bool
-    pose: Matrix | None
-    cpu_seconds: float | None
+    pose: PoseRows | None
+    cpu_seconds: Seconds | None
 
 
 class SubmittedEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,7 +108,7 @@ class SubmittedEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         said: after each view, in order.
     """
 
-    episode: str
+    episode: FileName
     said: tuple[SaidAfterView, ...]
 
 
@@ -116,11 +130,11 @@ class Submission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: int
     archive: str
     archive_sha256: HashText
-    method: str
-    version: str
+    method: ShortText
+    version: ShortText
     blind: bool
     run: str
-    views: int
+    views: ViewCount
     episodes: tuple[SubmittedEpisode, ...]
 
 
@@ -131,7 +145,7 @@ class Submitted:
     Attributes:
         method: name of the method.
         episodes: how many were run, those of an earlier run too.
-        cpu_seconds: of a view, mean; None where it is not known.
+        cpu_seconds: of a view, mean; None where that of a view is not known.
         whole: whether these are all episodes of the archive.
     """
 
@@ -141,11 +155,8 @@ class Submitted:
     whole: bool
 
     def __str__(self) -> str:
-        time = (
-            ""
-            if self.cpu_seconds is None
-            else f", {self.cpu_seconds:.2f} s of CPU a view"
-        )
+        seconds = "-" if self.cpu_seconds is None else f"{self.cpu_seconds:.2f}"
+        time = f", {seconds} s of CPU a view"
         return f"{self.method}: {number_of(self.episodes, 'episode')}{time}"
 
 
@@ -193,6 +204,7 @@ def submit(
             track(
                 _episodes(frozen, numbers, method, how, parts), len(numbers), "episodes"
             )
+            method.finish()
         finally:
             method.close()
         episodes = tuple(
@@ -212,21 +224,30 @@ def submit(
         )
         write_record(out, submission, overwrite)
 
-    times = [said.cpu_seconds for one in episodes for said in one.said]
-    known = [seconds for seconds in times if seconds is not None]
     return Submitted(
         method.name,
         len(episodes),
-        float(np.mean(known)) if known else None,
+        mean_seconds(episodes),
         len(episodes) == len(frozen.numbers),
     )
+
+
+def mean_seconds(episodes: Sequence[SubmittedEpisode]) -> float | None:
+    """Return the CPU time of a view, mean, seconds; None where that of one is not known.
+
+    Args:
+        episodes: what was said.
+    """
+    times = [said.cpu_seconds for one in episodes for said in one.said]
+    known = [seconds for seconds in times if seconds is not None]
+    return float(np.mean(known)) if known and len(known) == len(times) else None
 
 
 def _check_options(out: Path, how: SubmitOptions) -> None:
     """Check the options before any work is done; UsageError."""
     if out.suffix.lower() != ".json":
         raise UsageError(f"{out}: the name ends in .json")
-    whole(how.max_views, "the number of views", 1)
+    whole(how.max_views, "the number of views", 1, LARGEST_FROZEN_VIEWS)
     if how.episodes is not None:
         whole(how.episodes, "the number of episodes", 1)
     number(how.wait, "the time to wait, seconds,", above=0)
@@ -234,6 +255,13 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
         raise UsageError("--name, --version and --blind are for a --command")
     if how.command is not None and not (how.name and how.version):
         raise UsageError("a --command needs a --name and a --version, for the table")
+    texts = {"--name": how.name, "--version": how.version, "--policy": how.policy}
+    for option, text in texts.items():
+        if text is not None and one_line(text, LONGEST_NAME) != text:
+            raise UsageError(
+                f"{option}: is one line of {LONGEST_NAME} letters at most, for the table, not"
+                f" {one_line(repr(text))}"
+            )
 
 
 def _how_run(how: SubmitOptions) -> str:
