@@ -202,6 +202,11 @@ def draw_views(
     return CandidateViews(poses, world, told, int(rng.integers(len(poses))))
 
 
+def episode_rng(seed: int, place: Place, name: str) -> np.random.Generator:
+    """Source of everything random in an episode."""
+    return np.random.default_rng([seed, FROZEN_PLACES.index(place), *name.encode()])
+
+
 def moved(pose: Float, by: Float) -> Float:
     """A pose, (4, 4), moved along the axes of its world, (3,), metres."""
     there = pose.copy()
@@ -281,7 +286,7 @@ def make_episode(
     folder: Path, scans: Path, name: str, place: Place, how: FrozenTerms, seed: int
 ) -> EpisodeTruth | None:
     """Write an episode; its truth, or None if the thing cannot be shown there."""
-    rng = np.random.default_rng([seed, FROZEN_PLACES.index(place), *name.encode()])
+    rng = episode_rng(seed, place, name)
     views = draw_views(place, how, rng)
     scene = scene_before(views, place, scans, name, rng)
     if scene is None:
@@ -353,7 +358,7 @@ def finish(
         names: of the things that may be shown.
         shown: things of the episodes that are not sealed, by number.
         how: what the archive depends on.
-        sealed: truth of the others, which has been written.
+        sealed: truth of the others; None where none are.
     """
     things = [
         FrozenThing(name, sha256_of(scans / f"{name}.ply"), LICENCE, SOURCE)
@@ -390,7 +395,12 @@ def finish(
     )
     (out / "README.md").write_text(card, encoding="utf-8")
 
-    digest = None if sealed is None else sha256_of(truth_beside(out))
+    digest = None
+    if sealed is not None:
+        in_order = dict(sorted(sealed.episodes.items()))
+        beside = truth_beside(out)
+        write_record(beside, SealedTruth(sealed.secret, in_order), overwrite=True)
+        digest = sha256_of(beside)
     return seal(out, out.name, how.seed, made_with, digest)
 
 
