@@ -224,12 +224,17 @@ def answer_all(archive: Path) -> None:
     )
     names = np.array([name for _, name in known.values()])
     for look in map(json.loads, sys.stdin):
-        others = np.array([number != look["episode"] for number in known])
-        row = int(np.flatnonzero(~others)[0])
-        given = values[others]
-        asked = standardised(values[[row]], given)
-        (name,) = nearest(standardised(given, given), names[others], asked)
-        answer = {"name": str(name), "confidence": 0.0, "confident": False}
+        answer: dict[str, object] = {"confidence": 0.0, "confident": False}
+        if look["step"] == 1:
+            fields = FrozenEpisode.__struct_fields__
+            told = {field: look[field] for field in fields if field in look}
+            episode = msgspec.convert({**told, "first": look["view"]}, FrozenEpisode)
+            others = np.array([number != look["episode"] for number in known])
+            given = values[others]
+            measured = np.array([list(features_of(episode).values())])
+            asked = standardised(measured, given)
+            (name,) = nearest(standardised(given, given), names[others], asked)
+        answer["name"] = str(name)
         if look["free"]:
             answer["next"] = look["free"][0]
         print(json.dumps(answer), flush=True)

@@ -253,7 +253,7 @@ def test_another_processor_makes_the_same_archive(household, tmp_path):
     if last_bits(**OLD_PROCESSOR) == one:
         pytest.skip("the libraries do here what they do on an old processor")
 
-    options = "--places leaning --things 1 --draws 1 --grid 1 1 --seed 5"
+    options = "--places leaning --things 1 --draws 1 --grid 1 1 --seed 11"
     sums = []
     for number, surroundings in enumerate(({}, OLD_PROCESSOR)):
         out = tmp_path / f"{number}/tiny-1.0"
