@@ -69,7 +69,10 @@ reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$
 	test -f $(THINGS)/small/icp.json || \
 	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
 		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
-	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --overwrite
+	test -f $(THINGS)/small/poses.json || \
+	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/poses.json --name "poses alone" --version 1 --blind \
+		--command "$(abspath .venv-test/bin/python) -m benchmarks.poses_alone $(abspath $(THINGS)/nextview-bench-small) --answer"
+	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --reference "nextview random" --overwrite
 
 $(THINGS)/look_alikes_%/pairs.csv: | .venv-test/installed
 	rm -rf $(@D)

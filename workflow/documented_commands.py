@@ -95,7 +95,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|point_pairs)|verified_things|made_things stretched": (
         "needs the YCB scans, and minutes"
     ),
-    r"benchmarks\.frozen|nextview-bench": (
+    r"benchmarks\.(frozen|poses_alone)|nextview-bench": (
         "needs the YCB scans, and hours; tests/test_submit.py runs methods on a small archive"
     ),
     r"benchmarks\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
