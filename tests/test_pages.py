@@ -164,7 +164,7 @@ command = "count"
     assert f"| [Nuts](jar.md#nuts) {row}\n<!-- measured ends -->\nafter" in results
     assert results.startswith("before\n<!-- measured")
     assert "old" not in readme + results
-    assert "author = {{A} and {B}}" in readme
+    assert "title = {{jars}}, author = {{A} and {B}}" in readme
     assert "year = {2031}, version = {7.1}" in readme
 
 

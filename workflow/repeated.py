@@ -35,7 +35,7 @@ COLUMNS = (
     "task",
     "real or simulated",
     "n",
-    "right, of a stranger: unknown",
+    "right (a stranger: called unknown)",
     "confident and wrong",
 )
 
@@ -107,11 +107,12 @@ def share(count: int | str | None, total: int) -> str:
 def citation(_: str) -> str:
     """The entry for BibTeX, as a block of code, the same on all pages."""
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    # further braces keep the capitals of a title, and a name whole
     names = " and ".join(f"{{{author['name']}}}" for author in cited["authors"])
     return f"""\
 ```bibtex
 @software{{nextview,
-  title = {{{cited["title"]}}}, author = {{{names}}},
+  title = {{{{{cited["title"]}}}}}, author = {{{names}}},
   year = {{{cited["date-released"].year}}}, version = {{{cited["version"]}}}
 }}
 ```"""
