@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, get_args, overload, runtime_che
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.checks import number, one_line, plugin_errors, whole
+from nextview.checks import one_line, plugin_errors, whole
 from nextview.errors import (
     NoViewLeftError,
     ObservationError,
@@ -36,6 +36,7 @@ from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import (
     JudgesTogether,
     LooksAhead,
+    check_unknown,
 )
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
@@ -166,10 +167,7 @@ class Session:
             raise UsageError(
                 "an object has its own segmentation: ObservedObject(segmentation=...)"
             )
-        if number(unknown, "the share of known objects called unknown", 0) >= 1:
-            raise UsageError(
-                f"the share of known objects called unknown is below 1, not {unknown}"
-            )
+        check_unknown(unknown, models.recogniser)
 
         self.models = models
         self.policy = policy
