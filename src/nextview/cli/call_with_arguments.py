@@ -10,6 +10,7 @@ import docstring_parser
 import tyro
 
 from nextview.cli.commands import Command
+from nextview.cores import CORES_HELP
 
 CONFIG = (
     tyro.conf.OmitArgPrefixes,
@@ -99,7 +100,7 @@ def entry(
     run.__annotations__ = {
         parameter.name: parameter.annotation for parameter in parameters
     }
-    run.__doc__ = about
+    run.__doc__ = f"{about}\n\n{CORES_HELP}" if command.computes else about
     return run, called
 
 

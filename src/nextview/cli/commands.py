@@ -14,6 +14,7 @@ class Command:
             value of the function.
         show: MODULE:NAME of the function that prints the return value.
         thesis: MODULE:NAME of the recipe that --preset thesis selects.
+        computes: whether its help says how many cores it uses.
     """
 
     function: str
@@ -21,6 +22,7 @@ class Command:
     then: str = ""
     show: str = ""
     thesis: str = ""
+    computes: bool = True
 
 
 CLI = "nextview.cli"
@@ -65,16 +67,23 @@ COMMANDS = {  # by name, in the order of the printed list
     "capture": Command(
         f"{CLI}.capture:capture",
         "write depth images of a mesh, in the layout of BOP",
+        computes=False,
     ),
     "completion": Command(
         f"{CLI}.completion:completion",
         "print a completion script for bash, zsh or fish",
+        computes=False,
     ),
     "list": Command(
         f"{CLI}.listing:show",
         "list the bundled models or the view measures",
+        computes=False,
     ),
-    "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
+    "download": Command(
+        f"{CLI}.listing:download",
+        "download ModelNet10 or ModelNet40",
+        computes=False,
+    ),
     "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes or rooms"),
     "render": Command(
         f"{CLI}.stores:render",
@@ -199,11 +208,13 @@ COMMANDS = {  # by name, in the order of the printed list
         "compare methods on a frozen archive of episodes",
         "the page is {out}/leaderboard.html",
         f"{CLI}.submit:print_leaderboard",
+        computes=False,
     ),
     "report": Command(
         "nextview.benchmark.report:report",
         "write one HTML page of a benchmark of classes",
         "{found}",
+        computes=False,
     ),
 }
 RESUMES = (  # commands that continue an interrupted run

@@ -48,7 +48,7 @@ from nextview.sensing.plausibility import (
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
-from nextview.session.judging import CORES, Judge, one_blas_thread
+from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
@@ -703,7 +703,7 @@ class Session:
 
     def _parted(self, object: ObservedObject, seen: SegmentedFrame) -> Mask | None:
         """Part the object from its neighbours, see ``session.target.parted_from_neighbours``."""
-        judge = Judge(self.models, self.sphere, self.stopping, self.unknown, CORES)
+        judge = Judge(self.models, self.sphere, self.stopping, self.unknown)
         before = None
         if self.views and self.object is not None:
             result = self._recognition(self.views, self.object)
