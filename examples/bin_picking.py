@@ -40,9 +40,8 @@ ACCURACY = (
     0.1,
 )  # of the camera poses, millimetres and degrees: see bin_cell.SENSOR
 GRASPS = 800  # of each part: it may lie in any way, and others around it
-NO_STRANGERS = (
-    0.001  # significance of the test for strangers: nothing else is in the bin
-)
+# significance of the test for strangers, about the lowest: only the bin itself is in view
+FEW_STRANGERS = 0.01
 DISTANCE = 0.48  # metres from the middle of the bin to the camera
 FIRST_ELEVATION = np.radians(75)
 # from lower, the nearest wall hides more than a quarter of the bottom
@@ -113,7 +112,7 @@ def teach(folder: Path) -> tuple[nextview.System, dict[str, tuple[Grasp, ...]]]:
     system = nextview.load(
         folder / "taught",
         camera_accuracy=ACCURACY,
-        unknown=NO_STRANGERS,
+        unknown=FEW_STRANGERS,
         max_views=MOST_LOOKS,
     )
     return system, grasps

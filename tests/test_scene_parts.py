@@ -34,7 +34,7 @@ def top_of(frame):
 
 
 def judged_by(ycb):
-    judge = Judge(ycb.models, ycb.sphere, ycb.stopping, ycb.unknown, 1)
+    judge = Judge(ycb.models, ycb.sphere, ycb.stopping, ycb.unknown)
 
     return partial(judged, judge=judge)
 

@@ -59,6 +59,17 @@ def test_memories_take_precedence_and_shared_names_are_distinguished(several, kn
     assert twice.classes[4] == "block (theirs)"
 
 
+def test_the_least_rate_of_several_is_the_largest_of_theirs(system, several):
+    memory = several.memories[0].things.residuals
+    of_memory = memory.p_value(np.inf, 0, 1)
+    of_network = several.network.novelty.p_value(1e9, 1)
+    assert (of_memory, of_network < of_memory) == (0.01, True)
+    assert replace(system, unknown=1.01 * of_memory).unknown == 1.01 * of_memory
+    for rate in (of_memory, 1.5 * of_network):
+        with pytest.raises(UsageError, match=r"mine, modelnet10: .* above 0.01,"):
+            replace(system, unknown=rate)
+
+
 @pytest.mark.parametrize("name", ["mug", "block"])
 def test_a_thing_is_named_with_its_pose(system, meshes, name):  # noqa: F811
     result = system.recognise(meshes[name], seed=2)

@@ -62,17 +62,27 @@ def off(camera, tracked):
     return apart
 
 
-def hidden(camera, frame, name):
-    """A frame in which something close to the camera hides a thing."""
+def place_of(camera, name, share=1.0):
+    """The part of the last frame around a thing, or the left share of it."""
     row = [thing.name for thing in camera.table.things].index(name)
     rows, columns = np.nonzero(camera.owner == row)
-    depth = frame.depth.copy()
-    part = np.s_[
+    right = columns.min() + share * np.ptp(columns)
+    return np.s_[
         max(0, rows.min() - 8) : rows.max() + 8,
-        max(0, columns.min() - 8) : columns.max() + 8,
+        max(0, columns.min() - 8) : int(right) + 8 * (share == 1),
     ]
-    depth[part] = 0.3
+
+
+def covered(frame, part, distance=0.3):
+    """A frame in which something near the camera hides a part."""
+    depth = frame.depth.copy()
+    depth[part] = distance
     return Frame(depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
+
+
+def hidden(camera, frame, name):
+    """A frame in which something close to the camera hides a thing."""
+    return covered(frame, place_of(camera, name))
 
 
 def test_a_thing_that_moves_is_followed_and_the_others_stand(watched):
@@ -99,6 +109,63 @@ def test_a_thing_that_stands_is_expected_to_stay_while_it_is_hidden(watched):
         assert not banana.lost
         assert off(camera, tracked)["banana"] < 0.004
     assert np.array_equal(banana.velocity, np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("name", "distance"), [("banana", 0.3), ("tuna_fish_can", 0.4)]
+)
+def test_what_passes_before_an_empty_place_does_not_bring_the_thing_back(
+    watched, name, distance
+):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    camera.frame(view(20))
+    full, part = camera.table, place_of(camera, name)
+    camera.change(without(full, name))
+
+    def lost():
+        return {one.name for one in tracker.things if one.lost}
+
+    for _ in range(2):
+        tracker.update(camera.frame(view(20)))
+    assert lost() == {name}
+    for number in range(8):  # for four seconds, at the rate of a slow camera
+        frame = camera.frame(view(20))
+        tracker.update(covered(frame, part, distance), 0.1 + 0.5 * number)
+        assert lost() == {name}
+
+    camera.change(full)
+    for _ in range(2):
+        tracked = tracker.update(camera.frame(view(20)))
+    assert not lost()
+    assert off(camera, tracked)[name] < 0.004
+
+
+def test_a_thing_that_stands_behind_something_is_there_when_it_shows_again(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    for number in range(6):
+        frame = camera.frame(view(20))
+        tracked = tracker.update(hidden(camera, frame, "tuna_fish_can"), 2.0 * number)
+        assert not any(one.lost for one in tracked)
+    tracked = tracker.update(camera.frame(view(20)))
+    can = next(one for one in tracked if one.name == "tuna_fish_can")
+    assert can.visible > 0.4  # there is no depth on the rest
+    assert not can.lost
+    assert off(camera, tracked)["tuna_fish_can"] < 0.004
+
+
+def test_a_thing_that_is_partly_hidden_keeps_its_pose(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    for share in (0.3, 0.5, 0.7, 0.5, 0.3):
+        frame = camera.frame(view(20))
+        part = place_of(camera, "mustard_bottle", share)
+        tracked = tracker.update(covered(frame, part))
+        bottle = next(one for one in tracked if one.name == "mustard_bottle")
+        assert 0.1 < bottle.visible < 1.1 - share
+        assert not bottle.lost
+        assert off(camera, tracked)["mustard_bottle"] < 0.004
 
 
 def test_a_thing_that_moves_behind_something_is_lost_until_the_scene_finds_it(watched):

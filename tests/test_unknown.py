@@ -5,6 +5,7 @@ session answers.
 import hashlib
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
+from nextview.errors import UsageError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
@@ -267,6 +269,37 @@ def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
     ) == pytest.approx(share, abs=1e-9)
 
 
+# Rates
+
+
+@pytest.mark.parametrize("objects", [3, 50, 1999])
+def test_the_least_p_value_is_that_of_a_score_beyond_all_known_ones(objects):
+    score = some_score(np.random.default_rng(objects), objects=objects)
+    assert score.least_p_value == pytest.approx(score.p_value(1e9, [1, 3, 7]).min())
+    assert score.p_value(1e9, 1) == score.least_p_value
+
+
+def test_a_rate_that_no_p_value_is_below_is_refused_with_the_least_one(capsys):
+    system = nextview.load(threads=1, unknown=0.3)
+    least = float(system.models.recogniser.novelty.p_value(1e9, 1))
+    said = f"{system.models.recogniser.name}: .* above {least:.4g},"
+    for rate in (least, 0.7 * least, 1e-9):
+        with pytest.raises(UsageError, match=said):
+            nextview.load(threads=1, unknown=rate)
+        with pytest.raises(UsageError, match=said):
+            replace(system, unknown=rate)
+        with pytest.raises(UsageError, match=said):
+            nextview.Session(system.models, system.policy, system.sphere, unknown=rate)
+    assert replace(system, unknown=1.01 * least).unknown == 1.01 * least
+    assert replace(system, unknown=0.0).unknown == 0
+
+    mesh = Path(__file__).parents[1] / "samples" / "chair.off"
+    with pytest.raises(SystemExit):
+        main(["recognise", str(mesh), "--unknown", str(0.9 * least)])
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"0 or above {least:.4g}" in told
+
+
 # Sessions
 
 
@@ -274,6 +307,7 @@ class FixedNovelty:
     """A novelty score of which a test says what it is."""
 
     joint = False
+    least_p_value = 0.0
 
     def __init__(self, p):
         self.p = p

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import one_line
+from nextview.cores import cores
 from nextview.errors import DAMAGED, ModelError
 from nextview.files import checked_bytes
 
@@ -76,7 +77,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
     """
     content = checked_bytes(path, sha256)
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = threads or cores()
     options.log_severity_level = 3
     # Threads that wait for more work of one network would take the cores from the next: a third of
     # the time of a view.

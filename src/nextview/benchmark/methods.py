@@ -263,7 +263,7 @@ class NextviewMethod:
         return MethodAnswer(
             name,
             result.confidence,
-            bool(reached) and not result.doubt,
+            bool(reached) and not result.joint_doubt,
             None if pose is None else cast(PoseRows, as_matrix(pose)),
             chosen,
         )

@@ -63,7 +63,7 @@ class _Runs:
         things: thing of each run, (R,) int64.
         weight: of each run, 1 in total for each thing, (R,).
         right: after each view, (R, K) float64.
-        sure: whether it was ever confident, like a session without ``Recognition.doubt``: the
+        sure: whether it was ever confident, like a session without ``Recognition.joint_doubt``: the
             belief reached the threshold, and the residual is not suspicious, (R,) float64.
         wrong: whether it was confident and wrong, (R,) float64.
         until: number of views until it was confident; all of them if it never was, (R,).

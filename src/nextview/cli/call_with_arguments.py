@@ -14,6 +14,7 @@ from nextview.cli.commands import OUTPUTS, Command
 from nextview.cli.option_names import GROUPS, HELP, check_options
 from nextview.cli.option_values import CONFIG, VALUES, described, explained
 from nextview.cli.words import EXAMPLES
+from nextview.cores import CORES_HELP
 from nextview.files import check_writable
 
 PRESET = "recipe that sets the defaults of the recipe options"
@@ -116,7 +117,7 @@ def entry(
     run.__annotations__ = {
         parameter.name: parameter.annotation for parameter in parameters
     }
-    run.__doc__ = about
+    run.__doc__ = f"{about}\n\n{CORES_HELP}" if command.computes else about
     return run, called
 
 

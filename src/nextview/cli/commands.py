@@ -15,6 +15,7 @@ class Command:
         show: MODULE:NAME of the function that prints the return value.
         thesis: MODULE:NAME of the recipe that --preset thesis selects.
         changes: name of the parameter of a file or folder that is changed; see also ``OUTPUTS``.
+        computes: whether its help says how many cores it uses.
     """
 
     function: str
@@ -23,6 +24,7 @@ class Command:
     show: str = ""
     thesis: str = ""
     changes: str = ""
+    computes: bool = True
 
 
 # parameters, and fields of parameters, that name what a command writes
@@ -69,16 +71,23 @@ COMMANDS = {  # by name, in the order of the printed list
     "capture": Command(
         f"{CLI}.capture:capture",
         "write depth images of a mesh, in the layout of BOP",
+        computes=False,
     ),
     "completion": Command(
         f"{CLI}.completion:completion",
         "print a completion script for bash, zsh or fish",
+        computes=False,
     ),
     "list": Command(
         f"{CLI}.listing:show",
         "list the bundled models or the view measures",
+        computes=False,
     ),
-    "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
+    "download": Command(
+        f"{CLI}.listing:download",
+        "download ModelNet10 or ModelNet40",
+        computes=False,
+    ),
     "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes or rooms"),
     "render": Command(
         f"{CLI}.stores:render",
@@ -209,11 +218,13 @@ COMMANDS = {  # by name, in the order of the printed list
         "compare methods on a frozen archive of episodes",
         "the page is {out}/leaderboard.html",
         f"{CLI}.submit:print_leaderboard",
+        computes=False,
     ),
     "report": Command(
         "nextview.benchmark.report:report",
         "write one HTML page of a benchmark of classes",
         "{found}",
+        computes=False,
     ),
 }
 RESUMES = (  # commands that continue an interrupted run

@@ -56,8 +56,9 @@ class EpisodeOptions:
         viewpoints: candidate viewpoints: 40 or 12 views on rings, rings:0,30,60x12 (elevations in
             degrees x views per ring), or fibonacci:60 (spread evenly over the upper hemisphere).
         unknown: significance level of the test for unknown objects: an object with a smaller
-            p-value is called unknown. The default of 0.02 also rejects one known object in 50.
-            Objects of a size that their class never has are unknown too. 0 always names a class.
+            p-value is called unknown. The default of 0.02 also rejects one known object in 50. A
+            rate that no p-value of the models can be below is refused. Objects of a size that their
+            class never has are unknown too. 0 always names a class.
     """
 
     models: str = "modelnet10"

@@ -140,7 +140,9 @@ def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
         why = f": {printable(result.why_unknown)}, {effort}."
         return Text.assemble("It is ", (printable(result.none_of_them), "bold"), why)
 
-    reason = "no other view in reach" if result.stranded else "not confident"
+    reason = f"not confident: {printable(result.doubt)}"
+    if result.stranded:
+        reason = "no other view in reach"
     if result.confident:
         reason = "threshold reached" if has_threshold else f"{result.stopping}"
     rest = f"{result.views[-1].belief.max():.3f}, {effort} ({reason})."

@@ -58,7 +58,8 @@ class LookOptions:
         frames: number of frames to use, evenly spread over the recording; for cameras that stand
             still, over the moments at which the scene has changed.
         unknown: significance level of the test for unknown objects: an object with a smaller
-            p-value is called unknown. The default of 0.02 also rejects one known thing in 50.
+            p-value is called unknown. The default of 0.02 also rejects one known thing in 50. A
+            rate that no p-value of the models can be below is refused.
             0 always names a thing.
     """
 

@@ -9,6 +9,7 @@ from nextview import __version__
 from nextview.checks import did_you_mean
 from nextview.cli.commands import COMMANDS, RESUMES
 from nextview.cli.exit_status import orderly_end
+from nextview.cores import limit_blas
 from nextview.errors import MissingExtraError, UsageError, shell_words
 
 ABOUT = "Active 3D object recognition: what an object is, and where to look next."
@@ -80,6 +81,7 @@ def _call(name: str, arguments: list[str]) -> None:
     from nextview.cli.progress import console, track
 
     command = COMMANDS[name]
+    limit_blas()
     try:
         result, given = call(name, command, arguments, track)
     except MissingExtraError as missing:

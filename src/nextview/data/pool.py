@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from nextview.checks import extras, whole
+from nextview.cores import cores
 from nextview.errors import DatasetError
 
 MOST_WORKERS = 1024  # processes on one machine
@@ -45,7 +46,7 @@ class WorkerDied:
 def count(workers: int | None) -> int:
     """Return the number of processes, by default one per core."""
     return (
-        os.cpu_count() or 1
+        cores()
         if workers is None
         else whole(workers, "the number of workers", 0, MOST_WORKERS)
     )

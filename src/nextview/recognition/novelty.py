@@ -68,6 +68,11 @@ class Quantiles:
         if self.usual is not None:
             check_array("its usual", self.usual, np.floating, (None, None))
 
+    @property
+    def least_p_value(self) -> float:
+        """Smallest possible p-value; 0 for a joint score, whose p-values have no lower bound."""
+        return 0.0 if self.joint else 1 / (1 + int(self.objects[0]))
+
     def p_value(self, score: Floats | float, n_views: Index | int) -> Float:
         """Return the share of known objects that are at least as novel.
 

@@ -8,6 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from nextview.checks import number
+from nextview.errors import UsageError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import MUCH, Calibration, log_evidence_of
@@ -145,6 +147,40 @@ class RulesOut(Protocol):
 def tells_unknown(recogniser: Recogniser) -> bool:
     """Whether a recogniser may say that an object is of none of its classes."""
     return recogniser.novelty is not None or isinstance(recogniser, JudgesTogether)
+
+
+def least_p_value(recogniser: Recogniser) -> float:
+    """Smallest p-value of a recogniser's test for unknown objects; 0 if no bound is known.
+
+    A p-value is the rank of an object among known ones, so that their number bounds it.
+
+    Args:
+        recogniser: any; one of your own that judges views together has no known bound.
+    """
+    if isinstance(recogniser, JudgesTogether):
+        return float(getattr(recogniser, "least_p_value", 0.0))
+    return 0.0 if recogniser.novelty is None else recogniser.novelty.least_p_value
+
+
+def check_unknown(rate: float, recogniser: Recogniser) -> None:
+    """Check the significance level of the test for unknown objects.
+
+    Args:
+        rate: p-value below which an object is called unknown; 0 disables the test.
+        recogniser: whose test it is.
+
+    Raises:
+        UsageError: it is no number from 0 to below 1, or no p-value of the recogniser is as small.
+    """
+    what = "the share of known objects called unknown"
+    if number(rate, what, 0) >= 1:
+        raise UsageError(f"{what} is below 1, not {rate}")
+    least = least_p_value(recogniser)
+    if 0 < rate <= least:
+        raise UsageError(
+            f"{recogniser.name}: the share of known objects called unknown is 0 or above"
+            f" {least:.4g}, the smallest p-value of these models, not {rate:g}"
+        )
 
 
 def log_evidence_of_views(

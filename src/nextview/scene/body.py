@@ -186,8 +186,6 @@ class Body:
             self,
             rest=self.rest.after(seconds, model),
             unseen=unseen,
-            probability=self.probability * float(np.exp(-LOSSES * seconds))
-            + (1 - self.probability) * float(1 - np.exp(-RETURNS * seconds)),
         )
         if body.rests and body.probability >= 0.5:
             # it may begin to move now, whenever it was seen last
@@ -201,14 +199,20 @@ class Body:
             state = replace(state, rotation=self.seen.rotation, centre=self.seen.centre)
         return replace(body, state=state, adrift=adrift)
 
-    def judged(self, evidence: float, visible: float) -> Body:
+    def judged(self, seconds: float, evidence: float, visible: float) -> Body:
         """Update the probability that the pose is right.
 
+        Where something hides the thing or its empty place, it is not known to be lost or back.
+
         Args:
+            seconds: since the last frame.
             evidence: log-likelihood of a frame with the thing, against that without it.
             visible: share of the pixels on it that nothing in front hides.
         """
-        odds = np.clip(logit(self.probability) + evidence, -MOST_ODDS, MOST_ODDS)
+        seconds *= visible
+        kept = self.probability * float(np.exp(-LOSSES * seconds))
+        back = (1 - self.probability) * float(1 - np.exp(-RETURNS * seconds))
+        odds = np.clip(logit(kept + back) + evidence, -MOST_ODDS, MOST_ODDS)
         return replace(self, visible=visible, probability=float(expit(odds)))
 
     def measured(self, state: BodyState, errors: Float) -> Body:

@@ -306,12 +306,12 @@ def _gain(
 
     front = seen < depth
     on = log_density(np.abs(seen - depth), sigma, SEEN_THROUGH)
-    # what is known, and anything unknown, may hide the surface
-    gains = np.where(front, np.logaddexp(on, without), on) - without
-    visible = ~front | (gains > np.log(2))
+    # what is known, and anything unknown, may hide the surface: then the pixel tells nothing of it
+    gains = np.where(front, np.maximum(on, without), on) - without
+    visible = ~front | (gains > 0)
     independent = min(1.0, pixels.prior(count).pixels / count)
     explained = np.zeros(len(shows), bool)
-    explained[measured] = gains > np.log(2)
+    explained[measured] = gains > 0
     gain = gains.sum() + _gain_of_edges(view, explained, pixels)
     return float(independent * gain), float(np.count_nonzero(visible) / count)
 

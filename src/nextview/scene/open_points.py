@@ -34,7 +34,7 @@ class OpenPoint:
     in_sight: bool = True
 
     def __repr__(self) -> str:
-        """One line: ``3: its name is not confident, belief 0.731``."""
+        """One line: ``3: belief 0.731, and a confident name needs 0.97``."""
         why = (
             self.why if self.in_sight else f"{self.why}; no view is left that shows it"
         )
@@ -96,10 +96,8 @@ def _why(track: Track) -> str:
     result = track.result
     if result is None:
         return "it was not compared with the things"
-    if result.doubt:
-        return result.doubt
     if result.answer is not None:
-        return f"its name is not confident, belief {result.confidence:.3f}"
+        return result.doubt
     if track.lately_named:
         return "it had a name before the last frame that shows it"
     if len(track.frames) < ENOUGH_VIEWS:

@@ -57,9 +57,8 @@ def doubts_of(scene: Scene) -> list[str]:
             continue
         beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
         rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
-        doubt = thing.result.doubt
-        why = f" ({doubt})" if doubt else ""
-        said.append(f"{thing.number} is not confident: {', '.join(rest)}{why}")
+        why = thing.result.doubt
+        said.append(f"{thing.number} is not confident: {', '.join(rest)} ({why})")
     return said
 
 
@@ -105,6 +104,7 @@ def scene_as_json(
             "name": thing.name,
             "confidence": thing.confidence,
             "confident": thing.confident,
+            "doubt": thing.result.doubt,
             "most_like": thing.result.most_like,
             "novelty": thing.result.novelty,
             "beliefs": likely,

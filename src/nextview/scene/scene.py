@@ -48,7 +48,7 @@ from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.following import SAME_OBJECT_SHARE, assign
-from nextview.session.judging import CORES, Judge, one_blas_thread
+from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.parting import (
     GOOD_FIT,
@@ -735,7 +735,7 @@ class Scene:
 
 def _judge_of(system: System) -> Judge:
     """Return what recognises objects by a system."""
-    return Judge(system.models, system.sphere, system.stopping, system.unknown, CORES)
+    return Judge(system.models, system.sphere, system.stopping, system.unknown)
 
 
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:

@@ -137,17 +137,19 @@ class Tracker:
         }
         for key, body in bodies.items():
             others = [other for name, other in bodies.items() if name != key]
-            bodies[key] = self._followed(body, others, frame)
+            bodies[key] = self._followed(body, seconds, others, frame)
         self._bodies = bodies
         return self.things
 
-    def _followed(self, body: Body, others: Sequence[Body], frame: Frame) -> Body:
+    def _followed(
+        self, body: Body, seconds: float, others: Sequence[Body], frame: Frame
+    ) -> Body:
         """Register a thing in a frame."""
         pixels = BodyPixels.around(body, others, frame, self._noise, self._ground)
         if pixels is None:
-            return body.judged(0.0, 0.0)
+            return body.judged(seconds, 0.0, 0.0)
         found = registered(body, pixels)
-        body = body.judged(found.evidence, found.visible)
+        body = body.judged(seconds, found.evidence, found.visible)
         # few things that stand are moved in a frame: a few pixels do not tell it
         enough = SURPRISE if body.rests else 0.0
         if found.errors is None or found.evidence <= enough:

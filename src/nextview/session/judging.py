@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from nextview.cores import cores
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of, direction_of
 from nextview.recognition.belief import SizeEvidence, Stopping, log_evidence_of
@@ -23,8 +24,6 @@ from nextview.sensing.observed_object import ObservedObject
 from nextview.session.result import Recognition
 from nextview.session.view import View
 from nextview.types import Floats
-
-CORES = 2  # objects that are judged in parallel
 
 
 @lru_cache(maxsize=1)
@@ -55,7 +54,6 @@ class Judge:
         sphere: Viewpoints,
         stopping: Stopping,
         unknown: float,
-        threads: int,
     ) -> None:
         """Use the models and rules of a system or of a session.
 
@@ -64,13 +62,11 @@ class Judge:
             sphere: the candidate views.
             stopping: the stopping rule.
             unknown: significance level of the test for unknown objects; 0 disables it.
-            threads: number of objects that are judged in parallel.
         """
         self.models = models
         self.sphere = sphere
         self.stopping = stopping
         self.unknown = unknown
-        self._threads = threads
         self._said: WeakKeyDictionary[Observation, Evidence] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -81,7 +77,7 @@ class Judge:
         vars(self).update(state, _said=WeakKeyDictionary())
 
     def __call__(self, things: Sequence[ObservedObject]) -> list[Recognition]:
-        """Recognise objects.
+        """Recognise objects, as many in parallel as there are cores.
 
         Args:
             things: each with at least one view.
@@ -90,9 +86,10 @@ class Judge:
             The recognition of each object, in the same order.
         """
         self._ask([seen for thing in things for seen in thing.observations])
-        if len(things) < 2 or self._threads < 2:
+        threads = min(cores(), len(things))
+        if threads < 2:
             return [self._judged(thing) for thing in things]
-        with ThreadPoolExecutor(self._threads) as pool:
+        with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(self._judged, things))
 
     def _ask(self, observations: Sequence[Observation]) -> None:

@@ -46,7 +46,7 @@ class Recognition:
     An answer is confident if the threshold was reached in a view without blocking warnings (see
     ``ViewWarning.holds``), the object is not suspiciously novel (see ``SUSPICIOUS``), its size is
     possible for the class, fewer than half of the views contradict others, and there is no
-    ``doubt``.
+    ``joint_doubt``. ``doubt`` tells what of this is missing.
 
     Attributes:
         views: in order.
@@ -161,10 +161,9 @@ class Recognition:
     def refused(self) -> bool:
         """True if the answer must not be confident, whatever its belief.
 
-        It is unknown or suspiciously novel, in ``doubt``, or ruled out by warnings.
+        It is unknown or suspiciously novel, in ``joint_doubt``, or ruled out by warnings.
         """
-        joint = self._joint
-        if self.unknown or (joint is not None and joint.doubt):
+        if self.unknown or self.joint_doubt:
             return True
         if is_doubtful([view.warnings for view in self.views]):
             return True
@@ -189,13 +188,19 @@ class Recognition:
     @property
     def why_unknown(self) -> str:
         """Reason why the object is called unknown, in words."""
+        explained = self._explained is not None and self._joint_poses
+        if self.most_like in self.impossible and not explained:
+            return f"no {self.most_like} has a radius of {self.radius:.2g} m"
+        return self._novelty_in_words
+
+    @property
+    def _novelty_in_words(self) -> str:
+        """The p-value of the test for unknown objects."""
         if self._explained is not None and self._joint_poses:
             return (
                 f"{100 * self._explained:.2g} % of taught things are explained as badly by their"
                 " scans"
             )
-        if self.most_like in self.impossible:
-            return f"no {self.most_like} has a radius of {self.radius:.2g} m"
         return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
 
     @property
@@ -347,15 +352,64 @@ class Recognition:
         return joint.why_no_pose if joint is not None and self.pose is None else ""
 
     @property
-    def doubt(self) -> str:
-        """Reason why the answer is not confident whatever its belief; "" if there is none.
+    def joint_doubt(self) -> str:
+        """Reason of the recogniser why no answer is confident whatever its belief; "" for none.
 
         A taught thing is confident as "this thing in this pose": its scan is not below the ground,
         it occludes the background, it fits without being scaled, its orientation is determined, and
         it covers enough pixels.
         """
         joint = self._joint
-        return "" if joint is None or self.answer is None else joint.doubt
+        return "" if joint is None else joint.doubt
+
+    @property
+    def doubt(self) -> str:
+        """First reason why the result is not confident; "" if it is."""
+        if self.confident:
+            return ""
+        if not self.seen:
+            return "nothing of it is seen"
+        return (
+            (self.why_unknown if self.unknown else self.joint_doubt)
+            or self._why_warned
+            or self._why_suspicious
+            or self._why_not_reached
+        )
+
+    @property
+    def _why_warned(self) -> str:
+        """The warning that rules out a confident answer, see ``is_doubtful``; "" for none."""
+        if not is_doubtful([view.warnings for view in self.views]):
+            return ""
+        for warning in self.views[-1].warnings:
+            if warning.holds:
+                return f"warning ({warning.name}): {warning.message}"
+        return "half of the views contradict others"
+
+    @property
+    def _why_suspicious(self) -> str:
+        """What the p-value is and would have to be, see ``familiarity``; "" if it is enough."""
+        if self.familiarity >= 1:
+            return ""
+        return (
+            f"{self._novelty_in_words}, and a confident name needs"
+            f" {100 * SUSPICIOUS * self.unknown_rate:.2g} %"
+        )
+
+    @property
+    def _why_not_reached(self) -> str:
+        """What the belief is and would have to be."""
+        belief = self.confidence
+        counted = sum(view.observation.seen for view in self.views)
+        threshold = float(self.stopping.threshold_at(counted))
+        if np.isinf(threshold):
+            return f"belief {belief:.3f}, and the rule to stop is {self.stopping}"
+        if belief < threshold:
+            return f"belief {belief:.4g}, and a confident name needs {threshold:.4g}"
+        return (
+            f"belief {belief:.4g} is enough for the name, but the session has not ended, or its"
+            " pose is not certain"
+        )
 
     @property
     def _joint(self) -> JointBelief | None:
@@ -410,7 +464,7 @@ class Recognition:
             return f"{self.none_of_them}: {self.why_unknown} ({views})"
 
         sure = "confident" if self.confident else "not confident"
-        if self.doubt and not self.confident:
+        if self.doubt:
             sure += f", {self.doubt}"
         if self.stranded:
             sure += ", no other view in reach"

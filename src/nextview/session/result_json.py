@@ -49,6 +49,7 @@ def episode_as_json(
     whole |= {
         "unit": None if result.radius is None else "m",
         "threshold_reached": result.confident,
+        "doubt": result.doubt,
         "views": views,
     }
     whole["warnings"] = sorted(warning.name for warning in result.warnings)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, get_args, overload, runtime_che
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.checks import number, one_line, plugin_errors, whole
+from nextview.checks import one_line, plugin_errors, whole
 from nextview.errors import (
     NoViewLeftError,
     ObservationError,
@@ -36,6 +36,7 @@ from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import (
     JudgesTogether,
     LooksAhead,
+    check_unknown,
 )
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
@@ -47,7 +48,7 @@ from nextview.sensing.plausibility import (
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
-from nextview.session.judging import CORES, Judge, one_blas_thread
+from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
@@ -166,10 +167,7 @@ class Session:
             raise UsageError(
                 "an object has its own segmentation: ObservedObject(segmentation=...)"
             )
-        if number(unknown, "the share of known objects called unknown", 0) >= 1:
-            raise UsageError(
-                f"the share of known objects called unknown is below 1, not {unknown}"
-            )
+        check_unknown(unknown, models.recogniser)
 
         self.models = models
         self.policy = policy
@@ -705,7 +703,7 @@ class Session:
 
     def _parted(self, object: ObservedObject, seen: SegmentedFrame) -> Mask | None:
         """Part the object from its neighbours, see ``session.target.parted_from_neighbours``."""
-        judge = Judge(self.models, self.sphere, self.stopping, self.unknown, CORES)
+        judge = Judge(self.models, self.sphere, self.stopping, self.unknown)
         before = None
         if self.views and self.object is not None:
             result = self._recognition(self.views, self.object)

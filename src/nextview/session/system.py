@@ -41,6 +41,7 @@ from nextview.recognition.protocol import (
     KnowsAnyOrientation,
     Recogniser,
     RulesOut,
+    check_unknown,
     tells_unknown,
 )
 from nextview.session.limits import Limits
@@ -293,6 +294,9 @@ class System:
         models = replace(self.models, recogniser=recogniser.without(names))
         return replace(self, models=models, ruled_out=(*self.ruled_out, *names))
 
+    def __post_init__(self) -> None:
+        check_unknown(self.unknown, self.models.recogniser)
+
     def __repr__(self) -> str:
         name = self.models.recogniser.name
         views = len(self.sphere)
@@ -372,11 +376,12 @@ def load(
         max_views: largest number of views.
         viewpoints: candidate viewpoints: "40", "12", "rings:0,30,60x12", "fibonacci:60", or your
             own directions or poses, see ``viewsphere.viewpoints_of``.
-        threads: of ONNX Runtime, 0 for one per core.
+        threads: of ONNX Runtime, 0 for one on each core that is used, see ``nextview.cores``.
         unknown: significance level of the test for unknown objects: the answer is None for a
             smaller p-value, and so for this share of known objects. Objects of a size that their
-            class never has are unknown too. 0 always names a class. By default 0.02 if the
-            recogniser has a novelty score.
+            class never has are unknown too. 0 always names a class; another rate has to be above
+            the smallest p-value that the models can give. By default 0.02 if the recogniser has a
+            novelty score.
         stopping: your own rule: "MODULE:NAME", or a function of a
             ``recognition.own_stopping.Believed`` and the threshold; or a ``Stopping``, which
             replaces threshold, risk and max_views.

@@ -115,6 +115,12 @@ class VerifiedRecogniser(TaughtRecogniser):
         """Class of each thing of known geometry, (T,) int64."""
         return self._labels_of(self.things)
 
+    @property
+    def least_p_value(self) -> float:
+        """Smallest p-value of a thing that stands as it should; 0 if residuals were not fitted."""
+        residuals = self.things.residuals
+        return 0.0 if residuals is None else residuals.least_p_value
+
     def _labels_of(self, things: TaughtThings) -> Index:
         """Class of each of some things, (T,) int64."""
         of_hypotheses = np.array(self.calibration.hypotheses)[things.rows]

@@ -17,7 +17,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_of
-from nextview.recognition.protocol import JointBelief
+from nextview.recognition.protocol import JointBelief, least_p_value
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.types import Floats
@@ -102,6 +102,11 @@ class SeveralRecognisers:
             _said=WeakKeyDictionary(),
             _novelties=WeakKeyDictionary(),
         )
+
+    @property
+    def least_p_value(self) -> float:
+        """Largest of the smallest p-values of the collections: each of them may have to tell."""
+        return max(least_p_value(member) for member in self.members)
 
     @cached_property
     def in_any_orientation(self) -> SeveralRecognisers:

@@ -104,6 +104,11 @@ class KnownResiduals:
             excess.append(np.sort(np.concatenate([before, over[views == number]])))
         return KnownResiduals(np.exp(typical) - LEAST_RESIDUAL, tuple(excess))
 
+    @property
+    def least_p_value(self) -> float:
+        """Smallest p-value that is possible after any number of views."""
+        return 1 / (1 + min(len(excess) for excess in self.excess))
+
     def p_value(self, residual: float, thing: int, views: int) -> float:
         """Share of known things with at least this residual, relative to the usual one.
 

@@ -10,7 +10,6 @@ also shifted towards the occluder. The score of depths is their mean squared dif
 intersection. All scores are a few matrix products.
 """
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from scipy import ndimage
 
+from nextview.cores import cores
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
 from nextview.things.depth_view import NOT_MEASURED, THING, MetricImage
@@ -130,7 +130,7 @@ class ViewTemplates:
             threads: number of threads; 0 for one on each core.
         """
         looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
-        with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        with ThreadPoolExecutor(threads or cores()) as pool:
             render = partial(_rendered, caster, looks=looks)
             each = list(pool.map(render, range(len(caster.surfaces))))
         self.things = np.repeat(np.arange(len(each)), [len(one.sizes) for one in each])

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from nextview.checks import extras
+from nextview.cores import asked_cores
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, ModelError
@@ -316,6 +317,8 @@ def fit(
         try:
             # Denormal numbers are slow on CPUs and irrelevant here.
             torch.set_flush_denormal(True)
+            if (asked := asked_cores()) is not None:
+                torch.set_num_threads(asked)
             trainer.fit(
                 module,
                 datamodule=Batches(training, validation),

@@ -1,0 +1,108 @@
+"""How many cores are used: one setting, on which no answer depends."""
+
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from small_tables import camera_over, meshes_of, view
+
+import nextview
+from nextview.cli.commands import COMMANDS
+from nextview.cli.main import main
+from nextview.cores import CORES, cores, limit_blas
+from nextview.data import pool
+from nextview.data.samples import sample_mesh
+from nextview.errors import UsageError
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.inference import NetworkRecogniser
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.surface import SurfaceCaster
+from nextview.things.view_templates import ViewTemplates
+
+COUNTS = (1, 2, 5)
+
+
+def test_by_default_there_are_as_many_as_the_process_may_use(monkeypatch):
+    monkeypatch.delenv(CORES, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {3, 7, 8})
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    assert (cores(), pool.count(None), pool.count(2)) == (3, 3, 2)
+    monkeypatch.setenv(CORES, " 11 ")
+    assert (cores(), pool.count(None), pool.count(2)) == (11, 11, 2)
+
+
+@pytest.mark.parametrize("wrong", ["0", "-2", "2.5", "all", "99999"])
+def test_what_is_no_number_of_cores_is_refused(monkeypatch, capsys, wrong):
+    monkeypatch.setenv(CORES, wrong)
+    with pytest.raises(UsageError, match="number of cores in NEXTVIEW_CORES is"):
+        cores()
+    with pytest.raises(SystemExit):
+        main(["recognise", "nothing.off"])
+    assert "NEXTVIEW_CORES" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["look", "learn", "explore", "benchmark things"])
+def test_the_help_of_what_computes_names_the_setting(capsys, command):
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    assert CORES in capsys.readouterr().out
+    assert COMMANDS[command].computes
+    assert not COMMANDS["completion"].computes
+
+
+def test_matrix_products_of_a_command_are_limited(monkeypatch):
+    asked = []
+    blas = SimpleNamespace(threadpool_limits=lambda *limit: asked.append(limit))
+    monkeypatch.setitem(__import__("sys").modules, "threadpoolctl", blas)
+    monkeypatch.delenv(CORES, raising=False)
+    limit_blas()
+    assert not asked
+    monkeypatch.setenv(CORES, "4")
+    limit_blas()
+    assert asked == [(4, "blas")]
+
+
+def with_each_count(monkeypatch, answer):
+    """What is answered with each number of cores."""
+    found = []
+    for count in COUNTS:
+        monkeypatch.setenv(CORES, str(count))
+        found.append(answer())
+    return found
+
+
+def test_networks_and_templates_answer_alike_with_any_number(monkeypatch, ycb):
+    camera = SimulatedCamera(sample_mesh("chair"))
+    seen = [camera.observe(pose) for pose in ViewSphere.named("40").poses[:3]]
+    said = with_each_count(monkeypatch, lambda: NetworkRecogniser()(seen))
+    for one in said[1:]:
+        np.testing.assert_array_equal(one.logits, said[0].logits)
+        np.testing.assert_array_equal(one.azimuth_bins, said[0].azimuth_bins)
+
+    surfaces = ycb.models.recogniser.things.verifier.caster.surfaces
+    few = SurfaceCaster(surfaces[5:8])
+    drawn = with_each_count(monkeypatch, lambda: ViewTemplates(few, 0))
+    for one in drawn[1:]:
+        np.testing.assert_array_equal(one.offsets, drawn[0].offsets)
+        np.testing.assert_array_equal(one.pictures.depth, drawn[0].pictures.depth)
+
+
+def test_a_scene_answers_alike_with_any_number(monkeypatch, ycb):
+    names = ("mustard_bottle", "tuna_fish_can", "banana")
+    camera = camera_over(list(meshes_of(names).values()), seed=11)
+    frame = camera.frame(view(70))
+
+    def answer():
+        scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
+        scene.update(frame)
+        return scene.objects
+
+    first, *others = with_each_count(monkeypatch, answer)
+    assert len(first) == 3
+    for objects in others:
+        for one, before in zip(objects, first, strict=True):
+            assert one.result.beliefs == before.result.beliefs
+            assert one.result.novelty == before.result.novelty
+            assert one.confident == before.confident
+            np.testing.assert_array_equal(one.pose, before.pose)
