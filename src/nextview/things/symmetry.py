@@ -36,7 +36,7 @@ USUAL_ERRORS = 8.0
 LOCAL_ERRORS = 100.0
 # largest error about one axis, in errors of the surface: the scan of a lid is worse than of a side
 LARGEST_ERROR = 6.0
-LARGEST_LOCAL_ERROR = 0.1  # of the diameter
+LARGEST_LOCAL_ERROR = 0.09  # of the diameter
 # share of the surface that may exceed it: the walls of a keyway are twice as much of a gear
 MOVED_SHARE = 0.0075
 # largest median distance of a surface from its rotated copy, relative to the diameter, and largest
@@ -190,7 +190,7 @@ class _Compared:
         self._tree = cKDTree(self._points)
         self.axes = _axes(surface)
         self._known = dict[tuple[bytes, float], _Guess]()
-        self._exactly = dict[tuple[bytes, float], tuple[Float, Float]]()
+        self._exactly = dict[tuple[bytes, float], tuple[_Motion, Float]]()
 
     def _seen(self, surface: Surface) -> Mask:
         """Points that a camera outside can see, (N,), as opposed to faces inside a solid."""
@@ -261,9 +261,9 @@ class _Compared:
             some = self._visible[: COPIED_POINTS // 3]
             motion = self._fitted(guess.motion, axis, some, REFINED_STEPS)
             copied = motion.apply(self._visible[:COPIED_POINTS])
-            self._exactly[key] = _axis_of(motion), self._distances(copied)
+            self._exactly[key] = motion, self._distances(copied)
 
-        fitted, distances = self._exactly[key]
+        motion, distances = self._exactly[key]
         median = float(np.median(distances))
         fits = (
             median < MEDIAN_BOUNDS[kind]
@@ -272,7 +272,10 @@ class _Compared:
         if kind == "same":
             local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * error, LARGEST_LOCAL_ERROR)
             fits = fits and bool((distances > local).mean() < MOVED_SHARE)
-        return _Turned(median * self.diameter, fits, fitted)
+            # A symmetry leaves the centroid where it is.
+            moved = float(np.linalg.norm(motion.shift)) / self.diameter
+            fits = fits and moved < SYMMETRY_TOLERANCE
+        return _Turned(median * self.diameter, fits, _axis_of(motion))
 
     def _guess(self, axis: Float, turn: float) -> _Guess:
         """Rotate few points about an axis, and fit the axis."""
