@@ -14,6 +14,7 @@ from nextview.recognition.model_card import Symmetry, read_card
 from nextview.teaching import verification_fit
 from nextview.teaching.verification_fit import (
     DEFAULT_THINGS,
+    NeverConfident,
     Shown,
     as_stored,
     fit_verification,
@@ -149,6 +150,39 @@ def test_of_very_many_residuals_quantiles_are_kept():
         )
 
 
+def ended(episode, doubt):
+    """The results of a test, with the doubt after its last view."""
+    return [*episode[:-1], replace(episode[-1], doubt=doubt)]
+
+
+def test_a_thing_that_is_never_confident_is_told_with_the_reason():
+    rng = np.random.default_rng(3)
+    turn = (
+        "its orientation is known to ± {}° only, because it looks the same after a turn"
+    )
+    doubts = {
+        0: ["", "only 40 pixels show it"],  # confident once
+        1: [turn.format(90), "only 40 pixels show it", turn.format(104)],
+        2: ["", ""],
+        3: ["", "only 40 pixels show it"],
+    }
+    results = []
+    for thing, of_thing in doubts.items():
+        for doubt in of_thing:
+            views = [shown(thing, count, rng, 4, lie=thing == 2) for count in (1, 2, 3)]
+            results += ended(views, doubt)
+    assert fit_verification(results, np.arange(4)).never == (
+        NeverConfident(1, 3, None, turn.format(90)),
+        NeverConfident(2, 2, 3, ""),
+    )
+    # The things 2 and 3 are one class now: its members are tested as strangers.
+    of_class = [one for one in results if one.thing < 3]
+    before = as_stored(DEFAULTS, None, 4)
+    labels, new = np.array([0, 1, 2, 2]), np.full(4, -1)
+    never = with_new_things(before, of_class, labels, new).never
+    assert [one.thing for one in never] == [1]
+
+
 def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_their_own():
     before = as_stored(
         replace(DEFAULTS, geometry=22.0),
@@ -225,6 +259,35 @@ def test_learn_says_how_often_things_are_named_right_by_their_geometry(blocks):
         "high": [4, 2, 2],
         "low": [2, 2, 2],
     }
+
+
+def test_learn_says_which_things_are_never_confident_and_why(tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    step = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((90, 50, 20)),
+            trimesh.creation.box(bounds=[[-45, -25, 10], [-5, 5, 60]]),
+        ]
+    )
+    for name, mesh in {
+        "step": step,
+        "rod": trimesh.creation.cylinder(15, 110, sections=64),
+        "twin": trimesh.creation.box((70, 70, 30)),
+        "other_twin": trimesh.creation.box((70, 70, 30)),
+    }.items():
+        mesh.export(scans / f"{name}.ply")
+    named = ("rod=none",)  # as if it had a mark that no depth camera sees
+    learned = nextview.learn(
+        scans, tmp_path / "mine", unit="mm", workers=0, symmetry=named
+    )
+    why = dict(learned.never_confident)
+    assert set(why) == {"rod", "twin", "other_twin"}
+    assert "its orientation is known to ±" in why["rod"]
+    assert "it looks the same after a turn of" in why["rod"]
+    assert why["twin"].endswith("it looks like other_twin")
+    assert why["other_twin"].endswith("it looks like twin")
+    assert f"never confident: rod, {why['rod']}" in str(learned)
 
 
 def test_geometry_is_carried_over_and_only_new_things_are_shown(blocks, tmp_path):

@@ -67,6 +67,8 @@ from nextview.teaching.thing_views import (
 from nextview.teaching.unfinished_things import finished, part_of, stamp_of
 from nextview.teaching.verification_fit import (
     GROWTH,
+    VIEWS_VERIFIED,
+    NeverConfident,
     Shown,
     VerifiedFit,
     class_of_things,
@@ -91,6 +93,7 @@ LEARNED_PICTURE = "learned.png"
 JUDGED = "judged"
 # key of the things that an interrupted run has taught, see ``files.unfinished``
 PARTS = "things"
+MOST_NEVER = 10  # most things for which the summary says why they are never confident
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,8 @@ class Learned:
         left_out: what could not be learned and why, a phrase each.
         by_outline: with geometry: the accuracy in the same cases by outline and size alone.
         judged: number of things in this test.
+        never_confident: things that no test names with confidence after all its views, and why: a
+            sentence about each.
     """
 
     out: Path
@@ -142,6 +147,7 @@ class Learned:
     left_out: tuple[str, ...]
     by_outline: tuple[float, ...] = ()
     judged: int = 0
+    never_confident: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
         """Summary in words."""
@@ -155,6 +161,13 @@ class Learned:
         ]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
+        lines += [
+            f"never confident: {name}, {why}"
+            for name, why in self.never_confident[:MOST_NEVER]
+        ]
+        if len(self.never_confident) > MOST_NEVER:
+            rest = self.never_confident[MOST_NEVER:]
+            lines.append(f"nor {', '.join(name for name, _ in rest)}")
         return "\n".join(
             lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out]
         )
@@ -615,7 +628,25 @@ def _write(
     )
     if verified is None:
         return learned
-    return replace(learned, by_outline=verified.by_outline, judged=verified.things)
+    known = [source.name for source, arrays in taught if VERTICES in arrays]
+    return replace(
+        learned,
+        by_outline=verified.by_outline,
+        judged=verified.things,
+        never_confident=tuple(
+            (known[one.thing], _why_never(one, classes)) for one in verified.never
+        ),
+    )
+
+
+def _why_never(one: NeverConfident, classes: Sequence[str]) -> str:
+    """Reason why a thing is never named with confidence, in words."""
+    views = max(VIEWS_VERIFIED)
+    tests = "its test" if one.tests == 1 else f"any of {one.tests} tests"
+    after = f"not in {tests} of {views} views"
+    if one.confused is not None:
+        return f"{after}: it looks like {classes[one.confused]}"
+    return f"{after}: {one.doubt}"
 
 
 def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:

@@ -1,23 +1,31 @@
 """Fits to the surfaces of taught things: weight of the geometry, and usual residuals."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
+from nextview.recognition.belief import Stopping
 from nextview.recognition.model_card import Verification
+from nextview.recognition.poses import turn_apart
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.things.doubt import ORIENTATION_DOUBT, doubt_of
 from nextview.things.memory import RINGS, TaughtRecogniser
+from nextview.things.pose_candidates import candidates_of
+from nextview.things.recogniser import most_pixels
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals
+from nextview.things.verifier import Verified
 from nextview.things.weighing import (
     LEAST_TRUE_BELIEF,
     EvidenceWeights,
@@ -54,6 +62,8 @@ class Shown:
         named: number of the thing that explains the views best.
         residual: residual of that thing.
         judged: evidence; its belief is in classes.
+        doubt: reason why a result is not confident in its pose, see ``things.doubt``; "" without
+            one, or if later views were judged, too.
     """
 
     thing: int
@@ -61,6 +71,24 @@ class Shown:
     named: int
     residual: float
     judged: JudgedEpisode
+    doubt: str = ""
+
+
+@dataclass(frozen=True)
+class NeverConfident:
+    """A thing that was confident in none of its tests, after all their views.
+
+    Attributes:
+        thing: number of the thing among those of known geometry.
+        tests: number of its tests.
+        confused: class that it was most often confused with; None if its pose was in doubt.
+        doubt: the most frequent doubt about its pose; "" if it was confused.
+    """
+
+    thing: int
+    tests: int
+    confused: int | None
+    doubt: str
 
 
 @dataclass(frozen=True)
@@ -76,6 +104,7 @@ class VerifiedFit:
             views.
         things: number of tested things.
         unseen: names of the things that no view showed well enough.
+        never: tested things that were never confident.
     """
 
     verification: Verification
@@ -84,6 +113,7 @@ class VerifiedFit:
     confused: tuple[tuple[int, int, float], ...] = ()
     things: int = 0
     unseen: tuple[str, ...] = ()
+    never: tuple[NeverConfident, ...] = ()
 
 
 def to_be_shown(
@@ -125,7 +155,8 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     thing, draw = item
     known, labels = _opened(card)
     others = np.arange(len(labels))
-    if (labels == labels[thing]).sum() > 1:
+    alone = (labels == labels[thing]).sum() == 1
+    if not alone:
         others = np.delete(others, thing)
         known = TaughtThings(
             known.recogniser,
@@ -145,8 +176,45 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
             continue
         judged = _of_classes(verified.judged(0), int(labels[thing]), labels[others])
         named = int(others[verified.things[0]])
-        found.append(Shown(thing, count, named, verified.residual, judged))
+        # Of a class only other members are known, whose poses say nothing about this one.
+        last = alone and count == len(observations)
+        doubt = _doubt(known, verified, observations) if last else ""
+        found.append(Shown(thing, count, named, verified.residual, judged, doubt))
     return found
+
+
+def _doubt(
+    known: TaughtThings,
+    verified: Verified,
+    observations: Sequence[Observation],
+) -> str:
+    """Doubt about the likeliest pose after some views, and which pose it is mistaken for."""
+    numbers = np.arange(len(known.names))
+    poses, _ = candidates_of(known, verified, observations, numbers)
+    doubt = doubt_of(
+        verified,
+        poses,
+        most_pixels(observations),
+        partial(known.log_odds_of_stranger, observations, verified),
+    )
+    own = [pose for pose in poses if pose.thing == poses[0].thing]
+    if not doubt.startswith(ORIENTATION_DOUBT) or len(own) < 2:
+        return doubt
+    apart = [pose.probability * turn_apart(own[0], pose) ** 2 for pose in own]
+    other = own[int(np.argmax(apart))]
+    between = Rotation.from_matrix(own[0].pose[:3, :3].T @ other.pose[:3, :3])
+    return f"{doubt}, because it looks the same after {_in_words(between)}"
+
+
+def _in_words(turn: Rotation) -> str:
+    """A rotation in the axes of a scan file, such as ``a turn of 180° about (1, 0, 1)``."""
+    vector = turn.as_rotvec()
+    angle = np.linalg.norm(vector)
+    axis = vector / np.abs(vector).max()
+    axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    # Axes that are not quite those of the file are rounded to tenths.
+    named = ", ".join(f"{value:g}" for value in np.round(axis, 1) + 0.0)
+    return f"a turn of {np.degrees(angle):.0f}° about the axis ({named}) of its file"
 
 
 @lru_cache(maxsize=1)
@@ -264,6 +332,7 @@ def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
         _accuracy(shown, by_outline),
         _confused(shown, answers),
         len(half),
+        never=_never_confident(shown, [beliefs[id(one)] for one in shown], labels),
     )
 
 
@@ -363,7 +432,8 @@ def with_new_things(
         The extended fits.
     """
     weights = EvidenceWeights(**before.weights)
-    answers = [int(one.judged.belief(weights).argmax()) for one in shown]
+    beliefs = [one.judged.belief(weights) for one in shown]
+    answers = [int(belief.argmax()) for belief in beliefs]
     by_outline = [int(one.judged.by_outline.argmax()) for one in shown]
 
     residuals = residuals_of(before, range(len(before.usual)))
@@ -377,6 +447,7 @@ def with_new_things(
         _accuracy(shown, by_outline),
         _confused(shown, answers),
         len({one.thing for one in shown}),
+        never=_never_confident(shown, beliefs, labels),
     )
 
 
@@ -447,3 +518,49 @@ def _confused(
         (a, b, share)
         for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
     )
+
+
+def _never_confident(
+    shown: Sequence[Shown],
+    beliefs: Sequence[Float],
+    labels: Index,
+) -> tuple[NeverConfident, ...]:
+    """Things that no test ends with confidence in, and what they are confused with.
+
+    Args:
+        shown: results of the tests.
+        beliefs: belief in each class, of each result.
+        labels: class of each thing of known geometry, (T,).
+
+    Returns:
+        The things, by their numbers. A member of a class is left out: it is tested as a stranger.
+    """
+    ends = dict[int, list[tuple[Shown, Float]]]()
+    for one, belief in zip(shown, beliefs, strict=True):
+        if (labels == labels[one.thing]).sum() == 1:
+            tests = ends.setdefault(one.thing, [])
+            if one.views > 1 and tests and tests[-1][0].views < one.views:
+                tests.pop()  # an earlier result of the same test
+            tests.append((one, belief))
+
+    found = []
+    for thing, tests in sorted(ends.items()):
+        truth = int(labels[thing])
+        least = Stopping().threshold
+        unsure = [one.doubt for one, belief in tests if belief[truth] >= least]
+        if any(not doubt for doubt in unsure):
+            continue
+        count = len(tests)
+        if len(unsure) * 2 > count:
+            found.append(NeverConfident(thing, count, None, _usual_doubt(unsure)))
+            continue
+        rest = np.sum([belief for _, belief in tests], 0)
+        rest[truth] = 0
+        found.append(NeverConfident(thing, count, int(rest.argmax()), ""))
+    return tuple(found)
+
+
+def _usual_doubt(doubts: Sequence[str]) -> str:
+    """The first doubt of the most frequent kind; two of a kind differ in their numbers alone."""
+    kinds = [re.sub(r"\d+|, because.*", "", doubt) for doubt in doubts]
+    return doubts[kinds.index(max(kinds, key=kinds.count))]

@@ -13,6 +13,7 @@ MOST_SEEN_BEHIND = 0.1
 FEWEST_PIXELS = 350  # fewest pixels from which a shape can be recognised
 # share of the deviation of a uniformly random orientation, from which it counts as unknown
 UNKNOWN_PART = 0.75
+ORIENTATION_DOUBT = "its orientation is known to"  # how this doubt begins
 
 
 def doubt_of(
@@ -46,7 +47,7 @@ def doubt_of(
     if behind >= MOST_SEEN_BEHIND:
         return f"the camera sees past {100 * behind:.0f} % of its scan"
     if degrees >= unknown_turn(own[0].symmetry or ()):
-        return f"its orientation is known to ± {degrees:.0f}° only"
+        return f"{ORIENTATION_DOUBT} ± {degrees:.0f}° only"
     if stranger() > 0:
         return "its scan fits better if it is stretched"
     return ""

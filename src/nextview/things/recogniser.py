@@ -213,7 +213,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         doubt = doubt_of(
             found,
             poses,
-            _most_pixels(observations),
+            most_pixels(observations),
             partial(self.things.log_odds_of_stranger, observations, found),
         )
         return JointBelief(
@@ -248,8 +248,12 @@ class VerifiedRecogniser(TaughtRecogniser):
         return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
 
 
-def _most_pixels(observations: Sequence[Observation]) -> int:
-    """Number of pixels of the object in the frame that shows most of it."""
+def most_pixels(observations: Sequence[Observation]) -> int:
+    """Number of pixels of the object in the frame that shows most of it.
+
+    Args:
+        observations: views of one object.
+    """
     counts = [
         int(one.depth.astype(bool).sum()) for one in observations if one.scene is None
     ]

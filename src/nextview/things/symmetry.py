@@ -1,18 +1,19 @@
 """Rotational symmetries of a surface: axes and angles that map it to itself.
 
-A rotation is a symmetry if hardly any of the surface deviates from its rotated copy. The tolerance
-is a small part of the diameter plus the inexactness of the surface itself: an exact mesh maps to
-itself to within its facets, a scan to within its errors, which the median of the distances shows.
-The criterion is the area of the deviating parts, not a quantile, which would miss a hole or a
-keyway. The BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCV
-workshops 2020) uses the larger of 15 mm and a tenth of the diameter, the tolerance of people who
-look at pictures; a depth camera resolves the holes of a flange.
+A rotation is a symmetry if hardly any of the visible surface deviates from the rotated surface.
+The tolerance is a small part of the diameter plus the error of the surface: an exact mesh maps to
+itself to within its facets, a scan to within its errors. The rotation that fits best measures this
+error, so that the tolerance does not grow with the misfit of the rotation that is tested. The
+criterion is the area of the deviating parts, not a quantile, which would miss a hole or a keyway.
+The BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCV workshops 2020)
+uses the larger of 15 mm and a tenth of the diameter, the tolerance of people who look at pictures;
+a depth camera resolves the holes of a flange.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -29,21 +30,19 @@ from nextview.types import Float, Mask
 # relative to the diameter: facets of a circle with 16 corners, and the resolution of a camera at
 # five radii
 SYMMETRY_TOLERANCE = 0.01
-# median distance of a surface from its rotated copy, relative to the diameter
-SAME_MEDIAN = 0.01
-# tolerance of a tenth of a scan, in median distances, as for bulges and seams
+# tolerance of most of a scan, in errors of the surface, as for bulges and seams
 USUAL_ERRORS = 8.0
-USUAL_SHARE = 0.1
 # tolerance of all but MOVED_SHARE, as for the inside of a cup that no scanner reaches
-LOCAL_ERRORS = 40.0
-LARGEST_LOCAL_ERROR = 0.08  # of the diameter
+LOCAL_ERRORS = 100.0
+# largest error about one axis, in errors of the surface: the scan of a lid is worse than of a side
+LARGEST_ERROR = 6.0
+LARGEST_LOCAL_ERROR = 0.09  # of the diameter
 # share of the surface that may exceed it: the walls of a keyway are twice as much of a gear
 MOVED_SHARE = 0.0075
-# bounds of near symmetries, for which a part of the thing deviates
-NEAR_MEDIAN = 0.025
-NEAR_SHARE = 0.15
-MEDIAN_BOUNDS = {"same": SAME_MEDIAN, "nearly": NEAR_MEDIAN}
-BESIDE_BOUNDS = {"same": USUAL_SHARE, "nearly": NEAR_SHARE}
+# largest median distance of a surface from its rotated copy, relative to the diameter, and largest
+# share that is farther away than usual; of a near symmetry a part of the thing deviates
+MEDIAN_BOUNDS = {"same": 0.01, "nearly": 0.025}
+BESIDE_BOUNDS = {"same": 0.1, "nearly": 0.15}
 HIGHEST_ORDER = 40  # highest order of a symmetry, such as the number of teeth of a gear
 # powers of primes up to the highest order
 POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
@@ -51,8 +50,7 @@ POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
 ANY_TURNS = np.arange(23, 0, -2) / 48
 # sample points of the surface, whose triangles are candidates for the nearest one
 SAMPLE_POINTS = 20_000
-COARSE_POINTS = 4000  # of these, targets of the fit of a rotated copy
-COPIED_POINTS = 3000  # sample points of the rotated copy
+COPIED_POINTS = 3000  # visible sample points of the rotated copy
 GUESSED_POINTS = 400  # of these, points of a quick test that rejects most rotations
 # share of them that lies near the surface even for an inaccurate axis
 GUESSED_SHARE = 0.9
@@ -134,25 +132,44 @@ class _Turned:
 
 
 @dataclass(frozen=True, eq=False)
+class _Motion:
+    """A rotation about an axis that passes near the centroid.
+
+    Attributes:
+        rotation: the rotation about the centroid.
+        shift: displacement after it, (3,), metres.
+    """
+
+    rotation: Rotation
+    shift: Float
+
+    def apply(self, points: Float) -> Float:
+        """Move points, (N, 3), metres."""
+        return np.asarray(self.rotation.apply(points) + self.shift)
+
+
+@dataclass(frozen=True, eq=False)
 class _Guess:
     """A rotated copy of few points after the fit.
 
     Attributes:
-        rotation: rotation of the copy; None if no tilt makes it fit.
-        median: median distance of the points from the surface, relative to the diameter.
-        beside: share of the points whose distance is larger than usual.
+        motion: rotation and displacement of the copy; None if none near the rotation makes it fit.
+        distances: distances of the points from the surface, (N,), relative to the diameter.
+        median: their median.
     """
 
-    rotation: Rotation | None
+    motion: _Motion | None
+    distances: Float
     median: float
-    beside: float
 
 
 class _Compared:
-    """The visible part of a surface, prepared for comparisons with its rotated copies.
+    """A surface, prepared for comparisons with rotated copies of its visible part.
 
     Its centroid is the origin. Comparisons are cached: orders share rotations, and exact and near
     symmetries share guesses.
+
+    The target is the whole surface: a point inside a pipe may come to lie where no camera reaches.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -169,15 +186,11 @@ class _Compared:
         lengths = np.linalg.norm(across, axis=1, keepdims=True)
         self._normals = across / lengths.clip(1e-30)
 
-        seen = self._seen(surface)
-        self._triangles = self._triangles[seen]
-        self._points = self._points[seen]
-        self._normals = self._normals[seen]
+        self._visible = self._points[self._seen(surface)]
         self._tree = cKDTree(self._points)
-        self._coarse = cKDTree(self._points[:COARSE_POINTS])
         self.axes = _axes(surface)
         self._known = dict[tuple[bytes, float], _Guess]()
-        self._exactly = dict[tuple[bytes, float], tuple[Float, Float]]()
+        self._exactly = dict[tuple[bytes, float], tuple[_Motion, Float]]()
 
     def _seen(self, surface: Surface) -> Mask:
         """Points that a camera outside can see, (N,), as opposed to faces inside a solid."""
@@ -202,88 +215,123 @@ class _Compared:
         seen[left] = False
         return seen if seen.any() else ~seen
 
-    def turned(self, axis: Float, turn: float, kind: Kind) -> _Turned:
+    def error_about(self, axes: Sequence[Float], turns: Iterable[float]) -> float:
+        """Error of the surface, relative to the diameter, as rotations about some axes show it.
+
+        It is the smallest median distance of any of the rotations, but not much larger than the
+        smallest about all candidate axes: if one rotation is exact, so is the surface.
+
+        Args:
+            axes: unit vectors, (3,) each.
+            turns: angles, full turns.
+        """
+        least = self._least_median(axes, turns)
+        return min(least, LARGEST_ERROR * self._error)
+
+    @cached_property
+    def _error(self) -> float:
+        """Smallest median distance of any rotation about a candidate axis."""
+        return self._least_median(self.axes, map(_telling, POWERS))
+
+    def _least_median(self, axes: Sequence[Float], turns: Iterable[float]) -> float:
+        guesses = [self._guess(axis, turn) for turn in turns for axis in axes]
+        return min(guess.median for guess in guesses)
+
+    def turned(self, axis: Float, turn: float, error: float, kind: Kind) -> _Turned:
         """Compare with the copy that is rotated about an axis.
 
         Args:
             axis: unit vector, (3,).
             turn: angle, full turns.
+            error: error of the surface, relative to the diameter.
             kind: kind of symmetry.
         """
-        key = (axis.tobytes(), turn)
-        if key not in self._known:
-            self._known[key] = self._guessed(axis, turn)
-        guess = self._known[key]
-
+        guess = self._guess(axis, turn)
         beside = max(
             guess.median / MEDIAN_BOUNDS[kind],
-            guess.beside / BESIDE_BOUNDS[kind],
+            _beside(guess.distances, error) / BESIDE_BOUNDS[kind],
         )
-        if guess.rotation is None or beside > CLEARLY_BESIDE:
+        if guess.motion is None or beside > CLEARLY_BESIDE:
             return _Turned(guess.median * self.diameter, False, axis)
         if kind == "nearly" and beside * CLEARLY_BESIDE < 1:
-            return _Turned(guess.median * self.diameter, True, _axis_of(guess.rotation))
+            return _Turned(guess.median * self.diameter, True, _axis_of(guess.motion))
 
+        key = (axis.tobytes(), turn)
         if key not in self._exactly:
-            some = self._points[: COPIED_POINTS // 3]
-            rotation = self._fitted(guess.rotation, axis, some, REFINED_STEPS)
-            copied = rotation.apply(self._points[:COPIED_POINTS])
-            self._exactly[key] = _axis_of(rotation), self._distances(copied)
+            some = self._visible[: COPIED_POINTS // 3]
+            motion = self._fitted(guess.motion, axis, some, REFINED_STEPS)
+            copied = motion.apply(self._visible[:COPIED_POINTS])
+            self._exactly[key] = motion, self._distances(copied)
 
-        fitted, distances = self._exactly[key]
+        motion, distances = self._exactly[key]
         median = float(np.median(distances))
         fits = (
             median < MEDIAN_BOUNDS[kind]
-            and _beside(distances, median) < BESIDE_BOUNDS[kind]
+            and _beside(distances, error) < BESIDE_BOUNDS[kind]
         )
         if kind == "same":
-            local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
+            local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * error, LARGEST_LOCAL_ERROR)
             fits = fits and bool((distances > local).mean() < MOVED_SHARE)
-        return _Turned(median * self.diameter, fits, fitted)
+            # A symmetry leaves the centroid where it is.
+            moved = float(np.linalg.norm(motion.shift)) / self.diameter
+            fits = fits and moved < SYMMETRY_TOLERANCE
+        return _Turned(median * self.diameter, fits, _axis_of(motion))
 
-    def _guessed(self, axis: Float, turn: float) -> _Guess:
-        """Rotate few points about an axis, and fit the tilt."""
-        rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
-        few = self._points[:GUESSED_POINTS]
-        apart = self._coarse.query(rotation.apply(few))[0] / self.diameter
-        if np.quantile(apart, GUESSED_SHARE) > GUESSED_DISTANCE:
-            return _Guess(None, float(np.median(apart)), 1.0)
-
-        rotation = self._fitted(rotation, axis, few)
-        distances = self._distances(rotation.apply(few))
-        median = float(np.median(distances))
-        return _Guess(rotation, median, _beside(distances, median))
+    def _guess(self, axis: Float, turn: float) -> _Guess:
+        """Rotate few points about an axis, and fit the axis."""
+        key = (axis.tobytes(), turn)
+        if key not in self._known:
+            motion = _Motion(Rotation.from_rotvec(2 * np.pi * turn * axis), np.zeros(3))
+            few = self._visible[:GUESSED_POINTS]
+            distances = self._tree.query(motion.apply(few))[0] / self.diameter
+            near = np.quantile(distances, GUESSED_SHARE) <= GUESSED_DISTANCE
+            if near:
+                motion = self._fitted(motion, axis, few)
+                distances = self._distances(motion.apply(few))
+            self._known[key] = _Guess(
+                motion if near else None,
+                distances,
+                float(np.median(distances)),
+            )
+        return self._known[key]
 
     def _fitted(
         self,
-        rotation: Rotation,
+        motion: _Motion,
         axis: Float,
         points: Float,
         steps: int = FITTED_STEPS,
-    ) -> Rotation:
-        """Fit the tilt of a rotated copy, without further rotation about the axis.
+    ) -> _Motion:
+        """Fit tilt and displacement of the axis, without further rotation about it.
 
         Point-to-plane registration of some points, (N, 3), with the nearest sample points;
-        deviating parts have little weight.
+        deviating parts have little weight. A detail that breaks a symmetry, such as a keyway,
+        displaces the centroid from the axis of the rest.
         """
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
         across = np.stack([first, np.cross(axis, first)])
         for _ in range(steps):
-            copy = rotation.apply(points)
-            apart, nearest = self._coarse.query(copy)
+            copy = motion.apply(points)
+            apart, nearest = self._tree.query(copy)
             normals = self._normals[nearest]
             along = np.einsum("ni,ni->n", self._points[nearest] - copy, normals)
             weights = np.asarray(
                 1 / (1 + (apart / (np.median(apart) + LEAST_APART)) ** 2)
             )
-            tilting = np.cross(copy, normals) @ across.T
-            left = (tilting * weights[:, None]).T @ tilting
-            # The tilt of a ball is undetermined.
-            left += FREE_TILT * weights.sum() * self.diameter**2 * np.eye(2)
-            change = np.linalg.solve(left, tilting.T @ (weights * along))
-            rotation = Rotation.from_rotvec(change @ across) * rotation
-        return rotation
+            # Tilts are in radians, displacements in diameters.
+            moving = np.c_[
+                np.cross(copy, normals) @ across.T,
+                self.diameter * normals @ across.T,
+            ]
+            left = (moving * weights[:, None]).T @ moving
+            # The tilt of a ball is undetermined, and so is the displacement of a plane.
+            left += FREE_TILT * weights.sum() * self.diameter**2 * np.eye(4)
+            change = np.linalg.solve(left, moving.T @ (weights * along))
+            tilt = Rotation.from_rotvec(change[:2] @ across)
+            shift = tilt.apply(motion.shift) + self.diameter * change[2:] @ across
+            motion = _Motion(tilt * motion.rotation, shift)
+        return motion
 
     def _distances(self, points: Float) -> Float:
         """Distances of points from the surface, (N,), relative to the diameter."""
@@ -298,14 +346,14 @@ def _compared(surface: Surface) -> _Compared:
     return _Compared(surface)
 
 
-def _beside(distances: Float, median: float) -> float:
-    """Share of distances that are larger than usual, given the median; relative to the diameter."""
-    return float((distances > SYMMETRY_TOLERANCE + USUAL_ERRORS * median).mean())
+def _beside(distances: Float, error: float) -> float:
+    """Share of distances that are larger than usual for a surface with this error."""
+    return float((distances > SYMMETRY_TOLERANCE + USUAL_ERRORS * error).mean())
 
 
-def _axis_of(rotation: Rotation) -> Float:
+def _axis_of(motion: _Motion) -> Float:
     """Axis of a rotation, unit vector, (3,)."""
-    vector = rotation.as_rotvec()
+    vector = motion.rotation.as_rotvec()
     return np.asarray(vector / np.linalg.norm(vector))
 
 
@@ -356,8 +404,9 @@ def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     angles = np.arange(0, np.pi, STEP_ACROSS)[:, None]
-    across = np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
-    turned = [compared.turned(direction, 0.5, "same") for direction in across]
+    across = list(np.cos(angles) * first + np.sin(angles) * np.cross(axis, first))
+    error = compared.error_about(across, [0.5])
+    turned = [compared.turned(direction, 0.5, error, "same") for direction in across]
 
     best = min(turned, key=lambda one: (not one.fits, one.median))
     return [_symmetry(best.axis, 2)] if best.fits else []
@@ -428,14 +477,18 @@ def _order(
 
     The order is 0 for a continuous symmetry, and 1 for none.
     """
-    largest = compared.turned(axis, float(ANY_TURNS[0]), kind)
-    worst = _worst(compared, largest.axis, ANY_TURNS, kind) if largest.fits else None
-    if worst is not None:
-        return 0, worst, largest.axis
+    error = compared.error_about([axis], map(_telling, POWERS))
+    largest = compared.turned(axis, float(ANY_TURNS[0]), error, kind)
+    if largest.fits:
+        worst = _worst(compared, largest.axis, ANY_TURNS, error, kind)
+        if worst is not None:
+            return 0, worst, largest.axis
 
     # Rotations by 1/4 and 1/3 of a full turn generate one by 1/12: powers of primes are tested,
     # then their products.
-    tried = {power: compared.turned(axis, _telling(power), kind) for power in POWERS}
+    tried = {
+        power: compared.turned(axis, _telling(power), error, kind) for power in POWERS
+    }
     possible = {power: turned for power, turned in tried.items() if turned.fits}
     if not possible:
         return 1, np.inf, axis
@@ -443,7 +496,7 @@ def _order(
     for order in _orders(math.lcm(*possible)):
         # Rotations in both directions are equivalent.
         turns = _tellingly(np.arange(1, order // 2 + 1) / order)
-        worst = _worst(compared, fitted, turns, kind)
+        worst = _worst(compared, fitted, turns, error, kind)
         if worst is not None:
             return order, worst, fitted
     return 1, np.inf, axis
@@ -461,26 +514,21 @@ def _tellingly(turns: Float) -> Float:
 
 
 def _orders(whole: int) -> Sequence[int]:
-    """Candidates of the highest order, highest first, given the product of all symmetries found.
-
-    A thing that is round except for details, such as teeth, may seem to have more symmetries than
-    is possible.
-    """
-    if whole > HIGHEST_ORDER:
-        return range(HIGHEST_ORDER, 1, -1)
-    return [order for order in range(whole, 1, -1) if whole % order == 0]
+    """Candidates of the highest order, highest first: divisors of the product of those found."""
+    return [order for order in range(HIGHEST_ORDER, 1, -1) if whole % order == 0]
 
 
 def _worst(
     compared: _Compared,
     axis: Float,
     turns: Float,
+    error: float,
     kind: Kind,
 ) -> float | None:
     """Largest median distance of some rotations, metres; None if one of them is no symmetry."""
     worst = 0.0
     for turn in turns.tolist():
-        turned = compared.turned(axis, turn, kind)
+        turned = compared.turned(axis, turn, error, kind)
         if not turned.fits:
             return None
         worst = max(worst, turned.median)
