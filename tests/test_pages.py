@@ -27,14 +27,6 @@ import documented_commands
 README = (ROOT / "README.md").read_text()
 
 
-@pytest.fixture
-def there(tmp_path, monkeypatch):
-    """A working folder with the sample meshes."""
-    shutil.copytree(SAMPLE_FILES, tmp_path / "samples")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
 def test_the_examples_of_a_page_run(page):
     try:
@@ -242,17 +234,6 @@ def test_ci_runs_the_commands_of_all_pages():
 # The README
 
 
-@pytest.mark.parametrize(
-    "line",
-    re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M),
-)
-def test_its_commands_on_the_samples_run(line, there, capsys):
-    if "--models" in line:
-        pytest.skip("with models that the commands before it make")
-    main(line.split()[1:])
-    assert "It is a" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("line", re.findall(r"^nextview .*?(?=\s+#|$)", README, re.M))
 def test_its_options_are_there(line, capsys):
     """Every option that a line gives stands in the help of its command."""
@@ -263,52 +244,6 @@ def test_its_options_are_there(line, capsys):
     assert end.value.code == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in words if word.startswith("--"))
-
-
-SMALL = {
-    "render": "--workers 0",
-    "train recogniser": (
-        "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
-    ),
-    "predict": "--workers 0",
-    "fit calibration": "--delta 0.2",
-    "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
-    "benchmark classes": "--runs 2 --samples 100",
-}
-"""What makes a command of the page quick."""
-
-
-@pytest.mark.long  # CI's job for the commands of all pages runs them
-def test_the_commands_for_your_own_dataset_run(
-    furniture,
-    there,
-    capsys,
-):
-    for package in ("torch", "onnx", "pandas", "jinja2"):
-        pytest.importorskip(package)
-    shutil.copytree(furniture, there / "data/ModelNet10")
-    (part,) = re.findall(r"## Make it yours\n+```sh\n(.*?)```", README, re.S)
-    lines = [line.partition("#")[0].strip() for line in part.splitlines()]
-    assert (
-        lines[0] == "nextview download modelnet10 data"
-    )  # into the folder that is there already
-    for line in lines[1:]:
-        small = next(
-            (
-                options
-                for command, options in SMALL.items()
-                if line.startswith(f"nextview {command} ")
-            ),
-            "",
-        )
-        capsys.readouterr()
-        main([*line.split()[1:], *small.split()])
-        if line.startswith("nextview recognise "):
-            assert "It is a" in capsys.readouterr().out
-    assert (there / "benchmark/leaderboard.md").exists() or (
-        there / "benchmark/measures.csv"
-    ).exists()
-    assert list(there.rglob("*.html"))
 
 
 # From a RealSense

@@ -107,10 +107,11 @@ def shoot_recording(browser: Browser, path: Path) -> None:
         session.observers.append(Recorder(Path(folder) / "episode.rrd"))
         while not session.done:
             session.update(camera.observe(session.pose))
-        rerun = Path(sys.executable).with_name("rerun")
         serving = subprocess.Popen(
             [
-                rerun,
+                sys.executable,
+                "-m",
+                "rerun",
                 "--serve-web",
                 "--bind=127.0.0.1",
                 "--web-viewer-port=9091",
