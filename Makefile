@@ -2,7 +2,7 @@
 PYTHON ?= python3
 
 .SECONDARY:  # what a rule makes on the way is kept
-.PHONY: demo test test-ros lint docs reproduce reproduce-small reproduce-things clean
+.PHONY: demo test test-ros lint docs docs-check reproduce reproduce-small reproduce-things clean
 
 demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
 	.venv/bin/nextview demo
@@ -24,6 +24,9 @@ lint: .venv-test/installed  ## style and types
 docs: .venv-test/installed  ## the documentation site, build/site/index.html; a broken link or notebook ends it
 	NO_MKDOCS_2_WARNING=1 .venv-test/bin/mkdocs build
 	@echo 'build/site/index.html; for its search: python3 -m http.server -d build/site'
+
+docs-check: .venv-test/installed  ## each command, output and picture of the pages, anew and compared; CHECK="--data data": slow pictures, too; --update
+	OMP_NUM_THREADS=1 .venv-test/bin/python workflow/documented_commands.py $(CHECK)
 
 DATA ?= data/ModelNet10
 OUT ?= reproduction

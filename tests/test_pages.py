@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw, ImageFilter
 from pipeline import SAMPLE_FILES
 from small_tables import camera_over, view
 
@@ -25,14 +26,6 @@ import documented_commands
 import repeated
 
 README = (ROOT / "README.md").read_text()
-
-
-@pytest.fixture
-def there(tmp_path, monkeypatch):
-    """A working folder with the sample meshes."""
-    shutil.copytree(SAMPLE_FILES, tmp_path / "samples")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
@@ -204,6 +197,75 @@ def test_a_failing_command_is_reported(tmp_path, monkeypatch, capsys):
     assert shown.count("FAILED") == 2
 
 
+def test_an_output_is_compared_with_the_page_and_updated(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "page.md"
+    begin = "# Page\n\n```sh\npython print.py\n```\n\n```\n"
+    after = "```\n\n```python\nprint(7)\n```\n\nIt prints\n\n```\n7\n```\n"
+    (tmp_path / "print.py").write_text("print('a 1.25')\nprint('b')\nprint(' c 2.5')\n")
+    monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
+    environments = documented_commands.Environments(tmp_path / "environments")
+    for shown, becomes in (
+        ("a 1.25\nb\n c 2.5\n", ""),
+        ("a 1.25\nb\n", "a 1.25\nb\n c 2.5\n"),
+        ("...\n c 2.4\n...\n", "...\n c 2.5\n...\n"),
+        ("a 1.25\n...\n c 2.5\n", ""),
+    ):
+        page.write_text(begin + shown + after)
+        failed = documented_commands.run_page("page.md", environments, tmp_path)
+        assert failed == ["page.md:8  shows another output"] * bool(becomes), shown
+        assert ("\n- c 2.4\n+ c 2.5\n" in capsys.readouterr().out) == ("2.4" in shown)
+        documented_commands.run_page("page.md", environments, tmp_path, update=True)
+        capsys.readouterr()
+        assert page.read_text() == begin + (becomes or shown) + after
+
+
+def test_an_output_of_no_step_is_reported(tmp_path, monkeypatch):
+    (tmp_path / "page.md").write_text("```text\na folder\n```\n\n```\nanswer\n```\n")
+    monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
+    with pytest.raises(ValueError, match=r"page\.md:6: the output of what"):
+        documented_commands.steps_of("page.md")
+
+
+def test_each_picture_of_the_pages_has_a_command_or_a_reason():
+    made = [
+        name
+        for names in documented_commands.PICTURES.values()
+        for name in names.split()
+    ]
+    listed = [*made, *documented_commands.NOT_DRAWN]
+    kept = sorted(path.name for path in documented_commands.IMAGES.iterdir())
+    assert sorted(listed) == kept
+    assert documented_commands.pictures_on(documented_commands.PAGES) == set(kept)
+
+
+def test_a_picture_with_another_word_is_another_picture(tmp_path):
+    def drawn(name, words, size=(700, 500), blur=0.0, frames=1):
+        films = []
+        for number in range(frames):
+            image = Image.new("RGB", size, "white")
+            word = words[number % len(words)]
+            ImageDraw.Draw(image).text((40, 40), word, "black", font_size=13)
+            films.append(image.filter(ImageFilter.GaussianBlur(blur)))
+        more = {"save_all": True, "append_images": films[1:]} if frames > 1 else {}
+        films[0].save(tmp_path / name, **more)
+        return tmp_path / name
+
+    first = drawn("first.png", ["until it is sure"])
+    differs = documented_commands.picture_difference
+    assert differs(first, first) == 0
+    assert differs(first, tmp_path / "missing.png") == 255
+    assert differs(first, drawn("b.png", ["until it is sure"], (700, 501))) == 255
+    other = drawn("c.png", ["until confident"])
+    assert differs(first, other) > documented_commands.TOLERANCE
+    softer = drawn("d.png", ["until it is sure"], blur=0.4)
+    assert 0 < differs(first, softer) < documented_commands.TOLERANCE
+
+    film = drawn("film.gif", ["one", "two", "three"], frames=3)
+    assert differs(film, drawn("e.gif", ["one", "two", "three"], frames=3)) == 0
+    assert differs(film, drawn("f.gif", ["one", "two", "3333"], frames=3)) > 20
+    assert differs(film, drawn("g.gif", ["one", "two"], frames=2)) == 255
+
+
 def test_each_page_names_what_its_commands_need():
     needed = set()
     for page in documented_commands.PAGES:
@@ -220,73 +282,31 @@ def test_each_page_names_what_its_commands_need():
                     f"{page}:{step.line} needs {wanted}, which the page does not name"
                 )
                 needed.add(wanted)
+    for command in documented_commands.PICTURES:
+        needed |= documented_commands.needs_of(command)
     assert needed == set(documented_commands.NEEDS.values())
 
 
 def test_a_command_runs_with_only_its_own_dependencies(tmp_path):
     environments = documented_commands.Environments(tmp_path / "environments")
     asked = "python -c 'import nextview.training.export'"
-    status, said, _ = environments.run(asked, tmp_path)
-    assert status == 1
-    assert "pip install 'nextview[train]'" in said
-    status, said, _ = environments.run(
-        "nextview --version && python -c 'import pandas'",
-        tmp_path,
-    )
-    assert said.startswith("nextview 0")
-    assert "No module named 'pandas'" in said
-    status, said, _ = environments.run(
-        "python -c 'import pandas'",
-        tmp_path,
-        frozenset(["nextview[benchmark]"]),
-    )
-    assert (status, said) == (0, "")
+    done = environments.run(asked, tmp_path)
+    assert done.returncode == 1
+    assert "pip install 'nextview[train]'" in done.stderr
+    done = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
+    assert done.stdout.startswith("nextview 0")
+    assert "No module named 'pandas'" in done.stderr
+    needs = frozenset(["nextview[benchmark]"])
+    done = environments.run("python -c 'import pandas'", tmp_path, needs)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
 def test_ci_runs_the_commands_of_all_pages():
     ci = (ROOT / ".github/workflows/ci.yml").read_text()
-    assert "- run: .venv-test/bin/python workflow/documented_commands.py\n" in ci
+    assert "- run: make docs-check\n" in ci
 
 
 # The README
-
-
-@pytest.mark.long  # it teaches three things, as CI's job for the commands of all pages does
-def test_the_example_prints_what_the_readme_shows(there, capsys):
-    code, shown = re.search(
-        r"```python\n(.*?)```\n\n```\n(.*?)```",
-        README,
-        re.S,
-    ).groups()
-    names: dict = {}
-    exec(code, names)
-    said, pose = capsys.readouterr().out.split("\n", 1)
-    said_there, pose_there = shown.split("\n", 1)
-    assert said.partition(", at ")[0] == said_there.partition(", at ")[0]
-    numbers = [
-        np.array(re.findall(r"-?\d+\.\d*", text), float) for text in (pose, pose_there)
-    ]
-    np.testing.assert_allclose(*numbers, atol=0.02)
-    assert names["result"].answer == "table"
-
-
-def test_the_session_of_a_camera_in_the_object_frame_runs(capsys):
-    page = (ROOT / "docs/your_camera.md").read_text()
-    (example,) = re.findall(r"```\n(session = .*?)```", page, re.S)
-    camera = nextview.SimulatedCamera(nextview.load_mesh(SAMPLE_FILES / "chair.off"))
-    exec(f"import nextview\n{example}", {"my_camera": camera})
-    assert "chair (belief" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "line",
-    re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M),
-)
-def test_its_commands_on_the_samples_run(line, there, capsys):
-    if "--models" in line:
-        pytest.skip("with models that the commands before it make")
-    main(line.split()[1:])
-    assert "It is a" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("line", re.findall(r"^nextview .*?(?=\s+#|$)", README, re.M))
@@ -299,49 +319,6 @@ def test_its_options_are_there(line, capsys):
     assert end.value.code == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in words if word.startswith("--"))
-
-
-SMALL = {
-    "render": "--workers 0",
-    "train recogniser": (
-        "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
-    ),
-    "predict": "--workers 0",
-    "fit calibration": "--delta 0.2",
-    "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
-    "benchmark classes": "--runs 2 --samples 100",
-}
-"""What makes a command of the page quick."""
-
-
-@pytest.mark.long  # CI's job for the commands of all pages runs them
-def test_the_commands_for_your_own_dataset_run(
-    furniture,
-    there,
-    capsys,
-):
-    for package in ("torch", "onnx", "pandas", "jinja2"):
-        pytest.importorskip(package)
-    shutil.copytree(furniture, there / "data/ModelNet10")
-    page = (ROOT / "docs/dataset.md").read_text()
-    (part,) = re.findall(r"## From meshes to a benchmark\n.*?```\n(.*?)```", page, re.S)
-    for line in [line.partition("#")[0].strip() for line in part.splitlines()]:
-        small = next(
-            (
-                options
-                for command, options in SMALL.items()
-                if line.startswith(f"nextview {command} ")
-            ),
-            "",
-        )
-        capsys.readouterr()
-        main([*line.split()[1:], *small.split()])
-        if line.startswith("nextview recognise "):
-            assert "It is a" in capsys.readouterr().out
-    assert (there / "benchmark/leaderboard.md").exists() or (
-        there / "benchmark/measures.csv"
-    ).exists()
-    assert list(there.rglob("*.html"))
 
 
 # From a RealSense

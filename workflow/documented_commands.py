@@ -1,13 +1,19 @@
-"""Run every command that the pages show, on small inputs made here: a command that no machine runs
-is wrong some day.
+"""Run every command that the pages show, on small inputs made here, and compare what it prints and
+draws with the page: what no machine runs is wrong some day.
 
-    python workflow/documented_commands.py [PAGE ...] [--only-list]
+    python workflow/documented_commands.py [PAGE or PICTURE ...] [--data FOLDER] [--update]
 
 Takes README.md, docs/*.md, research/README.md and what stands above the code of examples/*.py apart
 into commands and Python blocks, and runs them page by page, in the order of the page, each page in
 a folder of its own with what its commands need: a few box meshes under the names of ModelNet10, a
 store of their views and predictions. ``SMALL`` makes a command quick; ``NOT_RUN`` says what is not
 run, and why. What fails is printed with the end of its output, and the exit status is 1.
+
+A fenced block without a language is the output of the step before it, which has to print just that;
+if it has lines "...", each other line has to be printed, in this order. ``PICTURES`` has the
+command of each picture of the pages, and ``NOT_DRAWN`` what is not drawn, and why. A difference is
+a failure, and is shown as a diff; ``--update`` changes the page and the pictures instead. With
+``--data``, a folder of real scans, the pictures are made that need them, a browser, or minutes.
 
 Each command runs where nothing is installed but what a reader of the page has: the base
 installation, and the extras that ``NEEDS`` names for it, which the page has to name, too. Such an
@@ -17,6 +23,7 @@ environment is linked from that of this script.
 from __future__ import annotations
 
 import ast
+import difflib
 import os
 import re
 import shlex
@@ -24,17 +31,23 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
 import trimesh
 import tyro
+from matplotlib import font_manager, get_data_path
+from PIL import Image, ImageSequence
+from scipy.ndimage import uniform_filter
 
 ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs/images"
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
 
 PAGES = (
@@ -57,9 +70,13 @@ PROGRAMS = (
     "cp -r ros2",
 )
 LIMIT = 900  # seconds for one command
+WIDTH = 110  # columns of the terminal
+SQUARE = 32  # pixels, side of the squares in which pictures are compared
+TOLERANCE = (
+    6.0  # of 255: mean difference in a square; edges of letters and lines stay below it
+)
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
-    r"^nextview look ": "needs frames of a table: tests/test_scene.py makes some and runs it",
     r"lmo": "needs a dataset of BOP: tests/test_bop.py writes one and runs it",
     r"examples/arm_over_table": (
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
@@ -76,7 +93,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
     ),
-    r"pyrealsense2|shot_0": (
+    r"pyrealsense2": (
         "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
     ),
     r"^rerun ": "opens a window",
@@ -84,9 +101,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"--scheduler": "needs the scheduler of the line before",
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |python3.11 ros2|export AMENT_PREFIX)": (
         "needs ROS 2; make test-ros runs the node, and the first steps of its page"
-    ),
-    r"my_rig": (
-        "needs frames of several cameras; tests/test_several_cameras.py writes such and checks them"
     ),
     r"my_(recordings?|folder)": (
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
@@ -99,6 +113,8 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans, and hours; tests/test_submit.py runs methods on a small archive"
     ),
     r"benchmarks\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
+    r"NpzDepth": "a part of a reader that is to be put into nextview itself",
+    r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
         "needs the YCB scans, and minutes"
     ),
@@ -128,8 +144,9 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"benchmarks\.views|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
-    r"--record|viewers\.(scene_)?recording": "nextview[record]",
-    r"--explorer|viewers\.scene_page": "nextview[explore]",
+    r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
+    r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
+    r"explorer_pictures": "nextview[browser]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
     r"research\.train_agent": "research[rl]",
     r"research\.arm|examples/(panda|bin_picking)": "research[arm]",
@@ -165,17 +182,26 @@ FEWER = {  # what a page says of the published runs, and how many it is here
     r"--batch \d+": "--batch 8",
 }
 TABLE_OF_THINGS = """
+from dataclasses import replace
+
 import numpy as np
 
+from nextview.data.samples import sample_mesh
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import taught_meshes
 
 rng = np.random.default_rng(4)
 meshes = taught_meshes("ycb", ("cracker_box", "mug", "banana"))
-table = TableCamera(SimulatedTable.draw(meshes, rng), SENSORS["stereo"], rng)
+toy = replace(sample_mesh("monitor"), radius=0.07, centre=np.zeros(3), unit="m")
+table = TableCamera(SimulatedTable.draw([*meshes, toy], rng), SENSORS["stereo"], rng)
 """
 BEFORE = {  # what Python blocks of a page take for granted
+    "README.md": """
+import nextview
+
+my_camera = nextview.SimulatedCamera(nextview.load_mesh("samples/chair.off"))
+""",
     "docs/your_camera.md": (
         """
 import nextview
@@ -277,12 +303,16 @@ class Step:
         line: where it begins, counted from 1.
         text: as it stands there, without comments of a shell.
         python: whether it is a block of Python.
+        output: lines that the page shows after it.
+        output_at: the line at which they begin, counted from 1.
     """
 
     page: str
     line: int
     text: str
     python: bool = False
+    output: tuple[str, ...] = ()
+    output_at: int = 0
 
     @property
     def needs(self) -> frozenset[str]:
@@ -320,11 +350,27 @@ def needs_of(text: str) -> frozenset[str]:
     )
 
 
-def steps_of(page: str) -> Iterator[Step]:
-    """The commands and Python blocks of a page, in order.
+def steps_of(page: str) -> list[Step]:
+    """The commands and Python blocks of a page, in order, each with the output that follows it.
 
     Blocks of doctest are run by the tests.
+
+    Raises:
+        ValueError: an output follows no step.
     """
+    steps: list[Step] = []
+    for step in _steps_and_outputs(page):
+        if step.text:
+            steps.append(step)
+        elif not steps or steps[-1].output:
+            raise ValueError(f"{page}:{step.output_at}: the output of what?")
+        else:
+            steps[-1] = replace(steps[-1], output=step.output, output_at=step.output_at)
+    return steps
+
+
+def _steps_and_outputs(page: str) -> Iterator[Step]:
+    """The same, with each output as a step without a text."""
     text = (ROOT / page).read_text(encoding="utf-8")
     if page.endswith(".py"):
         # What may be given or not stands in brackets there.
@@ -346,14 +392,18 @@ def steps_of(page: str) -> Iterator[Step]:
         if line.startswith("```"):
             if kind == "python" and not block[0].startswith(">>>"):
                 yield Step(page, begun + 1, "\n".join(block), python=True)
-            kind = (
-                None if kind is not None else line.removeprefix("```").strip() or "sh"
-            )
+            elif kind == "" and not any(
+                [*_commands(page, n, lines)] for n in range(begun + 1, number)
+            ):
+                yield Step(page, begun, "", output=tuple(block), output_at=begun + 1)
+            kind = None if kind is not None else line.removeprefix("```").strip()
             begun = number
             block = []
-        elif kind == "python":
+        elif kind is not None:
             block.append(line)
-        elif kind is not None or line.startswith("    "):
+            if kind not in ("python", "text", "json"):
+                yield from _commands(page, number, lines)
+        elif line.startswith("    "):
             yield from _commands(page, number, lines)
         else:
             yield from _in_table(page, number, line)
@@ -442,6 +492,21 @@ def make_inputs(folder: Path) -> None:
     shutil.copy(folder / "scans/mug.ply", folder)
     for name, content in FILES.items():
         (folder / name).write_text(content)
+    recording = ROOT / "src/nextview/captured/bundled/table"
+    for name in ("recording", "shot_0"):  # three frames of a table, and one
+        shutil.copytree(recording, folder / name)
+    for path in (folder / "shot_0").rglob("00000[12].*"):
+        path.unlink()
+    shutil.copy(recording / "depth/000000.png", folder / "depth.png")
+    shutil.copy(recording / "intrinsics.json", folder / "camera.json")
+
+
+def make_rig(folder: Path) -> None:
+    """Frames of two cameras, of which the right one errs."""
+    from test_several_cameras import an_error, moments_of, write_rig
+
+    rng = np.random.default_rng(11)
+    write_rig(folder, moments_of(rng, an_error(rng), 6))
 
 
 # modules that pages name as a reader's own, and what their Python blocks take for granted
@@ -513,6 +578,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     ),
     "docs/cluttered_scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
+    "docs/your_table.md": "nextview learn samples mine --unit cm",
     # Predictions name their store: those that are planned for have to be of the one in this folder.
     "research/README.md": (
         "nextview predict views.zarr test.npz --split test --workers 1 --overwrite; nextview train"
@@ -520,7 +586,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     ),
 }
 # pages of which each Python block runs by itself
-ALONE = ("docs/your_camera.md", "docs/your_objects.md")
+ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
 # pages whose Python blocks do again what their commands did: in a folder of its own
 BESIDE = ("docs/your_objects.md",)
 STORES = (  # made once, for all pages
@@ -580,33 +646,53 @@ class Environments:
             self._made[needs] = python.parent
         return self._made[needs]
 
+    @cached_property
+    def own_fonts(self) -> Path:
+        """A configuration of Matplotlib that has the fonts in it, and none of this machine."""
+        folder = self.folder / "matplotlib"
+        folder.mkdir(parents=True)
+        fonts = font_manager.FontManager()
+        fonts.ttflist = [
+            font for font in fonts.ttflist if font.fname.startswith(get_data_path())
+        ]
+        name = f"fontlist-v{font_manager.FontManager.__version__}.json"
+        font_manager.json_dump(fonts, folder / name)
+        return folder
+
     def run(
         self,
         command: str,
         folder: Path,
         needs: frozenset[str] = frozenset(),
-    ) -> tuple[int, str, float]:
-        """Exit status, output and seconds of a command of a shell in a folder."""
-        begun = time.monotonic()
+        limit: float = LIMIT,
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command of a shell in a folder, for at most some seconds."""
         setting = (
             f"export PATH={shlex.quote(str(self.programs(needs)))}:$PATH; set -e; "
         )
         surroundings = {
             name: value for name, value in os.environ.items() if name != "PYTHONPATH"
         }
+        surroundings |= {"COLUMNS": str(WIDTH), "MPLCONFIGDIR": str(self.own_fonts)}
         shell = ["bash", "-c", setting + command]
         try:
-            done = subprocess.run(
+            return subprocess.run(
                 shell,
                 cwd=folder,
                 env=surroundings,
                 capture_output=True,
                 text=True,
-                timeout=LIMIT,
+                timeout=limit,
             )
         except subprocess.TimeoutExpired:
-            return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
-        return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
+            said = f"took longer than {limit} s"
+            return subprocess.CompletedProcess(command, 124, "", said)
+
+    def run_or_end(self, command: str, folder: Path) -> None:
+        """Run what others need; the program ends where it fails."""
+        done = self.run(command, folder, needs_of(command))
+        if done.returncode != 0:
+            raise SystemExit(f"{command}\n{done.stdout}{done.stderr}")
 
 
 def run_page(
@@ -614,6 +700,7 @@ def run_page(
     environments: Environments,
     folder: Path,
     beside: Path | None = None,
+    update: bool = False,
 ) -> list[str]:
     """Run what a page shows; returns what failed, a line each.
 
@@ -622,18 +709,14 @@ def run_page(
         environments: those of its commands.
         folder: in which the commands run.
         beside: in which the Python blocks run, if not there.
+        update: write into the page what its steps print.
     """
     failed = []
     if page in PREPARED:
-        status, said, _ = environments.run(
-            PREPARED[page],
-            folder,
-            needs_of(PREPARED[page]),
-        )
-        if status != 0:
-            raise SystemExit(f"{page}: {PREPARED[page]}\n{said}")
+        environments.run_or_end(PREPARED[page], folder)
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
     needs_of_python: frozenset[str] = frozenset()
+    printed: list[tuple[Step, list[str]]] = []
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
         why_not = step.why_not
@@ -657,35 +740,208 @@ def run_page(
             )
             command = "python page_block.py"
 
-        status, said, seconds = environments.run(command, place, needs)
-        ended = "ok" if status == 0 else "FAILED"
+        begun = time.monotonic()
+        done = environments.run(command, place, needs)
+        ended = "ok" if done.returncode == 0 else "FAILED"
         installed = ", ".join(sorted(needs)) or "base"
         print(
-            f"{ended:>9}  {where}  {seconds:.0f} s  ({installed})  {command}",
+            f"{ended:>9}  {where}  {time.monotonic() - begun:.0f} s  ({installed})  {command}",
             flush=True,
         )
-        if status != 0:
-            print("\n".join(said.splitlines()[-12:]), flush=True)
+        if done.returncode != 0:
+            said = (done.stdout + done.stderr).splitlines()
+            print("\n".join(said[-12:]), flush=True)
             failed.append(f"{where}  {step.text.splitlines()[0]}")
+        elif step.output:
+            printed.append((step, as_shown(step.output, done.stdout or done.stderr)))
+    return failed + changed_page(page, printed, update)
+
+
+def as_shown(block: Sequence[str], output: str) -> list[str]:
+    """The lines of an output that a page shows, long ones in several.
+
+    Args:
+        block: what the page shows now. If it has lines "...", each other line becomes the printed
+            one, of those that follow, that is most like it.
+        output: what was printed.
+    """
+    lines = [
+        part.rstrip()
+        for line in output.strip("\n").splitlines()
+        for part in textwrap.wrap(line, WIDTH, break_long_words=False) or [""]
+    ]
+    if "..." not in block:
+        return lines
+    shown = []
+    for line in block:
+        if line != "..." and lines:
+            like = [difflib.SequenceMatcher(None, line, one).ratio() for one in lines]
+            at = int(np.argmax(like))
+            line, lines = lines[at], lines[at + 1 :]
+        shown.append(line)
+    return shown
+
+
+def changed_page(
+    page: str,
+    printed: Sequence[tuple[Step, list[str]]],
+    update: bool,
+) -> list[str]:
+    """Compare a page with what its steps print; returns the outputs that differ, a line each.
+
+    Args:
+        page: of the repository; the difference is printed.
+        printed: steps with an output, and the lines that it has to have.
+        update: write them into the page.
+    """
+    old = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    new = list(old)
+    for step, shown in reversed(printed):
+        begin = step.output_at - 1
+        new[begin : begin + len(step.output)] = shown
+    print(
+        "\n".join(
+            difflib.unified_diff(old, new, page, f"{page}, as printed", "", "", 1, "")
+        ),
+        flush=True,
+    )
+    if update and new != old:
+        (ROOT / page).write_text("\n".join(new) + "\n", encoding="utf-8")
+    return [
+        f"{page}:{step.output_at}  shows another output"
+        for step, shown in printed
+        if shown != [*step.output]
+    ]
+
+
+# pictures of docs/images, by the commands that leave them where they run
+PICTURES = {
+    "nextview demo && mv nextview_demo/table.png demo_table.png": "demo_table.png",
+    "nextview recognise samples/table.off --start 33 --figure episode.png": "episode.png",
+    "nextview recognise samples/chair.off --start 3 --figure gallery_chair.png": (
+        "gallery_chair.png"
+    ),
+    "nextview look recording --frames 2 --figure table.png": "table.png",
+    "python docs/site/pictures.py .": (
+        "concept_belief.png concept_calibration.png concept_gain.png concept_maps.png"
+        " concept_viewpoints.png gallery_samples.png sensors.png sizes.png"
+    ),
+    "python docs/site/explorer_pictures.py --out .": (
+        "explore.png explore_compared.png recording.png table_page.png"
+    ),
+    "python examples/panda.py samples/table.off --threshold 0.99 --film panda.gif": "panda.gif",
+    "python examples/bin_picking.py --parts 6 --seed 31 --film picking.gif": "picking.gif",
+    "python examples/arm_over_table.py YCB --film arm_table.gif": "arm_table.gif",
+    "python -m benchmarks.scenes picture ModelNet10 scenes.png": "scenes.png",
+    (
+        "mkdir eight && cp YCB/{b_lego_duplo,f_lego_duplo,flat_screwdriver,g_cups,h_cups,mug,"
+        "phillips_screwdriver,power_drill}.ply eight && nextview learn eight taught --unit m"
+        " && mv taught/learned.png ."
+    ): "learned.png",
+    "python -m research.film YCB .": "things.gif",
+}
+SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
+SLOW_LIMIT = 7200  # seconds for one of them
+NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
+    "things.mp4": "the film of things.gif, made with it, in a format that is not read here",
+    **dict.fromkeys(
+        ("conditions.png", "front.png", "measures.png"),
+        "needs hours; make reproduce draws it",
+    ),
+    "scenes_travel.png": "needs 200 scenes of each level; benchmarks.scenes judge draws it",
+}
+
+
+def check_pictures(
+    wanted: Collection[str],
+    environments: Environments,
+    inputs: Path,
+    data: Path | None,
+    update: bool,
+) -> list[str]:
+    """Make pictures anew and compare them; returns what failed or differs, a line each.
+
+    Args:
+        wanted: names of pictures in docs/images.
+        environments: those of their commands.
+        inputs: folder in which the commands run.
+        data: folder of real scans; without it, slow pictures are not made.
+        update: replace the pictures that differ.
+    """
+    failed = []
+    for command, names in PICTURES.items():
+        chosen = [name for name in names.split() if name in wanted]
+        needs = needs_of(command)
+        slow = re.search(SLOW, command) is not None
+        if not chosen or (environments.base is not None and needs):
+            continue
+        if slow and data is None:
+            print(f"  not run  {', '.join(chosen)}  {command}  (slow: give --data)")
+            continue
+        for name in ("YCB", "ModelNet10") if slow and data is not None else ():
+            shutil.rmtree(inputs / name, ignore_errors=True)
+            (inputs / name).unlink(missing_ok=True)
+            (inputs / name).symlink_to(data.resolve() / name)
+
+        done = environments.run(command, inputs, needs, SLOW_LIMIT if slow else LIMIT)
+        print(f"{'FAILED' if done.returncode else 'ok':>9}  {command}", flush=True)
+        if done.returncode != 0:
+            print("\n".join((done.stdout + done.stderr).splitlines()[-12:]))
+            failed.append(f"{', '.join(chosen)}  {command}")
+            continue
+        for name in chosen:
+            found = picture_difference(inputs / name, IMAGES / name)
+            print(
+                f"           {name}: {found:.2f} of 255 in the worst square", flush=True
+            )
+            if found > TOLERANCE:
+                failed.append(f"docs/images/{name}  is another picture")
+                if update:
+                    shutil.copy(inputs / name, IMAGES / name)
     return failed
 
 
+def picture_difference(made: Path, kept: Path) -> float:
+    """The largest mean absolute difference in a square of two pictures or films, of 255.
+
+    It is 255 if one is missing, or has another size or number of frames.
+    """
+    if not kept.exists():
+        return 255.0
+    with Image.open(made) as new, Image.open(kept) as old:
+        frames = [getattr(each, "n_frames", 1) for each in (new, old)]
+        if new.size != old.size or frames[0] != frames[1]:
+            return 255.0
+        worst = 0.0
+        for one, other in zip(
+            ImageSequence.Iterator(new), ImageSequence.Iterator(old), strict=True
+        ):
+            pixels = [np.asarray(each.convert("RGB"), float) for each in (one, other)]
+            apart = np.abs(pixels[0] - pixels[1]).mean(2)
+            worst = max(worst, float(uniform_filter(apart, SQUARE).max()))
+    return worst
+
+
 def main(
-    pages: tyro.conf.Positional[tuple[str, ...]] = (),
+    chosen: tyro.conf.Positional[tuple[str, ...]] = (),
     base: Path | None = None,
+    data: Path | None = None,
+    update: bool = False,
     only_list: bool = False,
 ) -> None:
-    """Run the commands of pages.
+    """Run the commands of pages, and compare what they print and draw.
 
     Args:
-        pages: of the repository; all that have commands by default.
+        chosen: pages, or pictures in docs/images; all by default.
         base: the folder of the programs of a base installation: all that needs no more is run
             there, and nothing else.
+        data: folder with YCB and ModelNet10: slow pictures are made, too.
+        update: change pages and pictures to what is printed and drawn.
         only_list: only show what would be run, and what not and why.
     """
-    chosen = pages or PAGES
+    pages = [name for name in chosen or PAGES if not name.startswith("docs/images/")]
     if only_list:
-        for step in (step for page in chosen for step in steps_of(page)):
+        for step in (step for page in pages for step in steps_of(page)):
             print(f"{step.page}:{step.line}  {step.why_not or step.command}")
         return
 
@@ -695,22 +951,36 @@ def main(
         inputs = Path(place) / "inputs"
         inputs.mkdir()
         make_inputs(inputs)
-        for command in STORES:
-            status, said, _ = environments.run(command, inputs)
-            if status != 0:
-                raise SystemExit(f"{command}\n{said}")
+        if base is None:  # which has nothing of the tests
+            make_rig(inputs / "my_rig")
+        for command in STORES if pages else ():
+            environments.run_or_end(command, inputs)
 
-        for page in chosen:
+        for page in pages:
             folder = Path(place) / page.replace("/", "_")
             shutil.copytree(inputs, folder)
             print(page, flush=True)
             beside = Path(place) / "beside" if page in BESIDE else None
             if beside is not None:
                 shutil.copytree(inputs, beside)
-            failed += run_page(page, environments, folder, beside)
+            failed += run_page(page, environments, folder, beside, update)
             shutil.rmtree(folder)
+
+        shown = {Path(name).name for name in chosen} | pictures_on(pages)
+        failed += check_pictures(shown, environments, inputs, data, update)
     if failed:
-        raise SystemExit("\n".join([f"{len(failed)} commands failed:", *failed]))
+        raise SystemExit("\n".join([f"{len(failed)} failed:", *failed]))
+
+
+def pictures_on(pages: Iterable[str]) -> set[str]:
+    """Names of the pictures that pages show or link."""
+    return {
+        name
+        for page in pages
+        for name in re.findall(
+            r"\]\((?:docs/)?images/([^)]+)\)", (ROOT / page).read_text(encoding="utf-8")
+        )
+    }
 
 
 if __name__ == "__main__":

@@ -1,19 +1,33 @@
-"""The pictures of the explorer: the page itself, in a headless Chromium.
+"""The pictures of pages in the browser, in a headless Chromium: explorer, scene, recording.
 
-pip install 'nextview[explore,browser]'
-python docs/site/explorer_pictures.py [--models FOLDER]
+pip install 'nextview[explore,record,browser]'
+python docs/site/explorer_pictures.py [--out FOLDER] [--models FOLDER]
+
+They are so narrow that their text is legible on a page of the documentation.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import tyro
 from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Page as Tab
 
+import nextview
+from nextview.captured.bundled_table import BUNDLED_TABLE
+from nextview.captured.folders import read_capture
+from nextview.data.samples import sample_mesh
 from nextview.viewers.exploration import Exploration, shown_objects
 from nextview.viewers.page import Page
+from nextview.viewers.recording import Recorder
+from nextview.viewers.scene_page import write_scene_page
 
 IMAGES = Path(__file__).parents[1] / "images"
 FLAGS = [
@@ -26,20 +40,38 @@ FLAGS = [
 """It draws without a graphics card."""
 SETTLES = 4000
 """Milliseconds from the last change until all of it is drawn."""
+WIDTH, HEIGHT = 900, 720
+"""Pixels: a page of the documentation shows 700 of them for each of these 900."""
 
 
-def shoot(browser: Browser, page: Page, views: int, path: Path) -> None:
-    """Take some views by clicking, and a picture of the page."""
-    tab = browser.new_page(viewport={"width": 1400, "height": 850})
+def open_tab(browser: Browser, address: str) -> Tab:
+    """Open an address."""
+    tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     tab.set_default_timeout(120_000)
-    tab.goto(page.address)
+    tab.goto(address)
+    return tab
+
+
+def close_notice(tab: Tab) -> None:
+    """Close the notice that it draws in software: that is meant so."""
+    tab.locator(".mantine-Notification-closeButton").first.click()
+
+
+def shoot(
+    browser: Browser, page: Page, views: int, path: Path, farther: float = 1.0
+) -> None:
+    """Take some views by clicking, and a picture of the page from farther away."""
+    tab = open_tab(browser, page.address)
     for step in range(views):
         tab.get_by_text("Take the next view").click()
         while len(page.exploration.walks[-1].views) <= step:
             tab.wait_for_timeout(100)
-    # it draws in software: that is meant so
-    tab.locator(".mantine-Notification-closeButton").first.click()
-    tab.mouse.move(660, 800)  # away from the button
+    close_notice(tab)
+    page.server.gui.main_panel.minimize()  # the controls hide the object else
+    for client in page.server.get_clients().values():
+        camera = client.camera
+        away = camera.position - camera.look_at
+        camera.position = camera.look_at + farther * away
     page._draw()
     tab.wait_for_timeout(SETTLES)
     tab.screenshot(path=path)
@@ -47,8 +79,65 @@ def shoot(browser: Browser, page: Page, views: int, path: Path) -> None:
     page.stop()
 
 
+def shoot_scene(browser: Browser, path: Path) -> None:
+    """Take a picture of the page of the bundled table."""
+    capture = read_capture(BUNDLED_TABLE)
+    scene = nextview.Scene("ycb", up=capture.up)
+    for captured in capture.frames:
+        scene.update(captured.read(masked=False))
+    with tempfile.TemporaryDirectory() as folder:
+        write_scene_page(scene, Path(folder) / "table.html", "bundled recording")
+        tab = open_tab(browser, f"file://{folder}/table.html")
+        tab.wait_for_timeout(SETTLES)
+        close_notice(tab)
+        tab.mouse.move(WIDTH / 4, HEIGHT / 2)
+        tab.mouse.down()  # turned: the cameras are to be seen, too
+        tab.mouse.move(WIDTH / 4 - 135, HEIGHT / 2, steps=5)
+        tab.mouse.up()
+        tab.wait_for_timeout(SETTLES)
+        tab.screenshot(path=path)
+        tab.close()
+
+
+def shoot_recording(browser: Browser, path: Path) -> None:
+    """Take a picture of Rerun with the recording of an episode."""
+    with tempfile.TemporaryDirectory() as folder:
+        camera = nextview.SimulatedCamera(sample_mesh("table"))
+        session = nextview.load().session(33)
+        session.observers.append(Recorder(Path(folder) / "episode.rrd"))
+        while not session.done:
+            session.update(camera.observe(session.pose))
+        serving = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "rerun",
+                "--serve-web",
+                "--bind=127.0.0.1",
+                "--web-viewer-port=9091",
+                f"{folder}/episode.rrd",
+            ],
+            start_new_session=True,  # to end the viewer that it starts, too
+        )
+        try:
+            tab = open_tab(browser, "about:blank")
+            tab.wait_for_timeout(SETTLES)
+            data = "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
+            tab.goto(f"http://127.0.0.1:9091/?renderer=webgl&url={data}")
+            tab.wait_for_timeout(10 * SETTLES)
+            for right in 80, 52:  # without the lists of recordings and of streams
+                tab.mouse.click(WIDTH - right, 18)
+                tab.wait_for_timeout(SETTLES)
+                tab.mouse.move(WIDTH / 4, HEIGHT / 5)  # away from the button
+                tab.wait_for_timeout(SETTLES)
+            tab.screenshot(path=path)
+            tab.close()
+        finally:
+            os.killpg(serving.pid, signal.SIGTERM)
+
+
 def main(models: str = "modelnet10", out: Path = IMAGES) -> None:
-    """Both pictures.
+    """Take all pictures.
 
     Args:
         models: bundled models by name, or a folder with models of your own.
@@ -70,7 +159,9 @@ def main(models: str = "modelnet10", out: Path = IMAGES) -> None:
         page = Page(compared, port=8850)
         page._hide.value = True
         page._draw()
-        shoot(browser, page, 3, out / "explore_compared.png")
+        shoot(browser, page, 3, out / "explore_compared.png", 1.25)
+        shoot_scene(browser, out / "table_page.png")
+        shoot_recording(browser, out / "recording.png")
         browser.close()
 
 

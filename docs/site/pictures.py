@@ -1,6 +1,6 @@
-"""The pictures of the page on concepts, and the sample objects, from real runs.
+"""The pictures of concepts, sensors and sizes, from real runs on the sample objects.
 
-python docs/site/pictures.py
+python docs/site/pictures.py [FOLDER]
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -19,8 +20,10 @@ from nextview.data.measures import depth_entropy
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.maps import local_peaks
+from nextview.recognition.model_card import find_card
 from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, PlainFigure
 from nextview.session.view import View
+from nextview.simulation.sensed_camera import SensedCamera
 
 IMAGES = Path(__file__).parents[1] / "images"
 RESULTS = Path(__file__).parents[1] / "results_classes.md"
@@ -29,8 +32,8 @@ START = 33
 SPHERE = ViewSphere.named("40")
 
 
-def main() -> None:
-    """Draw all of them."""
+def main(out: tyro.conf.Positional[Path] = IMAGES) -> None:
+    """Draw all of them into a folder."""
     view = nextview.load().recognise(sample_mesh("table"), start=START).views[0]
     figures = {
         "concept_viewpoints": viewpoints(13),
@@ -39,9 +42,11 @@ def main() -> None:
         "concept_maps": maps(19),
         "concept_gain": gain(view),
         "gallery_samples": samples((33, 17, 3, 22)),
+        "sensors": sensors(17),
+        "sizes": sizes(),
     }
     for name, figure in figures.items():
-        figure.savefig(IMAGES / f"{name}.png", dpi=110, facecolor="white")
+        figure.savefig(out / f"{name}.png", dpi=110, facecolor="white")
 
 
 def new(
@@ -302,6 +307,62 @@ def samples(views: tuple[int, ...]) -> Figure:
     return figure
 
 
+def sensors(view: int) -> Figure:
+    """The depth of each sensor, and what the networks get of it, raw and denoised."""
+    names = ("none", "kinect", "stereo", "setup", "wrist", "kinect:2")
+    figure = PlainFigure((7.0, 3.8), layout="constrained")
+    axes = figure.subplots(3, len(names))
+    for column, name in zip(axes.T, names, strict=True):
+        cameras = [
+            SensedCamera(
+                sample_mesh("chair"), name, np.random.default_rng(0), denoise=denoise
+            )
+            for denoise in (False, True)  # both draw the same errors
+        ]
+        sensor = cameras[0].sensor
+        frame = cameras[0].frame(SPHERE.poses[view])
+        half = int(1.2 * sensor.focal * sensor.radius / sensor.distance)
+        middle = sensor.height // 2, sensor.width // 2
+        around = tuple(slice(at - half, at + half) for at in middle)
+        depth = np.where(frame.depth > 0, frame.depth, np.nan)[around]
+        near, far = (sensor.distance + sign * sensor.radius for sign in (-1, 1))
+        column[0].imshow(depth, cmap="viridis_r", vmin=near, vmax=far)
+        column[0].set_title(name, fontsize=10)
+        for each, camera in zip(column[1:], cameras, strict=True):
+            seen = camera.observe(SPHERE.poses[view]).picture
+            each.imshow(seen, cmap="gray", vmin=0, vmax=255)
+        for each in column:
+            each.set(xticks=[], yticks=[])
+            each.grid(visible=False)
+    for each, label in zip(axes[:, 0], ("depth", "raw", "denoised"), strict=True):
+        each.set_ylabel(label, fontsize=10)
+    return figure
+
+
+def sizes() -> Figure:
+    """What the bundled recogniser knows of sizes: a density for each class, largest above."""
+    card = find_card("recogniser-modelnet10")
+    assert card.size is not None
+    radii, density = np.array(card.size.radii_m), np.exp(card.size.log_density)
+    order = np.argsort((density * np.log(radii)).sum(1) / density.sum(1))[::-1]
+    figure, (axes,) = new(1, 3.8, 6.4)
+    for row, label in enumerate(order):
+        top = row + 1.6 * density[label] / density.max()
+        over = {"zorder": 30 - row}
+        axes.fill_between(
+            radii, row, top, color=f"C{label}", alpha=0.75, linewidth=0, **over
+        )
+        axes.plot(radii, top, color=INK, linewidth=0.8, **over)
+    axes.set_xscale("log")
+    axes.set_xlim(0.08, 8)
+    axes.set_xticks(ticks := [0.1, 0.2, 0.5, 1, 2, 5], [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    names = [card.classes[label].replace("_", " ") for label in order]
+    axes.set_yticks(range(len(order)), names)
+    axes.set_xlabel("object radius, metres")
+    return figure
+
+
 if __name__ == "__main__":
     with matplotlib.rc_context(FIGURE_STYLE):
-        main()
+        tyro.cli(main)

@@ -31,7 +31,7 @@ from nextview.session.style import (
 )
 from nextview.types import Float, Floats, Mask
 
-FIGURE_HEIGHT = 5.2  # inches, of both panels
+FIGURE_HEIGHT = 4.0  # inches, of both panels: names are legible on a page
 FIGURE_MARGIN = 0.25  # inches
 TOP = 0.75  # inches, for the heading
 OBJECT_COLOURS = (
@@ -115,9 +115,8 @@ def draw_scene(
             (start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high)
         )
         _draw_from_above(right, tops, objects, colours, target)
-        caption = "from above; numbered arrows: the cameras"
-        caption += "; red: where to look next" if target is not None else ""
         above = 1 - 0.5 / height
+        caption = "from above; numbered arrows: the cameras"
         figure.text(start, above, caption, fontsize=9.5, color=GREY, va="top")
         return figure
 

@@ -25,8 +25,9 @@ CARD_STYLE = f"""<style>
 .nv h3 {{ margin: 0 0 0.1em; font-size: 20px }}
 .nv h3 small {{ color: {ACCENT}; font-size: 17px }}
 .nv p {{ margin: 0.2em 0 0.7em; color: #5b6672 }}
+.nv p small {{ font-size: inherit }}
 .nv img {{ image-rendering: pixelated; vertical-align: top; border-radius: 5px; margin-bottom: 4px }}
-.nv figure {{ display: inline-block; margin: 0 10px 8px 0; font-size: 11px; vertical-align: top; color: #5b6672 }}
+.nv figure {{ display: inline-block; margin: 0 10px 8px 0; vertical-align: top; color: #5b6672 }}
 .nv figcaption {{ width: 0; min-width: 100%; overflow-wrap: anywhere }}
 .nv table {{ border-spacing: 0 3px; width: 100% }}
 .nv td {{ padding: 0 4px; white-space: nowrap; font-variant-numeric: tabular-nums }}

@@ -30,8 +30,8 @@ PANEL = f"""<style>
 .nv h2 i {{ display: inline-block; width: 11px; height: 11px; border-radius: 3px;
   margin-right: 7px }}
 .nv h2 small {{ font-weight: normal; color: #5b6672 }}
-.nv small {{ color: #5b6672; overflow-wrap: anywhere }}
-.nv table {{ border-spacing: 0 2px; width: 100%; font-size: 12px }}
+.nv small {{ color: #5b6672; font-size: 13px; overflow-wrap: anywhere }}
+.nv table {{ border-spacing: 0 2px; width: 100% }}
 .nv td:first-child {{ width: 130px; overflow-wrap: anywhere }}
 .nv td:last-child {{ width: 44px; text-align: right; font-variant-numeric: tabular-nums }}
 .nv .bar {{ height: 9px; background: #eef1f4 }}
