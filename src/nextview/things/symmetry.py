@@ -272,9 +272,6 @@ class _Compared:
         if kind == "same":
             local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * error, LARGEST_LOCAL_ERROR)
             fits = fits and bool((distances > local).mean() < MOVED_SHARE)
-            # A symmetry leaves the centroid where it is.
-            moved = float(np.linalg.norm(motion.shift)) / self.diameter
-            fits = fits and moved < SYMMETRY_TOLERANCE
         return _Turned(median * self.diameter, fits, _axis_of(motion))
 
     def _guess(self, axis: Float, turn: float) -> _Guess:
