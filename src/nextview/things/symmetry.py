@@ -280,7 +280,8 @@ class _Compared:
         if key not in self._known:
             motion = _Motion(Rotation.from_rotvec(2 * np.pi * turn * axis), np.zeros(3))
             few = self._visible[:GUESSED_POINTS]
-            distances = self._tree.query(motion.apply(few))[0] / self.diameter
+            distances = np.asarray(self._tree.query(motion.apply(few))[0])
+            distances = distances / self.diameter
             near = np.quantile(distances, GUESSED_SHARE) <= GUESSED_DISTANCE
             if near:
                 motion = self._fitted(motion, axis, few)
