@@ -272,9 +272,6 @@ class _Compared:
         if kind == "same":
             local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * error, LARGEST_LOCAL_ERROR)
             fits = fits and bool((distances > local).mean() < MOVED_SHARE)
-            # A symmetry leaves the centroid where it is.
-            moved = float(np.linalg.norm(motion.shift)) / self.diameter
-            fits = fits and moved < SYMMETRY_TOLERANCE
         return _Turned(median * self.diameter, fits, _axis_of(motion))
 
     def _guess(self, axis: Float, turn: float) -> _Guess:
@@ -283,7 +280,8 @@ class _Compared:
         if key not in self._known:
             motion = _Motion(Rotation.from_rotvec(2 * np.pi * turn * axis), np.zeros(3))
             few = self._visible[:GUESSED_POINTS]
-            distances = self._tree.query(motion.apply(few))[0] / self.diameter
+            distances = np.asarray(self._tree.query(motion.apply(few))[0])
+            distances = distances / self.diameter
             near = np.quantile(distances, GUESSED_SHARE) <= GUESSED_DISTANCE
             if near:
                 motion = self._fitted(motion, axis, few)
