@@ -49,6 +49,11 @@ class Leaderboard:
     notes: tuple[str, ...]
 
 
+def points(difference: float) -> str:
+    """Format a difference of shares in percentage points."""
+    return f"{round(100 * difference, 1) + 0.0:+.1f}"
+
+
 def plain(board: Leaderboard) -> Leaderboard:
     """Return a leaderboard whose texts are one line each, control characters escaped.
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from nextview.benchmark.board_page import NONE, points
 from nextview.benchmark.entries import knows_truth
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
@@ -18,8 +19,6 @@ from nextview.session.style import to_svg
 with extras():
     import pandas as pd
     from jinja2 import Environment, PackageLoader, StrictUndefined
-
-NONE = "\N{EN DASH}"
 
 
 class Number(NamedTuple):
@@ -46,11 +45,6 @@ def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
 def percent(share: float) -> str:
     """Format a share."""
     return f"{100 * share:.1f}\u00a0%"
-
-
-def points(difference: float) -> str:
-    """Format a difference of shares in percentage points."""
-    return f"{round(100 * difference, 1) + 0.0:+.1f}"
 
 
 def words(name: str) -> str:

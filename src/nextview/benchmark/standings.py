@@ -20,6 +20,7 @@ from nextview.benchmark.board_page import (
     as_html,
     as_markdown,
     plain,
+    points,
 )
 from nextview.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview.benchmark.methods import check_said
@@ -495,12 +496,12 @@ def _differences_table(tests: Sequence[Difference], reference: str) -> WrittenTa
     together = st.holm(np.array([test.p for test in tests])).tolist()
     rows = []
     for test, corrected in zip(tests, together, strict=True):
-        between = f"({_points(test.low)} to {_points(test.high)})"
+        between = f"({points(test.low)} to {points(test.high)})"
         rows.append(
             (
                 test.key.policy,
                 number_of(test.key.views, "view"),
-                f"{_points(test.value)} {between}",
+                f"{points(test.value)} {between}",
                 f"{test.p:.3g}",
                 f"{corrected:.3g}",
             )
@@ -512,11 +513,6 @@ def _differences_table(tests: Sequence[Difference], reference: str) -> WrittenTa
         ("method", "after", "difference", "p", "p, corrected"),
         tuple(rows),
     )
-
-
-def _points(difference: float) -> str:
-    """Format a difference of shares in percentage points."""
-    return f"{round(100 * difference, 1) + 0.0:+.1f}"
 
 
 def _places_table(
