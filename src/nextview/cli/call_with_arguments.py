@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import docstring_parser
 import tyro
 
-from nextview.cli.commands import OUTPUTS, Command
+from nextview.cli.commands import OUTPUT_NAMES, Command
 from nextview.files import check_writable
 
 CONFIG = (
@@ -119,7 +119,7 @@ def written(arguments: Mapping[str, Any], command: Command) -> list[Path]:
         arguments,
         *(vars(each) for each in arguments.values() if is_dataclass(each)),
     ]
-    names = (*OUTPUTS, command.changes)
+    names = (*OUTPUT_NAMES, command.changes)
     found = [group.get(name) for group in groups for name in names]
     return [path for path in found if isinstance(path, Path)]
 
