@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from nextview.cli.commands import OUTPUTS, Command
+from nextview.cli.commands import OUTPUT_NAMES, Command
 from nextview.cli.option_names import GROUPS, HELP, check_options
 from nextview.cli.option_values import CONFIG, VALUES, described, explained
 from nextview.cli.words import EXAMPLES
@@ -132,6 +132,6 @@ def written(arguments: Mapping[str, Any], command: Command) -> list[Path]:
         arguments,
         *(vars(each) for each in arguments.values() if is_dataclass(each)),
     ]
-    names = (*OUTPUTS, command.changes)
+    names = (*OUTPUT_NAMES, command.changes)
     found = [group.get(name) for group in groups for name in names]
     return [path for path in found if isinstance(path, Path)]

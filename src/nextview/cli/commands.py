@@ -14,7 +14,7 @@ class Command:
             value of the function.
         show: MODULE:NAME of the function that prints the return value.
         thesis: MODULE:NAME of the recipe that --preset thesis selects.
-        changes: name of the parameter of a file or folder that is changed; see also ``OUTPUTS``.
+        changes: name of the parameter of a file or folder that is changed; see also ``OUTPUT_NAMES``.
         computes: whether its help says how many cores it uses.
     """
 
@@ -28,7 +28,7 @@ class Command:
 
 
 # parameters, and fields of parameters, that name what a command writes
-OUTPUTS = ("out", "figure", "figures", "explorer", "record")
+OUTPUT_NAMES = ("out", "figure", "figures", "explorer", "record")
 CLI = "nextview.cli"
 TEACHING = "nextview.teaching"
 TRAINING = "nextview.training"

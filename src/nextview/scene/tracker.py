@@ -24,7 +24,7 @@ from nextview.sensing.planes import Plane
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
 LATEST_TIME = 1e11  # seconds: since 1970, the year 5138
-LONGEST_GAP = 1e5  # seconds, a day: nothing is followed so long without a frame
+LONGEST_PAUSE = 1e5  # seconds, a day: nothing is followed so long without a frame
 
 
 class Tracker:
@@ -121,9 +121,11 @@ class Tracker:
             time = 0.0 if before is None else before + FRAME_SECONDS
         time = number(time, "the time", least=-np.inf if before is None else before)
         gap = 0.0 if before is None else time - before
-        if abs(time) > LATEST_TIME or gap > LONGEST_GAP:
+        if abs(time) > LATEST_TIME or gap > LONGEST_PAUSE:
             told = (
-                f"{time:.4g}" if gap <= LONGEST_GAP else f"{gap:.4g} after the last one"
+                f"{time:.4g}"
+                if gap <= LONGEST_PAUSE
+                else f"{gap:.4g} after the last one"
             )
             raise UsageError(
                 f"the time of a frame is in seconds, and {told} is none: nanoseconds, or"
