@@ -10,7 +10,7 @@ from nextview.checks import number_of, one_line
 from nextview.geometry.mesh import FORMATS
 
 MOST_FILES = 1000  # that are looked at
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".npy", ".pgm")
+LIKELY_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".npy", ".pgm")
 
 
 def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
@@ -46,7 +46,7 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
     if cloud := next((file for file in files if file.suffix == ".pcd"), None):
         read_pcd_header(cloud)  # raises an error that says why it is no depth image
 
-    if any(file.suffix.lower() in IMAGE_ENDINGS for file in _some(folder, "*")):
+    if any(file.suffix.lower() in LIKELY_IMAGES for file in _some(folder, "*")):
         return (
             f"{folder}: {_content(folder)} and has no folder depth/; give one image, or put 16-bit"
             " PNG files into depth/"

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 import tyro
 
 from nextview.cli.commands import OUTPUT_NAMES, Command
-from nextview.cli.option_names import GROUPS, HELP, check_options
-from nextview.cli.option_values import CONFIG, VALUES, described, explained
+from nextview.cli.option_names import GROUPS, HELP_OPTIONS, check_options
+from nextview.cli.option_values import CONFIG, OPTION_VALUES, described, explained
 from nextview.cli.words import EXAMPLES
 from nextview.cores import CORES_HELP
 from nextview.files import check_writable
@@ -44,7 +44,7 @@ def call(
         The return value of the function, and its arguments by name.
     """
     run, called = entry(command, arguments, track)
-    helped = not HELP.isdisjoint(arguments)
+    helped = not HELP_OPTIONS.isdisjoint(arguments)
     if not helped:
         check_options(f"nextview {name}", run, arguments)
     try:
@@ -53,7 +53,7 @@ def call(
             prog=f"nextview {name}",
             args=arguments,
             config=CONFIG,
-            registry=VALUES,
+            registry=OPTION_VALUES,
         )
     except SystemExit:
         if helped:

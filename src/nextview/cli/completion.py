@@ -5,7 +5,7 @@ from typing import Literal
 from tyro.extras import SubcommandApp
 
 from nextview.cli.call_with_arguments import entry
-from nextview.cli.option_values import CONFIG, VALUES
+from nextview.cli.option_values import CONFIG, OPTION_VALUES
 from nextview.cli.stand_ins import stand_ins
 
 
@@ -39,5 +39,5 @@ def completion(
             prog="nextview",
             args=["--tyro-print-completion", shell],
             config=CONFIG,
-            registry=VALUES,
+            registry=OPTION_VALUES,
         )

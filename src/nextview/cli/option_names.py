@@ -9,7 +9,7 @@ from typing import Any
 from nextview.checks import did_you_mean
 from nextview.errors import UsageError
 
-HELP = frozenset(("-h", "--help"))
+HELP_OPTIONS = frozenset(("-h", "--help"))
 GROUPS = {  # title of a group of options in the help, by the parameter that holds it
     "how": "further",
     "looking": "recognition",
@@ -36,7 +36,7 @@ def check_options(
     known = option_names(function)
     for word in takewhile(lambda each: each != "--", arguments):
         option = word.partition("=")[0].replace("_", "-")
-        if option.startswith("--") and option not in known | HELP:
+        if option.startswith("--") and option not in known | HELP_OPTIONS:
             near = did_you_mean(option, sorted(known))
             near = near or f"; {command} --help lists those that there are"
             raise UsageError(f"{command} has no option {option}{near}")

@@ -31,7 +31,7 @@ NUMBERS = {3: "X Y Z", 4: "FX FY CX CY", 6: "X Y Z X Y Z"}  # by the length of a
 UNIONS = (Union, UnionType)
 UNSAID = ("", "''", "None", "False", "True")  # defaults that go without saying
 
-VALUES = ConstructorRegistry()
+OPTION_VALUES = ConstructorRegistry()
 _asked: list[PrimitiveTypeInfo | StructTypeInfo] = []
 
 
@@ -103,7 +103,7 @@ def _tyros_own(info: PrimitiveTypeInfo | StructTypeInfo) -> Iterator[None]:
         _asked.pop()
 
 
-@VALUES.primitive_rule
+@OPTION_VALUES.primitive_rule
 def _value(
     info: PrimitiveTypeInfo,
 ) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
@@ -130,7 +130,7 @@ def _value(
     return replace(spec, metavar=word, instance_from_str=read, choices=choices)
 
 
-@VALUES.struct_rule
+@OPTION_VALUES.struct_rule
 def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Explain the options of a dataclass as those of a function."""
     if _asked or not is_dataclass(info.type):
