@@ -126,7 +126,7 @@ def shoot_recording(browser: Browser, path: Path) -> None:
             tab.goto(f"http://127.0.0.1:9091/?renderer=webgl&url={data}")
             tab.wait_for_timeout(10 * SETTLES)
             for right in 80, 52:  # without the lists of recordings and of streams
-                tab.mouse.click(WIDTH - right, 18)
+                tab.mouse.click(WIDTH - right, 18, delay=1000)  # it draws slowly
                 tab.wait_for_timeout(SETTLES)
                 tab.mouse.move(WIDTH / 4, HEIGHT / 5)  # away from the button
                 tab.wait_for_timeout(SETTLES)
