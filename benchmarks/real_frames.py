@@ -1,30 +1,38 @@
-"""Real frames of things on a table, one view each: things that were taught, or none of which was.
+"""Real frames of things on a table, one view each: what scenes say of them, and single things.
 
+    python -m benchmarks.real_frames alone FOLDER [--models ycb] [--show] [--network CARD]
     python -m benchmarks.real_frames taught FOLDER SCANS [--models ycb] [--network CARD]
-    python -m benchmarks.real_frames untaught FOLDER [--models ycb] [--show] [--network CARD]
 
 No camera pose is known: up is the normal of the table. Nothing is drawn at random. ``--network``
 is the card of a network of ``nextview train segmentation`` in place of the bundled one.
 
-``taught``: FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, the
-label of each pixel) and names.txt, a line for each label, the first for the background. SCANS holds
-the scans of the things that the memory knows, in metres, by their names. Each thing is selected
+``alone``: each frame is given to a scene of its own. FOLDER holds one of
+
+- a folder for each frame: depth.png (uint16, millimetres; scale.json has metres a step, if it is
+  another one) and K.json (fx, fy, cx, cy, with the middle of the first pixel at 0). truth.json
+  beside them lists by the frame's name what is in it and taught, as {"name", "column", "row"}: a
+  pixel on the thing. Without it, nothing in the frames is taught;
+- NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, the label of each pixel) and
+  names.txt, a line for each label, the first for the background.
+
+An object that a scene finds belongs to a thing if it holds more of its labelled pixels (those
+within 8 of a given pixel) than any other object. Printed are a row for the taught things, of which
+a thing without an object and one in a frame without a table are not right, and a row for the other
+objects: strangers, and fragments of things. Their right answer is "unknown". With ``--show`` each
+confident wrong name is printed.
+
+``taught``: FOLDER holds frames with labels. SCANS holds the scans of the things that the memory
+knows, in metres, by their names. Each thing is selected
 once by a point, the median of the positions under its label, and once by its label as a mask.
 Printed are the answer by outline and size alone and with the geometry, whether the thing is among
 the first three, the belief in the answer, its residual, and the intersection over union of the
 label with the outline of the posed scan (of the true thing, if it is among the hypotheses; what
-stands before it is not taken off). Labels of few pixels are left out. Then a scene looks at each
-frame; printed are its right and wrong names.
-
-``untaught``: FOLDER holds a folder for each frame: depth.png (uint16, millimetres) and K.json (fx,
-fy, cx, cy, with the middle of the first pixel at 0). Each frame is given to a scene of its own.
-Every name is wrong, so none of them should be confident. Printed are the objects that were found,
-those with a name, and those with a confident one; with ``--show`` each confident name, its pixels
-and how uncertain its pose is.
+stands before it is not taken off). Labels of few pixels are left out.
 """
 
+import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,10 +50,11 @@ from benchmarks.shared import (
     mesh_of,
     progress,
     scans_of,
+    share,
 )
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation
-from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.sensing import Frame, ObservedObject
 from nextview.things.memory import TaughtRecogniser
@@ -57,6 +66,7 @@ from nextview.types import Mask
 # of the camera of the PoseCNN demo: fx, fy, cx, cy
 INTRINSICS = (618.017, 618.003, 312.377, 232.375)
 LEAST_PIXELS = 200  # of a label
+NEAR_PIXELS = 8  # of a given pixel, that are still on the thing
 
 
 @dataclass(frozen=True)
@@ -88,23 +98,40 @@ class Named:
     seconds: float
 
 
-@dataclass
-class Counts:
-    """What was found in some frames.
+@dataclass(frozen=True)
+class LabelledFrame:
+    """A frame, and which taught things are in it.
 
     Attributes:
-        frames: that were taken in.
-        refused: frames in which no table was seen.
-        objects: that were found.
-        named: of these, those with a name.
-        confident: of these, those whose name is confident.
+        name: of the frame.
+        frame: without a pose.
+        things: name of each taught thing and its pixels, (H, W) bool; not all of them, where the
+            truth is a point.
     """
 
-    frames: int = 0
-    refused: int = 0
-    objects: int = 0
-    named: int = 0
-    confident: int = 0
+    name: str
+    frame: Frame
+    things: Sequence[tuple[str, Mask]]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a scene says of a taught thing, or of an object that is none.
+
+    Attributes:
+        name: that it is given; None for a thing that was not found.
+        confident: whether the name is confident.
+        right: whether it is the right answer; for a stranger that is "unknown".
+    """
+
+    name: str | None
+    confident: bool
+    right: bool
+
+    @property
+    def sure_and_wrong(self) -> bool:
+        """Whether a confident name is wrong."""
+        return self.confident and not self.right
 
 
 def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
@@ -231,49 +258,6 @@ def labels_of(path: Path) -> NDArray[np.uint8]:
     return np.asarray(Image.open(labels))
 
 
-def print_scenes(
-    system: nextview.System,
-    paths: list[Path],
-    names: list[str],
-    intrinsics: NDArray[np.float64],
-    segmentation: Segmenter | None,
-) -> None:
-    """Print how many things are named right and wrong by a scene of each frame.
-
-    Args:
-        system: that knows the things.
-        paths: of the depth images.
-        names: of the labels, the first of what is none.
-        intrinsics: of the camera, (3, 3).
-        segmentation: that tells the things; None for the bundled network.
-    """
-    things = right = sure_right = wrong = sure_wrong = 0
-    for path in paths:
-        labels = labels_of(path)
-        frame = Frame(np.asarray(Image.open(path)), intrinsics)
-        shown = np.bincount(labels[frame.depth > 0], minlength=len(names))[1:]
-        things += int(np.count_nonzero(shown >= LEAST_PIXELS))
-
-        scene = nextview.Scene(system, up=None, segmentation=segmentation)
-        scene.update(frame)
-        taken = set()
-        for found in scene.objects:
-            (mask,) = found.pixels.values()
-            true = names[int(np.bincount(labels[mask]).argmax())]
-            if found.name == UNKNOWN_NAME:
-                continue
-            good = found.name == true and true not in taken
-            taken.add(found.name)
-            right += good
-            wrong += not good
-            sure_right += good and found.confident
-            sure_wrong += not good and found.confident
-    print(
-        f"scenes: of {things} things {right} named right, {sure_right} of them confidently; {wrong}"
-        f" wrong names, {sure_wrong} of them confident"
-    )
-
-
 def taught(
     folder: tyro.conf.Positional[Path],
     scans: tyro.conf.Positional[Path],
@@ -323,59 +307,152 @@ def taught(
             f" geometry, {three} among the first three; mean overlap {overlap:.2f}; at most"
             f" {slowest:.0f} ms of CPU for the geometry"
         )
-    print_scenes(nextview.load(models), paths, names, matrix, learned)
 
 
-def in_words(name: str, thing: SceneObject) -> tuple[object, ...]:
-    """A row of a table on a confident name."""
-    pixels = max(int(mask.sum()) for mask in thing.pixels.values())
-    return name, thing.name, pixels, thing.pose_uncertainty
-
-
-def untaught(
-    folder: tyro.conf.Positional[Path],
-    models: str = "ycb",
-    show: bool = False,
-    network: Path | None = None,
-) -> None:
-    """Count what is found in the frames of a folder, and what gets a name.
+def frames_in(
+    folder: Path, intrinsics: tuple[float, float, float, float]
+) -> list[LabelledFrame]:
+    """All frames of a folder.
 
     Args:
-        folder: of the frames.
-        models: memory of things, none of which is in the frames.
-        show: whether each confident name is printed.
-        network: card of a segmentation network; None for the bundled one.
-    """
-    frames = sorted(path.parent for path in folder.glob("*/depth.png"))
-    if not frames:
-        raise UsageError(f"{folder}: holds no folder with a depth.png")
-    system = nextview.load(models=models)
-    learned = None if network is None else LearnedSegmenter(network)
-    counts = Counts()
-    rows = []
-    for path in progress(frames, f"frames of {folder.name}"):
-        scene = nextview.Scene(system, up=None, segmentation=learned)
-        try:
-            scene.update(frame_in(path))
-        except ObservationError as error:
-            counts.refused += 1
-            print(f"{path.name}: {error}")
-            continue
-        sure = [thing for thing in scene.objects if thing.confident]
-        counts.frames += 1
-        counts.objects += len(scene.objects)
-        counts.named += sum(thing.name != UNKNOWN_NAME for thing in scene.objects)
-        counts.confident += len(sure)
-        rows += [in_words(path.name, thing) for thing in sure]
+        folder: in one of the two layouts.
+        intrinsics: of frames with labels, which have none of their own: fx, fy, cx, cy, pixels.
 
-    if show:
-        print(markdown(("frame", "name", "pixels", "uncertainty"), rows))
-    share = counts.confident / max(counts.objects, 1)
-    print(
-        f"{counts.frames} frames taken in, {counts.refused} refused: {counts.objects} objects,"
-        f" {counts.named} with a name, {counts.confident} with a confident one ({share:.3f})"
+    Raises:
+        UsageError: it holds no frame.
+    """
+    found = []
+    for path in sorted(folder.glob("*.depth.png")):
+        frame = Frame(np.asarray(Image.open(path)), camera_matrix(*intrinsics))
+        labels = labels_of(path)
+        names = (folder / "names.txt").read_text().split()
+        things = [
+            (names[number], labels == number)
+            for number in np.unique(labels[labels > 0])
+        ]
+        found.append(LabelledFrame(path.name.split(".")[0], frame, things))
+
+    truth = folder / "truth.json"
+    points = json.loads(truth.read_text()) if truth.exists() else {}
+    for path in sorted(path.parent for path in folder.glob("*/depth.png")):
+        frame = frame_in(path)
+        things = [
+            (point["name"], around(point["row"], point["column"], frame.shape))
+            for point in points.get(path.name, ())
+        ]
+        found.append(LabelledFrame(path.name, frame, things))
+    if not found:
+        raise UsageError(
+            f"{folder}: holds no NAME.depth.png and no folder with a depth.png"
+        )
+    return found
+
+
+def around(row: int, column: int, shape: tuple[int, int]) -> Mask:
+    """The pixels near a pixel, (H, W)."""
+    rows, columns = np.indices(shape)
+    return np.hypot(rows - row, columns - column) <= NEAR_PIXELS
+
+
+def answers(
+    things: Sequence[tuple[str, Mask]], objects: Sequence[tuple[str, bool, Mask]]
+) -> tuple[list[Answer], list[Answer]]:
+    """Compare what a scene says of one frame with the truth.
+
+    Args:
+        things: name of each taught thing and its pixels, (H, W).
+        objects: name of each object of the scene, whether it is confident, and mask.
+
+    Returns:
+        The answers for the taught things, and for all objects that belong to none of them.
+    """
+    known = []
+    owned = set()
+    for true, pixels in things:
+        shared = [int((mask & pixels).sum()) for _, _, mask in objects]
+        if not any(shared):
+            known.append(Answer(None, False, False))
+            continue
+        owner = int(np.argmax(shared))
+        name, confident, _ = objects[owner]
+        owned.add(owner)
+        known.append(Answer(name, confident, name == true))
+
+    others = [
+        Answer(name, confident, name == UNKNOWN_NAME)
+        for number, (name, confident, _) in enumerate(objects)
+        if number not in owned
+    ]
+    return known, others
+
+
+def row(what: str, told: Sequence[Answer]) -> tuple[object, ...]:
+    """A row of the table: what it is about, how many there are, and the shares."""
+    total = len(told)
+    return (
+        what,
+        total,
+        share(sum(one.right for one in told), total),
+        share(sum(one.name == UNKNOWN_NAME for one in told), total),
+        share(sum(one.sure_and_wrong for one in told), total),
     )
 
 
+def alone(
+    folder: tyro.conf.Positional[Path],
+    models: str = "ycb",
+    intrinsics: tuple[float, float, float, float] = INTRINSICS,
+    show: bool = False,
+    network: Path | None = None,
+) -> None:
+    """Name everything in the frames of a folder, each frame alone, and count what is right.
+
+    Args:
+        folder: of the frames.
+        models: memory of the things.
+        intrinsics: of frames with labels: fx, fy, cx, cy, pixels.
+        show: whether each confident wrong name is printed.
+        network: card of a segmentation network; None for the bundled one.
+    """
+    system = nextview.load(models=models)
+    learned = None if network is None else LearnedSegmenter(network)
+    frames = frames_in(folder, intrinsics)
+    refused = 0
+    known: list[Answer] = []
+    others: list[Answer] = []
+    rows = []
+    for one in progress(frames, f"frames of {folder.name}"):
+        scene = nextview.Scene(system, up=None, segmentation=learned)
+        try:
+            scene.update(one.frame)
+        except ObservationError as error:
+            refused += 1
+            print(f"{one.name}: {error}")
+        things = [(name, mask) for name, mask in one.things if name in system.classes]
+        objects = [
+            (each.name, each.confident, next(iter(each.pixels.values())))
+            for each in scene.objects
+        ]
+        of_things, of_others = answers(things, objects)
+        known += of_things
+        others += of_others
+        true = [
+            *(name for name, _ in things),
+            *("none that was taught" for _ in of_others),
+        ]
+        rows += [
+            (one.name, name, said.name)
+            for name, said in zip(true, of_things + of_others, strict=True)
+            if said.sure_and_wrong
+        ]
+
+    if show:
+        print(markdown(("frame", "thing", "confident and wrong"), rows), end="\n\n")
+    print(f"{len(frames)} frames, each alone; {refused} refused\n")
+    columns = ("", "n", "right", "called unknown", "confident and wrong")
+    parts = (("taught things", known), ("other objects", others))
+    print(markdown(columns, [row(what, told) for what, told in parts if told]))
+
+
 if __name__ == "__main__":
-    subcommand_cli_from_dict({"taught": taught, "untaught": untaught})
+    subcommand_cli_from_dict({"alone": alone, "taught": taught})

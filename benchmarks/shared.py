@@ -89,11 +89,15 @@ def frame_in(folder: Path) -> Frame:
     """The frame without a pose that a folder holds.
 
     Args:
-        folder: of depth.png (uint16, millimetres) and K.json (fx, fy, cx, cy, with the middle of
-            the first pixel at 0).
+        folder: of depth.png (uint16, millimetres; scale.json has metres a step, if it is another
+            one) and K.json (fx, fy, cx, cy, with the middle of the first pixel at 0).
     """
     intrinsics = camera_matrix(*json.loads((folder / "K.json").read_text()))
-    return Frame(np.asarray(Image.open(folder / "depth.png")), intrinsics)
+    depth = np.asarray(Image.open(folder / "depth.png"))
+    scale = folder / "scale.json"
+    if scale.exists():
+        depth = depth * np.float32(json.loads(scale.read_text()))
+    return Frame(depth, intrinsics)
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
