@@ -22,6 +22,7 @@ from nextview.cli.main import main
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))
 import documented_commands
+import repeated
 
 README = (ROOT / "README.md").read_text()
 
@@ -91,6 +92,80 @@ def test_the_tests_named_on_pages_exist():
         column = re.findall(r"\| `(\w+)` \|$", text, re.M) if "| test |" in text else []
         for part in column:
             assert any(part in name for name in names), (page.name, part)
+
+
+# What pages repeat
+
+
+@pytest.mark.parametrize("page", repeated.PARTS)
+def test_a_page_repeats_the_table_and_the_citation_as_they_are(page):
+    said = "python workflow/repeated.py writes what has changed"
+    assert (ROOT / page).read_text() == repeated.with_parts(page), said
+
+
+def test_real_frames_come_first_in_the_table_and_its_figures_are_possible():
+    rows = repeated.measured_rows()
+    assert [row.real for row in rows] == sorted(
+        (row.real for row in rows), reverse=True
+    )
+    for row in rows:
+        for count in (row.right, row.sure_and_wrong):
+            assert not isinstance(count, int) or 0 <= count <= row.n, row
+        assert bool(row.n) == bool(row.command) == (row.right is not None), row
+
+
+@pytest.mark.parametrize("row", repeated.measured_rows(), ids=lambda row: row.task)
+def test_a_row_of_the_table_has_its_command_in_the_section_that_it_names(row):
+    name, _, anchor = row.page.partition("#")
+    parts = re.split(r"^##+ (.*)$", (ROOT / name).read_text(), flags=re.M)
+    titles = [re.sub(r"[^\w -]", "", title.lower()) for title in parts[1::2]]
+    sections = dict(
+        zip((title.replace(" ", "-") for title in titles), parts[2::2], strict=True)
+    )
+    assert row.command.strip() in (sections[anchor] if anchor else parts[0])
+
+
+def test_a_share_of_few_has_the_wilson_interval_and_one_of_many_none():
+    assert repeated.share(9, 10) == "9: 0.900 (0.60 to 0.98)"  # as in Wilson's tables
+    assert repeated.share(0, 10) == "0: 0.000 (0.00 to 0.28)"
+    assert repeated.share(150, 300) == "150: 0.500"
+    assert repeated.share(None, 0) == "not measured"
+    assert repeated.share("at most 1", 26) == "at most 1"
+
+
+def test_a_changed_row_and_another_version_change_the_page(tmp_path, monkeypatch):
+    (tmp_path / "workflow").mkdir()
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "workflow/measured.toml").write_text(
+        """
+[[rows]]
+task = "[Nuts] in a jar"
+page = "docs/jar.md#nuts"
+real = true
+n = 4
+right = 3
+command = "count"
+"""
+    )
+    (tmp_path / "CITATION.cff").write_text(
+        "title: jars\nversion: 7.1\ndate-released: 2031-05-06\nauthors: [{name: A}, {name: B}]\n"
+    )
+    old = "before\n<!-- measured: workflow/repeated.py -->\nold\n<!-- measured ends -->\nafter\n"
+    cite = "<!-- citation: workflow/repeated.py -->\n<!-- citation ends -->\n"
+    (tmp_path / "README.md").write_text(old + cite)
+    (tmp_path / "docs/results.md").write_text(old)
+    monkeypatch.setattr(repeated, "ROOT", tmp_path)
+
+    readme, results = (
+        repeated.with_parts(page) for page in ("README.md", "docs/results.md")
+    )
+    row = "in a jar | **real** | 4 | 3: 0.750 (0.30 to 0.95) | not measured |"
+    assert f"| [Nuts](docs/jar.md#nuts) {row}\n<!-- measured ends -->\nafter" in readme
+    assert f"| [Nuts](jar.md#nuts) {row}\n<!-- measured ends -->\nafter" in results
+    assert results.startswith("before\n<!-- measured")
+    assert "old" not in readme + results
+    assert "title = {{jars}}, author = {{A} and {B}}" in readme
+    assert "year = {2031}, version = {7.1}" in readme
 
 
 # The commands of all pages
@@ -195,8 +270,9 @@ def test_the_example_prints_what_the_readme_shows(there, capsys):
     assert names["result"].answer == "table"
 
 
-def test_its_session_runs(capsys):
-    (example,) = re.findall(r"```\n(session = .*?)```", README, re.S)
+def test_the_session_of_a_camera_in_the_object_frame_runs(capsys):
+    page = (ROOT / "docs/your_camera.md").read_text()
+    (example,) = re.findall(r"```\n(session = .*?)```", page, re.S)
     camera = nextview.SimulatedCamera(nextview.load_mesh(SAMPLE_FILES / "chair.off"))
     exec(f"import nextview\n{example}", {"my_camera": camera})
     assert "chair (belief" in capsys.readouterr().out
@@ -247,12 +323,9 @@ def test_the_commands_for_your_own_dataset_run(
     for package in ("torch", "onnx", "pandas", "jinja2"):
         pytest.importorskip(package)
     shutil.copytree(furniture, there / "data/ModelNet10")
-    (part,) = re.findall(r"## Make it yours\n+```sh\n(.*?)```", README, re.S)
-    lines = [line.partition("#")[0].strip() for line in part.splitlines()]
-    assert (
-        lines[0] == "nextview download modelnet10 data"
-    )  # into the folder that is there already
-    for line in lines[1:]:
+    page = (ROOT / "docs/dataset.md").read_text()
+    (part,) = re.findall(r"## From meshes to a benchmark\n.*?```\n(.*?)```", page, re.S)
+    for line in [line.partition("#")[0].strip() for line in part.splitlines()]:
         small = next(
             (
                 options

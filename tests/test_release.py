@@ -3,9 +3,11 @@
 import os
 import re
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
+import yaml
 
 import nextview
 
@@ -21,12 +23,15 @@ def top_of_changelog() -> tuple[str, str]:
     return found[1], found[2]
 
 
+def citation() -> dict:
+    return yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+
+
 def test_version_citation_and_changelog_are_in_step():
-    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    cited = re.search(r"^version: (\S+)$", citation, re.M)
+    cited = citation()
     research = tomllib.loads((ROOT / "research/pyproject.toml").read_text())
-    assert cited
-    assert cited[1] == nextview.__version__
+    assert cited["version"] == nextview.__version__
+    assert isinstance(cited["date-released"], date)
     assert research["project"]["version"] == nextview.__version__
     assert top_of_changelog()[0] == nextview.__version__
 
@@ -36,6 +41,7 @@ def test_a_release_has_the_tag_of_its_version_and_a_date():
     version, when = top_of_changelog()
     assert os.environ["NEXTVIEW_RELEASE"] == f"v{version}"
     assert re.fullmatch(r"\d{4}-\d{2}-\d{2}", when), "date the section before a release"
+    assert citation()["date-released"].isoformat() == when
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.name)

@@ -71,6 +71,12 @@ def test_every_command_has_a_page_with_its_own_help(site, capsys):
         assert all(option in page for option in options)
 
 
+def test_the_home_page_tells_how_to_cite(site):
+    home = re.sub("<[^>]+>", "", pages(site)["index.html"])
+    assert "@software{nextview" in home
+    assert "nextview: active 3D object recognition" in home
+
+
 def test_every_bundled_model_has_a_page_with_its_hash(site):
     shown = pages(site)
     for name, card in bundled_cards().items():
