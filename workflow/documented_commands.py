@@ -141,7 +141,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
     r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
-    r"benchmarks\.views|research\.(measure_study|example_maps)": (
+    r"benchmarks\.(views|scenes)|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",

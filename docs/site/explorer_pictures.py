@@ -19,14 +19,15 @@ from pathlib import Path
 import tyro
 from playwright.sync_api import Browser, sync_playwright
 from playwright.sync_api import Page as Tab
+from rerun.blueprint import TimePanel
 
 import nextview
 from nextview.captured.bundled_table import BUNDLED_TABLE
 from nextview.captured.folders import read_capture
 from nextview.data.samples import sample_mesh
+from nextview.viewers import recording
 from nextview.viewers.exploration import Exploration, shown_objects
 from nextview.viewers.page import Page
-from nextview.viewers.recording import Recorder
 from nextview.viewers.scene_page import write_scene_page
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -100,11 +101,15 @@ def shoot_scene(browser: Browser, path: Path) -> None:
 
 
 def shoot_recording(browser: Browser, path: Path) -> None:
-    """Take a picture of Rerun with the recording of an episode."""
+    """Take a picture of Rerun with the recording of an episode, without the lists at the sides."""
+    shown = recording.blueprint()
+    shown.collapse_panels = True
+    shown.time_panel = TimePanel(state="collapsed")
+    recording.blueprint = lambda: shown
     with tempfile.TemporaryDirectory() as folder:
         camera = nextview.SimulatedCamera(sample_mesh("table"))
         session = nextview.load().session(33)
-        session.observers.append(Recorder(Path(folder) / "episode.rrd"))
+        session.observers.append(recording.Recorder(Path(folder) / "episode.rrd"))
         while not session.done:
             session.update(camera.observe(session.pose))
         serving = subprocess.Popen(
@@ -124,12 +129,7 @@ def shoot_recording(browser: Browser, path: Path) -> None:
             tab.wait_for_timeout(SETTLES)
             data = "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
             tab.goto(f"http://127.0.0.1:9091/?renderer=webgl&url={data}")
-            tab.wait_for_timeout(10 * SETTLES)
-            for right in 80, 52:  # without the lists of recordings and of streams
-                tab.mouse.click(WIDTH - right, 18, delay=1000)  # it draws slowly
-                tab.wait_for_timeout(SETTLES)
-                tab.mouse.move(WIDTH / 4, HEIGHT / 5)  # away from the button
-                tab.wait_for_timeout(SETTLES)
+            tab.wait_for_timeout(20 * SETTLES)
             tab.screenshot(path=path)
             tab.close()
         finally:
