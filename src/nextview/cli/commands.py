@@ -14,7 +14,7 @@ class Command:
             value of the function.
         show: MODULE:NAME of the function that prints the return value.
         thesis: MODULE:NAME of the recipe that --preset thesis selects.
-        changes: name of the parameter of a file or folder that is changed; see also ``OUTPUT_NAMES``.
+        changes: name of a parameter, beside ``OUTPUT_NAMES``, whose file or folder is changed.
     """
 
     function: str
