@@ -35,7 +35,7 @@ USUAL_ERRORS = 8.0
 # tolerance of all but MOVED_SHARE, as for the inside of a cup that no scanner reaches
 LOCAL_ERRORS = 100.0
 # largest error about one axis, in errors of the surface: the scan of a lid is worse than of a side
-LARGEST_ERROR = 6.0
+AXIS_ERRORS = 6.0
 LARGEST_LOCAL_ERROR = 0.09  # of the diameter
 # share of the surface that may exceed it: the walls of a keyway are twice as much of a gear
 MOVED_SHARE = 0.0075
@@ -226,7 +226,7 @@ class _Compared:
             turns: angles, full turns.
         """
         least = self._least_median(axes, turns)
-        return min(least, LARGEST_ERROR * self._error)
+        return min(least, AXIS_ERRORS * self._error)
 
     @cached_property
     def _error(self) -> float:
@@ -475,7 +475,10 @@ def _order(
 
     The order is 0 for a continuous symmetry, and 1 for none.
     """
-    error = compared.error_about([axis], map(_telling, POWERS))
+    # Of candidates that end in one axis, the worst may be too far off to show the error.
+    alike = np.abs(np.array(compared.axes) @ axis) > np.cos(AXIS_TOLERANCE)
+    axes = [one for one, is_near in zip(compared.axes, alike, strict=True) if is_near]
+    error = compared.error_about(axes, map(_telling, POWERS))
     largest = compared.turned(axis, float(ANY_TURNS[0]), error, kind)
     if largest.fits:
         worst = _worst(compared, largest.axis, ANY_TURNS, error, kind)
