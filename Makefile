@@ -43,39 +43,40 @@ YCB ?= data/YCB
 PSB ?= data/PSB
 THINGS ?= reproduction-things
 NEXTVIEW = OMP_NUM_THREADS=1 .venv-test/bin/nextview
+LAB = OMP_NUM_THREADS=1 .venv-test/bin/nextview-lab
 PYTHON_TEST = OMP_NUM_THREADS=1 .venv-test/bin/python
 FIRST_DRAW = --draws 2 --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
 NEXT_DRAWS = --draws 2 --views 1 2 --policies geometry --reference
 
 reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$(seed)/memory.json)  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
-	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_60 $(THINGS)/pairs --models $(THINGS)/alike_60 --families $(FIRST_DRAW)
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy $(FIRST_DRAW)
-	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families --seed 71 $(NEXT_DRAWS) spread
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy --seed 71 $(NEXT_DRAWS) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half --seed 71 $(NEXT_DRAWS) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_two --models ycb --seed 71 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(THINGS)/look_alikes_60 $(THINGS)/pairs --models $(THINGS)/alike_60 --families $(FIRST_DRAW)
+	$(LAB) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy $(FIRST_DRAW)
+	$(LAB) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families --seed 71 $(NEXT_DRAWS) spread
+	$(LAB) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy --seed 71 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half --seed 71 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(YCB) $(THINGS)/clear_two --models ycb --seed 71 $(NEXT_DRAWS) furthest
 	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_two heavy_two half_two clear_two) > $(THINGS)/joined_two.md
-	$(NEXTVIEW) benchmark things $(THINGS)/look_alikes_75 $(THINGS)/pairs_three --models $(THINGS)/alike_75 --families --seed 74 $(NEXT_DRAWS) spread
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/heavy_three --models ycb --occlusion heavy --seed 74 $(NEXT_DRAWS) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/half_three --models ycb --occlusion half --seed 74 $(NEXT_DRAWS) furthest
-	$(NEXTVIEW) benchmark things $(YCB) $(THINGS)/clear_three --models ycb --seed 74 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(THINGS)/look_alikes_75 $(THINGS)/pairs_three --models $(THINGS)/alike_75 --families --seed 74 $(NEXT_DRAWS) spread
+	$(LAB) benchmark things $(YCB) $(THINGS)/heavy_three --models ycb --occlusion heavy --seed 74 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(YCB) $(THINGS)/half_three --models ycb --occlusion half --seed 74 $(NEXT_DRAWS) furthest
+	$(LAB) benchmark things $(YCB) $(THINGS)/clear_three --models ycb --seed 74 $(NEXT_DRAWS) furthest
 	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_three heavy_three half_three clear_three) > $(THINGS)/joined_three.md
-	$(NEXTVIEW) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
+	$(LAB) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
 	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
 	$(PYTHON_TEST) -m benchmarks.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
 	mkdir -p $(THINGS)/small
 	for policy in geometry sampled predicted fixed furthest random spread; do \
 		test -f $(THINGS)/small/$$policy.json || \
-		$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/$$policy.json --policy $$policy || exit 1; \
+		$(LAB) submit $(THINGS)/nextview-bench-small $(THINGS)/small/$$policy.json --policy $$policy || exit 1; \
 	done
 	test -f $(THINGS)/small/icp.json || \
-	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
+	$(LAB) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
 		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
 	test -f $(THINGS)/small/poses.json || \
-	$(NEXTVIEW) submit $(THINGS)/nextview-bench-small $(THINGS)/small/poses.json --name "poses alone" --version 1 --blind \
+	$(LAB) submit $(THINGS)/nextview-bench-small $(THINGS)/small/poses.json --name "poses alone" --version 1 --blind \
 		--command "$(abspath .venv-test/bin/python) -m benchmarks.poses_alone $(abspath $(THINGS)/nextview-bench-small) --answer"
-	$(NEXTVIEW) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --reference "nextview random" --overwrite
+	$(LAB) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --reference "nextview random" --overwrite
 
 $(THINGS)/look_alikes_%/pairs.csv: | .venv-test/installed
 	rm -rf $(@D)
@@ -90,9 +91,9 @@ $(THINGS)/alike_%/memory.json: $(THINGS)/look_alikes_%/pairs.csv
 	.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	touch $@
 
-.venv-test/installed: pyproject.toml research/pyproject.toml constraints.txt
+.venv-test/installed: pyproject.toml lab/pyproject.toml research/pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[train,bags,benchmark,cluster,explore,large,record,dev,workflow,docs,envs]' -e 'research[arm,rl]'
+	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[bags,cluster,explore,large,record,dev,workflow,docs]' -e 'lab[train,benchmark,envs]' -e 'research[arm,rl]'
 	touch $@
 
 .venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/*/*)

@@ -1,5 +1,5 @@
 """The main jobs in a base installation, on small inputs made here; each has to give the right
-result.
+result. The argument is the project whose jobs are run: nextview or nextview-lab.
 
 Run by ``.ci/base_installation`` in an empty working folder that holds copies of ``samples`` and
 ``examples``.
@@ -19,7 +19,6 @@ import trimesh
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.resting import resting_poses
 
-NEXTVIEW = str(Path(sys.executable).with_name("nextview"))
 EXTRAS = (
     "torch",
     "pandas",
@@ -35,14 +34,17 @@ OVER = {"rod": 90, "plate": 180, "angle": 90}
 MATPLOTLIB = {".cache", ".cache/matplotlib", ".config", ".config/matplotlib"}
 
 
-def run(*arguments: object, status: int = 0) -> str:
+def run(*arguments: object, status: int = 0, program: str = "nextview") -> str:
     """What a command prints; it has to end with this status and without a traceback."""
-    command = [NEXTVIEW, *map(str, arguments)]
+    command = [
+        str(Path(sys.executable).with_name(program)),
+        *map(str, arguments),
+    ]
     begun = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True)
     said = done.stdout + done.stderr
     print(
-        f"{time.monotonic() - begun:5.1f} s  nextview {' '.join(command[1:])}",
+        f"{time.monotonic() - begun:5.1f} s  {program} {' '.join(command[1:])}",
         flush=True,
     )
     assert done.returncode == status, said
@@ -69,6 +71,13 @@ def no_extra_is_there() -> None:
     """What an extra or the tests bring cannot be imported."""
     there = [name for name in EXTRAS if find_spec(name) is not None]
     assert not there, f"this is no base installation: {there}"
+
+
+def the_laboratory_is_not_there() -> None:
+    """Neither the laboratory nor what only it needs can be imported."""
+    names = ("nextview_lab", "zarr", "numcodecs", "pooch", "requests")
+    there = [name for name in names if find_spec(name) is not None]
+    assert not there, f"nextview brings {there}"
 
 
 def learn_and_recognise() -> None:
@@ -139,7 +148,19 @@ def sessions_with_frames() -> None:
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert name in done.stdout.splitlines()[-1], done.stdout
-    run(
+    assert "DAMAGED" not in run("list", "models")
+    assert "recognise" in run("completion", "bash")
+    assert "nextview-lab train" in run("train", "recogniser", status=2)
+
+
+def lab(*arguments: object, status: int = 0) -> str:
+    """What a command of the laboratory prints."""
+    return run(*arguments, status=status, program="nextview-lab")
+
+
+def captures() -> None:
+    """Depth images of a mesh, which nextview recognises."""
+    lab(
         "capture",
         "samples/chair.off",
         "captured",
@@ -158,15 +179,15 @@ def stores_and_predictions() -> None:
         place = Path("shop") / name
         place.mkdir(parents=True)
         Path(f"samples/{name}.off").rename(place / f"{name}.off")
-    run("render", "shop", "views.zarr", "--size", 112, "--workers", 0)
-    assert "3 objects are sound, 0 damaged" in run(
+    lab("render", "shop", "views.zarr", "--size", 112, "--workers", 0)
+    assert "3 objects are sound, 0 damaged" in lab(
         "check",
         "views.zarr",
         "--workers",
         0,
     )
-    assert "3 objects" in run("predict", "views.zarr", "views.npz", "--workers", 0)
-    assert "all 40 1.000" in run(
+    assert "3 objects" in lab("predict", "views.zarr", "views.npz", "--workers", 0)
+    assert "all 40 1.000" in lab(
         "predict",
         "views.zarr",
         "views.npz",
@@ -174,14 +195,14 @@ def stores_and_predictions() -> None:
         0,
         "--overwrite",
     )
-    assert "DAMAGED" not in run("list", "models")
-    said = run("benchmark", "classes", "views.npz", "results", status=2)
-    assert "pip install 'nextview[benchmark]'" in said
+    assert "gradient" in lab("list", "measures")
+    said = lab("benchmark", "classes", "views.npz", "results", status=2)
+    assert "pip install 'nextview-lab[benchmark]'" in said
     assert said.count("\n") == 1
-    assert run("train", "recogniser", "--help").startswith(
-        "usage: nextview train recogniser"
+    assert lab("train", "recogniser", "--help").startswith(
+        "usage: nextview-lab train recogniser"
     )
-    assert "recognise" in run("completion", "bash")
+    assert "leaderboard" in lab("completion", "bash")
 
 
 def nothing_unasked_is_written() -> None:
@@ -194,13 +215,22 @@ def nothing_unasked_is_written() -> None:
     assert not strange, f"in the home folder: {sorted(strange)}"
 
 
-for job in (
-    no_extra_is_there,
-    learn_and_recognise,
-    look_at_samples,
-    sessions_with_frames,
-    stores_and_predictions,
-    nothing_unasked_is_written,
-):
+JOBS = {
+    "nextview": (
+        no_extra_is_there,
+        the_laboratory_is_not_there,
+        learn_and_recognise,
+        look_at_samples,
+        sessions_with_frames,
+        nothing_unasked_is_written,
+    ),
+    "nextview-lab": (
+        no_extra_is_there,
+        captures,
+        stores_and_predictions,
+        nothing_unasked_is_written,
+    ),
+}
+for job in JOBS[sys.argv[1]]:
     print(job.__name__.replace("_", " "), flush=True)
     job()

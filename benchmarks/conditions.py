@@ -30,12 +30,12 @@ from nextview import Camera, Mesh, System, load_mesh
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
-from nextview.data.metrics import calibration_error
 from nextview.data.pool import WorkerDied, each
 from nextview.sensing import ObjectFrame
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import RENDER, sensor_named
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.data.metrics import calibration_error
 
 BOXES = 15.5
 """So many boxes on average leave about 57 % of an object visible; chosen on held-out training

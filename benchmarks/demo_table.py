@@ -40,15 +40,15 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.sensing.frame import Frame
-from nextview.simulation.scene import upright_boxes
+from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import (
+from nextview.types import Float
+from nextview_lab.worlds.tables import (
     TABLE_HEIGHT,
     SimulatedTable,
     TableCamera,
     poses_around,
 )
-from nextview.types import Float
 
 TAUGHT_THINGS = 7
 SMALLEST = 0.05  # metres across: of a smaller thing too little is seen

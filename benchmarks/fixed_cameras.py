@@ -19,9 +19,9 @@ from nextview.geometry.mesh import Mesh
 from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import taught_meshes
 from nextview.types import Float
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 NAMES = ("cracker_box", "mug", "mustard_bottle", "tomato_soup_can", "power_drill")
 THINGS = 4

@@ -1,4 +1,4 @@
-"""A frozen archive of depth images, rendered by MuJoCo, for ``nextview submit``.
+"""A frozen archive of depth images, rendered by MuJoCo, for ``nextview-lab submit``.
 
     python -m benchmarks.frozen SCANS nextview-bench-1.0
     python -m benchmarks.frozen SCANS part --things 4 --draws 1 --grid 3 4
@@ -57,7 +57,10 @@ from benchmarks.staged_things import (
     staged,
     true_pose,
 )
-from nextview.benchmark.frozen import (
+from nextview.cli.exit_status import orderly_end
+from nextview.errors import UsageError
+from nextview.files import only_one, read_record, sha256_of, write_record
+from nextview_lab.benchmark.frozen import (
     EPISODE_FILE,
     EPISODES_FOLDER,
     MANIFEST,
@@ -71,9 +74,6 @@ from nextview.benchmark.frozen import (
     as_matrix,
     seal,
 )
-from nextview.cli.exit_status import orderly_end
-from nextview.errors import UsageError
-from nextview.files import only_one, read_record, sha256_of, write_record
 
 FROZEN_PLACES: tuple[Place, ...] = (
     "alone",
@@ -112,8 +112,8 @@ CARD = """\
 
 - **What**: depth of 640 x 480 pixels in steps of 0.1 mm (`NNN.png`), the pixels of the thing
   (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
-  holds names, poses of the things and true poses of the cameras: only `nextview leaderboard` reads
-  it. A method is not shown it. The truth of {sealed} sealed episodes is not in the archive.
+  holds names, poses of the things and true poses of the cameras: only `nextview-lab leaderboard`
+  reads it. A method is not shown it. The truth of {sealed} sealed episodes is not in the archive.
 - **How**: things fall by the physics of MuJoCo and are seen along its rays. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and

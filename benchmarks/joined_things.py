@@ -1,4 +1,4 @@
-"""One table of several runs of ``nextview benchmark things``, with one correction of all tests.
+"""One table of several runs of ``nextview-lab benchmark things``, with one correction of all tests.
 
     python -m benchmarks.joined_things heavy half clear pairs
 
@@ -18,7 +18,8 @@ and the number of views must have been chosen before.
 import json
 from pathlib import Path
 
-from nextview.cli.exit_status import orderly_end, require
+from nextview.cli.exit_status import orderly_end
+from nextview_lab.extras import require
 
 require("benchmark")
 
@@ -27,10 +28,10 @@ import pandas as pd
 import tyro
 from scipy.stats import combine_pvalues
 
-from nextview.benchmark.comparison import ALL, corrected
-from nextview.benchmark.results import RECORD, markdown
-from nextview.benchmark.thing_tables import FAR_POSE, POSE_AFTER
 from nextview.errors import UsageError
+from nextview_lab.benchmark.comparison import ALL, corrected
+from nextview_lab.benchmark.results import RECORD, markdown
+from nextview_lab.benchmark.thing_tables import FAR_POSE, POSE_AFTER
 
 COLUMNS = (
     "set",
@@ -59,7 +60,9 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     for run in runs:
         if not (run / "tests.csv").is_file():
-            raise UsageError(f"{run}: holds no results of nextview benchmark things")
+            raise UsageError(
+                f"{run}: holds no results of nextview-lab benchmark things"
+            )
     measures, tests = (
         [pd.read_csv(run / f"{name}.csv").assign(run=run.name) for run in runs]
         for name in ("measures", "tests")

@@ -35,13 +35,14 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 import nextview
-from nextview.cli.exit_status import orderly_end, require
+from nextview.cli.exit_status import orderly_end
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import open_weights
 from nextview.recognition.model_card import ModelCard, find_card
 from nextview.runtime import ort
 from nextview.sensing import Frame, ObservedObject, plausibility, resampling, sighting
+from nextview_lab.extras import require
 
 NETWORKS = ("lcm-modelnet10", "lem-modelnet10", "recogniser-modelnet10")
 SIDE = 2048  # of the matrices of the baseline

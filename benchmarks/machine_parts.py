@@ -34,8 +34,8 @@ from nextview.recognition.model_card import Symmetry
 from nextview.session.result import Recognition
 from nextview.session.system import System
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.simulation.solids import Solid, extruded, joined, moved, ring_points
 from nextview.types import Float
+from nextview_lab.worlds.solids import Solid, extruded, joined, moved, ring_points
 
 SPHERE = ViewSphere((18.0, 36.0, 54.0, 72.0), 8)
 WRONG = 20.0  # degrees by which a confident orientation is wrong

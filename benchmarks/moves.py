@@ -45,10 +45,10 @@ from nextview.geometry.mesh import Mesh
 from nextview.scene.objects import SceneObject
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.frame import Frame
-from nextview.simulation.scene import footprint, separation
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.types import Float
+from nextview_lab.worlds.scene import footprint, separation
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 Masks = Literal["true", "network"]
 

@@ -8,8 +8,8 @@ by what was learned from the other half: by the nearest neighbour, along each si
 along all of them, and by a linear classifier. What is told of an episode is the same as in an
 archive: it is drawn before the scene (``benchmarks.frozen.draw_views``).
 
-The second is a method for ``nextview submit --command``. It names what it sees by the nearest of
-all other episodes of ARCHIVE, whose truth it reads, and opens no image.
+The second is a method for ``nextview-lab submit --command``. It names what it sees by the nearest
+of all other episodes of ARCHIVE, whose truth it reads, and opens no image.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from benchmarks.frozen import (
 )
 from benchmarks.shared import names_to_stage
 from benchmarks.staged_things import CAMERA_MATRIX, Float
-from nextview.benchmark.frozen import FrozenArchive, FrozenEpisode, as_matrix
-from nextview.benchmark.methods import aimed_at
+from nextview_lab.benchmark.frozen import FrozenArchive, FrozenEpisode, as_matrix
+from nextview_lab.benchmark.methods import aimed_at
 
 RIDGE = 1.0  # penalty of the linear classifier, in units of standardised features
 LIKELY = 0.001  # chance of as many right names without any information
@@ -217,7 +217,7 @@ def episodes_of(archive: Path) -> dict[str, tuple[FrozenEpisode, str]]:
 
 
 def answer_all(archive: Path) -> None:
-    """Answer lines of ``nextview submit`` by the nearest other episode of an archive."""
+    """Answer lines of ``nextview-lab submit`` by the nearest other episode of an archive."""
     known = episodes_of(archive)
     values = np.array(
         [list(features_of(episode).values()) for episode, _ in known.values()]
@@ -250,7 +250,7 @@ def main(
     Args:
         folder: of the scans, NAME.ply; with --answer of an archive.
         seeds: of the draws, each with all things in all places.
-        answer: answer the lines of nextview submit.
+        answer: answer the lines of nextview-lab submit.
     """
     if answer:
         answer_all(folder)

@@ -4,7 +4,7 @@
     python -m benchmarks.real_frames taught FOLDER SCANS [--models ycb] [--network CARD]
 
 No camera pose is known: up is the normal of the table. Nothing is drawn at random. ``--network``
-is the card of a network of ``nextview train segmentation`` in place of the bundled one.
+is the card of a network of ``nextview-lab train segmentation`` in place of the bundled one.
 
 ``alone``: each frame is given to a scene of its own. FOLDER holds one of
 

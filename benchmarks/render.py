@@ -106,10 +106,10 @@ def embree_bounded(files: list[str]) -> Cost:
 
 def one_process(files: list[str]) -> Cost:
     """nextview's work on each object, mesh file to arrays in memory."""
-    from nextview.data.rendering import render_object
     from nextview.geometry.mesh import load_mesh
     from nextview.geometry.viewsphere import ViewSphere
     from nextview.simulation.simulated import SimulatedCamera
+    from nextview_lab.data.rendering import render_object
 
     began = now()
     for file in files:
@@ -319,8 +319,8 @@ def end_to_end(
 
     The processes' starting is in both.
     """
-    from nextview.data.rendering import render
     from nextview.geometry.viewsphere import ViewSphere
+    from nextview_lab.data.rendering import render
 
     with tempfile.TemporaryDirectory() as folder:
         for file in files:

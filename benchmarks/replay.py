@@ -14,20 +14,20 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
 import numpy as np
 import tyro
 
-from nextview.benchmark.class_tables import summarise
-from nextview.benchmark.entries import default_entries
-from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview.cli.exit_status import orderly_end
-from nextview.data.predictions import Predictions
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration
+from nextview_lab.benchmark.class_tables import summarise
+from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
+from nextview_lab.data.predictions import Predictions
 
 TEN = ["random", "random-all", "furthest", "unidirectional", "lem", "lem-peak"]
 TEN += ["oracle-valley", "true-lem", "true-lcm", "oracle-gain"]

@@ -12,23 +12,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
 import numpy as np
 import tyro
 
-from nextview.benchmark.class_tables import ClassTables, summarise
-from nextview.benchmark.comparison import ALL, SIGNIFICANT
-from nextview.benchmark.entries import default_entries
-from nextview.benchmark.leaderboard import nothing_differs
-from nextview.benchmark.published import published, published_threshold
-from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview.cli.exit_status import orderly_end
-from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
 from nextview.recognition.belief import PLAIN_SUM
+from nextview_lab.benchmark.class_tables import ClassTables, summarise
+from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT
+from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.leaderboard import nothing_differs
+from nextview_lab.benchmark.published import published, published_threshold
+from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
+from nextview_lab.data.predictions import Predictions
 
 AT = 0.97
 BASELINES = ("random", "furthest", "unidirectional")
@@ -140,7 +140,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
             " views; the same first views for every policy and threshold. In brackets: 95 %"
             " bootstrap intervals over objects. p-values are by sign flips over objects, after one"
             " Holm correction over all that is compared with the same policy: every other one,"
-            " published, learned or oracle, at every threshold, as in `nextview benchmark classes`."
+            " published, learned or oracle, at every threshold, as in `nextview-lab benchmark"
+            " classes`."
             " Differences of accuracy are in percentage points."
         ),
         "",
@@ -148,8 +149,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
             "`python -m benchmarks.reproduction predictions.npz docs/reproduction.md` makes this"
             " page, verdicts and all."
         ),
-        f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview predict"
-        " modelnet10.zarr predictions.npz --split test`; models: "
+        f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview-lab"
+        " predict modelnet10.zarr predictions.npz --split test`; models: "
         + ", ".join(
             f"{kind} {name} (`{sha[:12]}...`)"
             for kind, (name, sha) in table.models.items()
@@ -188,8 +189,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "## At the published thresholds",
         "",
         (
-            "`nextview benchmark classes predictions.npz results --uncalibrated`; `measures.csv`."
-            " Published: tables 5, 8 and 9."
+            "`nextview-lab benchmark classes predictions.npz results --uncalibrated`;"
+            " `measures.csv`. Published: tables 5, 8 and 9."
         ),
         "",
         (
@@ -224,7 +225,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         f"## Every policy at threshold {AT}",
         "",
-        "`nextview benchmark classes predictions.npz results --uncalibrated`; `measures.csv`.",
+        "`nextview-lab benchmark classes predictions.npz results --uncalibrated`; `measures.csv`.",
         "",
         "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
         "|---|---|---|---|---|---|",
@@ -247,7 +248,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         f"## Accuracy against each baseline at threshold {AT}, points",
         "",
         (
-            "`nextview benchmark classes predictions.npz results --uncalibrated --reference"
+            "`nextview-lab benchmark classes predictions.npz results --uncalibrated --reference"
             " BASELINE`; `tests.csv`."
         ),
         "",

@@ -1,10 +1,10 @@
 """Recognise objects in rooms: by the aim of the camera alone, by a point or by a mask, through a
 good and a poor camera.
 
-    nextview scenes ModelNet10 rooms --room --split train --scenes 60
+    nextview-lab scenes ModelNet10 rooms --room --split train --scenes 60
     python -m benchmarks.room rooms ModelNet10 out [--mistakes page]
 
-    nextview scenes YCB tables --room --unit m --scenes 40
+    nextview-lab scenes YCB tables --room --unit m --scenes 40
     python -m benchmarks.room tables YCB out-ycb --models ycb --by point mask
 
 Each room is looked at from its first view on, with all defaults, until the session is done. By
@@ -47,10 +47,10 @@ from nextview.errors import DatasetError, NextviewError, ObservationError, Usage
 from nextview.files import check_new, only_one, read_record, write_record
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.session import Session
-from nextview.simulation.room import Room, RoomCamera, build_room
-from nextview.simulation.room_layout import RoomLayout
 from nextview.simulation.sensor import Sensor, sensor_named
 from nextview.types import Mask
+from nextview_lab.worlds.room import Room, RoomCamera, build_room
+from nextview_lab.worlds.room_layout import RoomLayout
 
 By = Literal["pose", "point", "mask"]
 
@@ -291,7 +291,7 @@ def jobs_of(
     )
     if not files:
         raise DatasetError(
-            f"{rooms}: holds no rooms; nextview scenes --room draws some"
+            f"{rooms}: holds no rooms; nextview-lab scenes --room draws some"
         )
     return [
         Job(
@@ -401,7 +401,7 @@ def main(
     """Recognise the objects in some rooms, and print how it went.
 
     Args:
-        rooms: folder that nextview scenes --room drew.
+        rooms: folder that nextview-lab scenes --room drew.
         meshes: folder of the meshes that they are made of.
         out: folder of the episodes; those that are there are not run again.
         by: how the object is said.

@@ -9,11 +9,11 @@
     python -m benchmarks.scenes calibration scenes.npz ... --alone single-objects.npz ...
 
 ``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in
-the truth and accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level
-accuracy and travel after 2, 3 and 5 views, points over random, and those of ours over each rival,
-with 95 % bootstrap intervals over scenes and one Holm correction for all that is claimed; the share
-of what one step of foresight gains; as a figure, accuracy against travel in cells and in seconds of
-a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
+the truth and accuracy after 2 to 5 views, as ``nextview-lab train gain`` judges. ``judge``: by
+level accuracy and travel after 2, 3 and 5 views, points over random, and those of ours over each
+rival, with 95 % bootstrap intervals over scenes and one Holm correction for all that is claimed;
+the share of what one step of foresight gains; as a figure, accuracy against travel in cells and in
+seconds of a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
 ``calibration``: how far the belief after 1, 2, 3 and 5 random views can be trusted, by level and by
 how much of the target they show. ``picture``: one object at three levels, seen from some of the
 40 views. The target is orange, what stands around it grey, the table light. Above each picture is
@@ -26,7 +26,7 @@ from dataclasses import dataclass, fields
 from itertools import pairwise, product
 from pathlib import Path
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
@@ -37,18 +37,9 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from nextview.benchmark.class_tables import grid_mean, levels_of
-from nextview.benchmark.comparison import Counted, Key, corrected
-from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.replay import Grid, make_specs, run_grid
-from nextview.benchmark.statistics import interval, resample
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
-from nextview.data.metrics import calibration_error
-from nextview.data.predictions import Predictions
-from nextview.data.scene_drawing import Meshes, draw_scene
-from nextview.data.scene_views import scenes_of
 from nextview.errors import UsageError
 from nextview.geometry.depth import headlight
 from nextview.geometry.observation import pinhole
@@ -56,16 +47,25 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import of_true_class
 from nextview.session.style import FIGURE_STYLE, PAPER
-from nextview.simulation.scene import TargetScene, build_scene
-from nextview.simulation.scene_layout import CLUTTER_LEVELS
-from nextview.simulation.simulated import (
+from nextview_lab.benchmark.class_tables import grid_mean, levels_of
+from nextview_lab.benchmark.comparison import Counted, Key, corrected
+from nextview_lab.benchmark.entries import is_oracle
+from nextview_lab.benchmark.replay import Grid, make_specs, run_grid
+from nextview_lab.benchmark.statistics import interval, resample
+from nextview_lab.data.metrics import calibration_error
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.scene_drawing import Meshes, draw_scene
+from nextview_lab.data.scene_views import scenes_of
+from nextview_lab.training.rollout import ReplayTable
+from nextview_lab.training.rollout import judge as follow
+from nextview_lab.worlds.scene import TargetScene, build_scene
+from nextview_lab.worlds.scene_cameras import (
     SHOWS_OTHER,
     SHOWS_TABLE,
     SHOWS_TARGET,
     SceneCamera,
 )
-from nextview.training.rollout import ReplayTable
-from nextview.training.rollout import judge as follow
+from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS
 
 POLICIES = ("random", "gain", "visibility", "volumetric", "visible-gain")
 RIVALS = ("random-all", "visibility", "volumetric", "gain")

@@ -2,14 +2,14 @@
 
     python -m benchmarks.second_views SCANS STRANGERS OUT.jsonl [--tables 20] [--seed 1]
 
-Tables, camera and first views are those of ``nextview benchmark tables``. From the state after the
-first frame a scene looks once at its target, and once at each of some random candidates of 30 to
-60 degrees elevation, every time as if it had not looked at the others. The best of the random views
-by the truth is then looked at once more, with other noise: the first look chose it and contains the
-luck of its noise, the second one does not. Printed are the things that are named right, a table:
-after the first frame, after the target, after a random view (mean), and after the best view, first
-and again. "Again" is what a rule can expect that knows of each view how it turned out. OUT.jsonl
-gets a line for each table; those that it holds are not run again.
+Tables, camera and first views are those of ``nextview-lab benchmark tables``. From the state after
+the first frame a scene looks once at its target, and once at each of some random candidates of 30
+to 60 degrees elevation, every time as if it had not looked at the others. The best of the random
+views by the truth is then looked at once more, with other noise: the first look chose it and
+contains the luck of its noise, the second one does not. Printed are the things that are named
+right, a table: after the first frame, after the target, after a random view (mean), and after the
+best view, first and again. "Again" is what a rule can expect that knows of each view how it turned
+out. OUT.jsonl gets a line for each table; those that it holds are not run again.
 """
 
 from __future__ import annotations
@@ -23,8 +23,12 @@ import numpy as np
 import tyro
 
 from benchmarks.shared import markdown, results
-from nextview.benchmark.statistics import sign_flip_p
-from nextview.benchmark.table_runs import (
+from nextview.cli.exit_status import orderly_end
+from nextview.scene.view_policies import VIEW_ELEVATIONS
+from nextview.simulation.sensor import SENSORS
+from nextview.types import Float
+from nextview_lab.benchmark.statistics import sign_flip_p
+from nextview_lab.benchmark.table_runs import (
     CAMERA_FROM_TABLE,
     TABLE_CENTRE,
     Looking,
@@ -32,11 +36,7 @@ from nextview.benchmark.table_runs import (
     meshes_in,
     opened_models,
 )
-from nextview.cli.exit_status import orderly_end
-from nextview.scene.view_policies import VIEW_ELEVATIONS
-from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import TableCamera, poses_around
-from nextview.types import Float
+from nextview_lab.worlds.tables import TableCamera, poses_around
 
 
 def looked_from(before: Looking, pose: Float, seed: tuple[int, ...]) -> float:

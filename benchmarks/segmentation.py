@@ -15,8 +15,8 @@ over union (IoU) of each with the segment that fits it best, the shares with mor
 .9, the share of segments that fit some thing by more than .5 (precision), segments that hold most
 of two things (merges), and things of which two segments hold a fifth each (splits); the mean IoU by
 how many things a frame shows; and the seconds a frame takes. ``--network``
-names the card of a network of ``nextview train segmentation``; without it the bundled one is asked.
-``--figure`` draws the worst frames and the best.
+names the card of a network of ``nextview-lab train segmentation``; without it the bundled one is
+asked. ``--figure`` draws the worst frames and the best.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
-from nextview.simulation.worlds import Shape, draw_world, photograph
+from nextview_lab.worlds.worlds import Shape, draw_world, photograph
 
 LEAST_PIXELS = 200  # of a thing that counts; of a segment half as many
 SHAPE = (480, 640)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.sessions_and_scenes SCANS STRANGERS OUT.jsonl [--tables 8] [--seed 1]
 
-Tables, camera and first views are those of ``nextview benchmark tables``; the next views are a
+Tables, camera and first views are those of ``nextview-lab benchmark tables``; the next views are a
 quarter circle on. A scene takes all frames. For each object with 100 pixels in the first frame a
 session takes the same frames; it is given a point on the object: the measured point that is
 nearest to their median. Both segment the frames themselves. Counted are right names and confident
@@ -21,7 +21,15 @@ import numpy as np
 import tyro
 
 from benchmarks.shared import markdown, results
-from nextview.benchmark.table_runs import (
+from nextview.cli.exit_status import orderly_end
+from nextview.errors import ObservationError
+from nextview.scene.objects import UNKNOWN_NAME
+from nextview.scene.view_policies import VIEW_ELEVATIONS
+from nextview.sensing import Frame, ObservedObject
+from nextview.session.system import System
+from nextview.simulation.sensor import SENSORS
+from nextview.types import Float, Mask
+from nextview_lab.benchmark.table_runs import (
     CAMERA_FROM_TABLE,
     STRANGER,
     TABLE_CENTRE,
@@ -30,15 +38,7 @@ from nextview.benchmark.table_runs import (
     meshes_in,
     opened_models,
 )
-from nextview.cli.exit_status import orderly_end
-from nextview.errors import ObservationError
-from nextview.scene.objects import UNKNOWN_NAME
-from nextview.scene.view_policies import VIEW_ELEVATIONS
-from nextview.sensing import Frame, ObservedObject
-from nextview.session.system import System
-from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import TableCamera, poses_around
-from nextview.types import Float, Mask
+from nextview_lab.worlds.tables import TableCamera, poses_around
 
 FEWEST_PIXELS = 100  # of an object in the first frame
 Answers = list[tuple[str, bool]]

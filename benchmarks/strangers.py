@@ -10,8 +10,8 @@
     python -m benchmarks.strangers shapes --shapes ball box rod can --radii 0.025 0.05 0.1 0.15
     python -m benchmarks.strangers shapes --models modelnet10 --radii 0.3 0.6    # furniture sizes
 
-    nextview render data/ModelNet10 views.zarr
-    nextview render data/PSB unseen.zarr
+    nextview-lab render data/ModelNet10 views.zarr
+    nextview-lab render data/PSB unseen.zarr
     python -m benchmarks.strangers views views.zarr unseen.zarr [--split test]
     python -m benchmarks.strangers maps unseen.zarr [--model lem-modelnet10]
 
@@ -53,13 +53,8 @@ from trimesh.bounds import oriented_bounds
 
 import nextview
 from benchmarks.shared import markdown, progress
-from nextview.benchmark.statistics import interval, resample
 from nextview.cli.exit_status import orderly_end
 from nextview.data.folders import Entry, list_dataset
-from nextview.data.measures import normalise_per_object
-from nextview.data.metrics import map_scores, ratio
-from nextview.data.scene_drawing import Meshes, draw_scene
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.observation import Camera
 from nextview.geometry.resting import rotated
@@ -69,11 +64,16 @@ from nextview.recognition.inference import Features, MapNetwork, NetworkRecognis
 from nextview.recognition.model_card import RECOGNISER
 from nextview.recognition.network_input import from_store
 from nextview.session.session import FrameCamera
-from nextview.simulation.robot_camera import Named, RobotCamera
-from nextview.simulation.scene import build_scene
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.types import Float
+from nextview_lab.benchmark.statistics import interval, resample
+from nextview_lab.data.measures import normalise_per_object
+from nextview_lab.data.metrics import map_scores, ratio
+from nextview_lab.data.scene_drawing import Meshes, draw_scene
+from nextview_lab.data.store import ViewStore
+from nextview_lab.worlds.robot_camera import Named, RobotCamera
+from nextview_lab.worlds.scene import build_scene
 
 BOOTSTRAP_SAMPLES = 1000
 MOST_UNKNOWN_CLASSES = 5
@@ -451,7 +451,7 @@ def views(
     network = NetworkRecogniser(recogniser)
     if network.novelty is None:
         raise SystemExit(
-            f"{recogniser} cannot tell unknown objects; nextview fit unknown teaches it"
+            f"{recogniser} cannot tell unknown objects; nextview-lab fit unknown teaches it"
         )
     ours = judge(known, split, None, network, seed)
     others = judge(unknown, None, objects, network, seed)
@@ -543,7 +543,7 @@ def maps(
         samples: of the bootstrap over objects.
         seed: of the bootstrap.
     """
-    from nextview.benchmark.evaluation import baselines
+    from nextview_lab.benchmark.evaluation import baselines
 
     views = ViewStore.open(store)
     network = MapNetwork(model)

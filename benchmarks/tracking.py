@@ -44,15 +44,15 @@ from nextview.scene.objects import SceneObject
 from nextview.scene.scene import Scene
 from nextview.scene.tracker import Tracker
 from nextview.sensing.frame import Frame
-from nextview.simulation.scene import upright_boxes
+from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import (
+from nextview.types import Float
+from nextview_lab.worlds.tables import (
     PlacedThing,
     SimulatedTable,
     TableCamera,
     poses_around,
 )
-from nextview.types import Float
 
 RATE = 30  # frames a second
 SECONDS = 4.0

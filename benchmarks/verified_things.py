@@ -53,7 +53,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.recognition.model_card import Symmetry
-from nextview.simulation.scene import boxes_around
+from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface

@@ -1,4 +1,5 @@
-"""``nextview benchmark classes --views`` with policies and references of its own, and its figure.
+"""``nextview-lab benchmark classes --views`` with policies and references of its own, and its
+figure.
 
     python -m benchmarks.views test.npz views [--policies gain@0.01 ...] [--views 2 3 5]
         [--against lem ...]
@@ -16,7 +17,7 @@ from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
@@ -29,19 +30,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
-from nextview.benchmark.class_tables import ONE_STEP, after_views
-from nextview.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
-from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
-from nextview.benchmark.figures import OWN, POLICY_COLOURS
-from nextview.benchmark.leaderboard import after_views_rows
-from nextview.benchmark.replay import Grid, make_specs, run_grid
-from nextview.benchmark.results import markdown
-from nextview.benchmark.statistics import resample_families, target_families
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
-from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
 from nextview.session.style import FIGURE_STYLE, GREY, to_png
+from nextview_lab.benchmark.class_tables import ONE_STEP, after_views
+from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
+from nextview_lab.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
+from nextview_lab.benchmark.figures import OWN, POLICY_COLOURS
+from nextview_lab.benchmark.leaderboard import after_views_rows
+from nextview_lab.benchmark.replay import Grid, make_specs, run_grid
+from nextview_lab.benchmark.results import markdown
+from nextview_lab.benchmark.statistics import resample_families, target_families
+from nextview_lab.data.predictions import Predictions
 
 POLICIES = (
     "random",
@@ -298,7 +299,7 @@ def main(
     """Write the table and the figure.
 
     Args:
-        predictions: made by nextview predict.
+        predictions: made by nextview-lab predict.
         out: folder for views.md, measures.csv, tests.csv and front.png.
         policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by
             default a choice of those that the predictions allow.

@@ -5,7 +5,7 @@
 SCANS holds the scans, in metres, of the things that MODELS knows (``nextview learn SCANS MODELS
 --unit m``). The agent is two weights: of what a view is expected to tell, and of the way there. The
 cross-entropy method (Rubinstein 1999) draws some pairs of weights, keeps the best third, and draws
-anew around these. It needs ``pip install 'nextview[envs]'``.
+anew around these. It needs ``pip install 'nextview-lab[envs]'``.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def main(
     with extras():
         import gymnasium
 
-        import nextview.benchmark.environments  # noqa: F401  # registers the environment
+        import nextview_lab.benchmark.environments  # noqa: F401  # registers the environment
 
     name = "nextview/RecogniseThings-v0"
     options = {"objective": "belief", "max_views": 3, "travel_price": 0.02}

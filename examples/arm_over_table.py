@@ -35,9 +35,9 @@ from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Look
 from nextview.sensing.object_frame import Box
-from nextview.simulation.scene import footprint, separation
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import PlacedThing
+from nextview_lab.worlds.scene import footprint, separation
+from nextview_lab.worlds.tables import PlacedThing
 
 if TYPE_CHECKING:
     from research.arm import Arm

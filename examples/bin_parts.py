@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.cli.exit_status import orderly_end
 from nextview.files import new_folder
-from nextview.simulation.solids import Solid, extruded, joined, moved, ring_points
+from nextview_lab.worlds.solids import Solid, extruded, joined, moved, ring_points
 
 ROUND = 48  # sides of a cylinder
 

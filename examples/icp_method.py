@@ -1,6 +1,7 @@
-"""A method in another process for nextview submit (docs/submit.md): ICP with NumPy and SciPy alone.
+"""A method in another process for nextview-lab submit (docs/submit.md): ICP with NumPy and SciPy
+alone.
 
-    nextview submit ARCHIVE icp.json --command "python examples/icp_method.py SCANS" \
+    nextview-lab submit ARCHIVE icp.json --command "python examples/icp_method.py SCANS" \
         --name "plain ICP" --version 1 --blind
 
 It matches the points of all views so far with each scan, in 24 orientations, and names the scan

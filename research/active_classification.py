@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.environments import (
+from nextview_lab.benchmark.environments import (
     EnvironmentSplit,
     RecogniseEnv,
     RecogniseVectorEnv,
     info_of,
 )
-from nextview.data.predictions import Predictions
+from nextview_lab.data.predictions import Predictions
 from research.extras import extras
 
 with extras():

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView
 from research.mesh_view import MeshView
 
 GRAZING = 0.05

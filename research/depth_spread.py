@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView
 from research.area import bits
 
 BIN = 0.01

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
@@ -20,17 +20,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from nextview.benchmark.classes import chosen_split
-from nextview.benchmark.evaluation import judged_objects
-from nextview.benchmark.page import words
-from nextview.benchmark.true_maps import known_maps, true_map
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
-from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
 from nextview.session import style
 from nextview.session.style import ACCENT, INK
+from nextview_lab.benchmark.classes import chosen_split
+from nextview_lab.benchmark.evaluation import judged_objects
+from nextview_lab.benchmark.page import words
+from nextview_lab.benchmark.true_maps import known_maps, true_map
+from nextview_lab.data.predictions import Predictions
 
 EXAMPLES = 5
 ROWS = 12
@@ -149,7 +149,7 @@ def draw(
     right.
 
     Args:
-        predictions: made by nextview predict.
+        predictions: made by nextview-lab predict.
         name: of the map, as lem.
         out: the PNG file.
         split: take only the objects of this one; needed where the predictions hold several.

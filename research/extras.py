@@ -4,13 +4,14 @@ from contextlib import AbstractContextManager
 
 from nextview import checks
 from nextview.cli import exit_status
+from nextview_lab.extras import EXTRAS as LAB
 
 EXTRAS = {  # packages by the optional part, as in pyproject.toml, that brings them
     "ap-gym": ("ap_gym", "gymnasium"),
     "arm": ("gymnasium_robotics", "mink", "mujoco"),
     "film": ("imageio_ffmpeg",),
     "ppf": ("cv2",),
-    "rl": (*checks.EXTRAS["envs"], *checks.EXTRAS["train"], "stable_baselines3"),
+    "rl": (*LAB["envs"], *LAB["train"], "stable_baselines3"),
 }
 PROJECT = "./research"
 

@@ -37,7 +37,6 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.benchmark.confusable import distances_between
 from nextview.cli.exit_status import orderly_end
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import rotated
@@ -45,6 +44,7 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.taught import TaughtThings
 from nextview.viewers.card import differing, warm
+from nextview_lab.benchmark.confusable import distances_between
 from research.film_stage import (
     Array,
     Colour,

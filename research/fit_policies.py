@@ -17,16 +17,17 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.cli.exit_status import orderly_end
-from nextview.data.predictions import Predictions
-from nextview.data.splits import divide
-from nextview.errors import PredictionsError, UsageError
+from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
 from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
 from nextview.recognition.belief import Calibration, of_true_class
-from nextview.training.card_fits import calibration_of
-from nextview.training.fitting_set import blind_walks, for_fitting
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.splits import divide
+from nextview_lab.errors import PredictionsError
+from nextview_lab.training.card_fits import calibration_of
+from nextview_lab.training.fitting_set import blind_walks, for_fitting
 
 Float = NDArray[np.float64]
 VARIANTS: tuple[tuple[str, Scope], ...] = (
@@ -69,7 +70,7 @@ def fit_policies(
     (NAME-near; no ring).
 
     Args:
-        predictions: of the training split (nextview predict --split train).
+        predictions: of the training split (nextview-lab predict --split train).
         out: folder for NAME.json; run one with --policy OUT/NAME.json.
         validation_share: part of every class that the recogniser was not trained on; 1 for
             out-of-fold predictions.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 
-from nextview.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView
 from research.area import bits
 
 ACCURACY = 0.1

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from nextview.cli.common_options import check_file
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.files import new_file
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import BLUE, PlainFigure
+from nextview_lab.data.store import ViewStore
 
 ORANGE = "#e08a2e"
 MAPS_ACROSS = 6
@@ -225,7 +225,7 @@ def inspect(
     """Draw what a view store holds: classes, counts, failures; or one object from all sides.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         out: picture to make (PNG, PDF or SVG); STORE.png or OBJECT.png here if not given.
         object_name: name of the object to draw instead of the whole store.
         overwrite: replace the picture if it exists.

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import follow, say_done
-from nextview.data import measures
 from nextview.data.folders import list_dataset
-from nextview.data.rendering import deformed
-from nextview.data.splits import some_objects
-from nextview.data.store import DEPTH_UNIT, ViewStore
 from nextview.errors import DatasetError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import MAX_FACES, load_mesh
+from nextview_lab.data import measures
+from nextview_lab.data.rendering import deformed
+from nextview_lab.data.splits import some_objects
+from nextview_lab.data.store import DEPTH_UNIT, ViewStore
 from research.mesh_view import FaceCamera, MeshView
 
 
@@ -37,7 +37,7 @@ def measure(
     overwrite: bool = False,
     max_faces: int = MAX_FACES,
 ) -> Iterator[tuple[int, int]]:
-    """As ``nextview.data.measures.measure``, with views that know which face each pixel shows.
+    """As ``nextview_lab.data.measures.measure``, with views that know which face each pixel shows.
 
     ``meshes`` is the dataset folder, as the store was rendered from it; ``max_faces`` are those of
     a mesh at most.
@@ -114,10 +114,10 @@ def main(
     was.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         meshes: the dataset folder that it was rendered from.
-        measures: names (see nextview list measures), all, or MODULE:FUNCTION.
-        max_faces: of a mesh, as for nextview render.
+        measures: names (see nextview-lab list measures), all, or MODULE:FUNCTION.
+        max_faces: of a mesh, as for nextview-lab render.
         split: only this split.
         held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of
             its training.

@@ -17,7 +17,7 @@ accuracy and travel of the policy that climbs its true map in the local window, 
 of views. That policy sees what no robot can, and so is an oracle by name; what it does not see is
 the class: it goes to the valley for those that it believes in at that moment and for which the
 valley gained on the validation objects. Other policies can stand beside, under the names that
-nextview benchmark has for them. Intervals are 95 % bootstrap intervals over objects; p is by
+nextview-lab benchmark has for them. Intervals are 95 % bootstrap intervals over objects; p is by
 sign flips against random choice in the window, over objects, corrected by Holm's method for all
 measures, policies and numbers of views together.
 """
@@ -29,7 +29,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
@@ -42,24 +42,24 @@ from numpy.typing import NDArray
 from scipy.special import log_softmax
 from scipy.stats import rankdata
 
-from nextview.benchmark.page import write_figures
-from nextview.benchmark.replay import make_specs, replay
-from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
-from nextview.benchmark.true_maps import true_map, true_measure
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, follow, track
-from nextview.data import predicting
-from nextview.data.measures import measure
-from nextview.data.metrics import ratio
-from nextview.data.predictions import Predictions
-from nextview.data.splits import sample
-from nextview.data.store import ViewStore
 from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.recognition.map_names import map_name
 from nextview.recognition.model_card import find_card, find_models
 from nextview.session.style import BLUE, FIGURE_STYLE, INK, PlainFigure, to_png
-from nextview.training.card_fits import valley_gains
+from nextview_lab.benchmark.page import write_figures
+from nextview_lab.benchmark.replay import make_specs, replay
+from nextview_lab.benchmark.statistics import holm, interval, resample, sign_flip_p
+from nextview_lab.benchmark.true_maps import true_map, true_measure
+from nextview_lab.data import predicting
+from nextview_lab.data.measures import measure
+from nextview_lab.data.metrics import ratio
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.splits import sample
+from nextview_lab.data.store import ViewStore
+from nextview_lab.training.card_fits import valley_gains
 from research.measure import measure as measure_meshes
 
 Split = Literal["train", "test"]
@@ -445,7 +445,7 @@ def main(
     """Compare the measures.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         out: folder of the results.
         meshes: the dataset folder that the store was rendered from, for measures that need the
             mesh.
@@ -456,8 +456,8 @@ def main(
         validation: of training objects that the recogniser has not seen; else OUT/validation.npz.
         measures: names, or MODULE:FUNCTION of your own; by default all that the store then holds,
             and the confidence.
-        policies: others in the same table, as nextview benchmark names them.
-        objects: only so many of each split, as nextview measure and research.plan spread them.
+        policies: others in the same table, as nextview-lab benchmark names them.
+        objects: only so many of each split, as nextview-lab measure and research.plan spread them.
         views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.

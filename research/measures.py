@@ -1,12 +1,12 @@
 """The measures of the thesis's chapter 3, and one that it suggests, with what each needs and which
 values are good.
 
-nextview measure views.zarr --measures research.measures:view_area
+nextview-lab measure views.zarr --measures research.measures:view_area
 """
 
 from __future__ import annotations
 
-from nextview.data.measures import Measure
+from nextview_lab.data.measures import Measure
 from research import area, curvature, depth_spread, saliency, semantic, silhouette
 from research import gradient_entropy as gradient
 

@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.measures import MeasuredView
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import checked_pose, pinhole
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.data.measures import MeasuredView
 
 APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
 # what stands no farther before a face is not told from it, object radii: two steps of a store's

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, track
-from nextview.data.measures import normalise_per_object
 from nextview.data.pool import WorkerDied, each
-from nextview.data.store import ViewStore, opened
 from nextview.errors import DatasetError
 from nextview.files import check_new, new_file
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import PlainFigure
+from nextview_lab.data.measures import normalise_per_object
+from nextview_lab.data.store import ViewStore, opened
 
 TOLERANCE = 0.003
 """How far behind the visible surface a point may lie and still count as seen, object radii. Against
@@ -156,7 +156,7 @@ def overlap(
     [0, 1] first, and OUT.png the picture.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         out: name of the two files, without a suffix.
         label: average over this class only.
         workers: processes; one for each core by default.

@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import follow, say_done
-from nextview.data.measures import Made, keep
-from nextview.data.scene_views import SceneSight, scene_views, sight_of
-from nextview.data.splits import some_objects
-from nextview.data.store import PLANNED, ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.observation import Observation
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import FixedLength
 from nextview.session.episode import run_episodes
+from nextview_lab.data.measures import Made, keep
+from nextview_lab.data.scene_views import SceneSight, scene_views, sight_of
+from nextview_lab.data.splits import some_objects
+from nextview_lab.data.store import PLANNED, ViewStore
 
 
 def plan(
@@ -136,7 +136,7 @@ def main(
     Resumes where it was.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         names: of the policies, MODULE:CLASS or an installed one.
         split: only this split.
         held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView
 from research.mesh_view import MeshView
 
 LIKED = 22.5

@@ -12,7 +12,7 @@ from contourpy import LineType, contour_generator
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
-from nextview.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView
 from research.area import bits
 
 ARM = 1 / 24

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.environments import TaskVectorEnv
 from nextview.errors import ModelError
+from nextview_lab.benchmark.environments import TaskVectorEnv
 from research.extras import extras
 
 with extras():

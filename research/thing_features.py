@@ -20,7 +20,7 @@ from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("train")
 
@@ -49,9 +49,9 @@ from nextview.recognition.network_input import from_observations
 from nextview.runtime import OnnxFile, open_onnx
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.training.architectures import LiteNet
-from nextview.training.export import export_onnx
-from nextview.training.runs import start_from
+from nextview_lab.training.architectures import LiteNet
+from nextview_lab.training.export import export_onnx
+from nextview_lab.training.runs import start_from
 
 VIEWS = 16
 SETUP = 8

@@ -5,9 +5,9 @@ ONNX beside it.
     python -m research.train_agent mvselect validation.npz agents/mvselect.json
 
 The card is one of a gain policy: the network takes and gives what that of ``Gain`` does, so it is
-read and run in the same way (``nextview benchmark classes test.npz --policies agents/ppo.json``).
-But its scores are the action values of Q-learning, or the logits of a policy gradient's actor, and
-the highest free view wins.
+read and run in the same way (``nextview-lab benchmark classes test.npz --policies
+agents/ppo.json``). But its scores are the action values of Q-learning, or the logits of a policy
+gradient's actor, and the highest free view wins.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from nextview.benchmark.environments import Rules, TaskVectorEnv, replayed
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, track
-from nextview.data.predictions import Predictions
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
 from nextview.policies.gain import Gain, features
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
-from nextview.training.fitting_set import for_fitting, hold_out
-from nextview.training.gain_training import Perceptrons, Score, write_gain
-from nextview.training.rollout import ReplayTable, Value, judge, rollout
+from nextview_lab.benchmark.environments import Rules, TaskVectorEnv, replayed
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.training.fitting_set import for_fitting, hold_out
+from nextview_lab.training.gain_training import Perceptrons, Score, write_gain
+from nextview_lab.training.rollout import ReplayTable, Value, judge, rollout
 from research.stable_baselines import MVSELECT, AgentRecipe, Layers, learn, learner
 
 
@@ -216,7 +216,7 @@ def main(
 
     Args:
         predictions: of objects of the training split: those that validated the recogniser, or
-            out-of-fold predictions (nextview predict --held-out).
+            out-of-fold predictions (nextview-lab predict --held-out).
         out: card of the policy (.json), the network beside it (.onnx).
         recipe: how to train.
     """

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("train")
 require("benchmark")
@@ -25,11 +25,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import nn
 
-from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track as progress
 from nextview.data.progress import TrackProgress, silently
-from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
 from nextview.session.style import (
@@ -40,11 +38,13 @@ from nextview.session.style import (
     percent_axis,
     to_png,
 )
-from nextview.training.export import run_network
-from nextview.training.inputs import PackedViews, load_inputs
-from nextview.training.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
-from nextview.training.recogniser_training import train_recogniser
-from nextview.training.runs import is_first
+from nextview_lab.benchmark.published import published_recognisers, read_rows
+from nextview_lab.data.store import ViewStore
+from nextview_lab.training.export import run_network
+from nextview_lab.training.inputs import PackedViews, load_inputs
+from nextview_lab.training.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
+from nextview_lab.training.recogniser_training import train_recogniser
+from nextview_lab.training.runs import is_first
 from research.training_curves import draw_curves
 
 TABLE = "grid.csv"
@@ -305,7 +305,7 @@ def main(
     chosen on validation. The test split is used once they all are trained.
 
     Args:
-        store: view store made by nextview render.
+        store: view store made by nextview-lab render.
         out: folder for the runs, grid.csv and grid.png.
         depths: train only networks of so many layers.
         batches: train only networks with these batch sizes.

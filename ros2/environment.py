@@ -98,7 +98,7 @@ def install(environment: Path) -> None:
     venv.create(environment, with_pip=True)
     pip_install(environment, *RUN, *BUILD, *COMMANDS)
     pinned = ("-c", ROOT / "constraints.txt")
-    pip_install(environment, *pinned, *TESTS, "-e", ROOT)
+    pip_install(environment, *pinned, *TESTS, "-e", ROOT, "-e", ROOT / "lab")
 
 
 def mend_paths(environment: Path) -> None:

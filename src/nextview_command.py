@@ -5,13 +5,23 @@ Outside the package, so that Ctrl-C ends it quietly while the package is importe
 
 import os
 import signal
+from importlib import import_module
 from types import FrameType
 
 
 def main() -> None:
     """Run the command."""
+    start("nextview.cli.main")
+
+
+def start(module: str) -> None:
+    """Import the module of a command, and run its ``main``.
+
+    Args:
+        module: its dotted name.
+    """
     before = signal.signal(signal.SIGINT, _stop)
-    from nextview.cli.main import main as run
+    run = import_module(module).main
 
     signal.signal(signal.SIGINT, before)
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:

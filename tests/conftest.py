@@ -26,8 +26,6 @@ from small_tables import meshes_of
 
 import nextview
 from nextview import runtime
-from nextview.benchmark import table_runs
-from nextview.data import room_drawing
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
@@ -36,6 +34,8 @@ from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
 from nextview.things import view_templates
 from nextview.things.memory import open_memory
+from nextview_lab.benchmark import table_runs
+from nextview_lab.data import room_drawing
 
 LONG = (
     "test_workflow.py",
@@ -296,7 +296,7 @@ def furniture(shared) -> Path:
 @pytest.fixture(scope="session")
 def views(shared, furniture) -> Path:
     """A store of ``furniture``: 18 objects, 40 views, 32 pixels, with depth-entropy."""
-    from nextview.data.rendering import render
+    from nextview_lab.data.rendering import render
 
     def make(folder: Path) -> None:
         list(render(furniture, folder / "views.zarr", pipeline.SPHERE, 32, workers=0))
@@ -336,8 +336,8 @@ def tiny(models):
 @pytest.fixture(scope="session")
 def predictions(shared, views, models) -> Path:
     """The predictions of ``models`` for all of ``views``, train and test."""
-    from nextview.data.predicting import predict
     from nextview.recognition.model_card import read_card
+    from nextview_lab.data.predicting import predict
 
     def make(folder: Path) -> None:
         recogniser, lem = (
@@ -386,7 +386,7 @@ def cluttered(shared, furniture) -> Path:
     """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each
     level.
     """
-    from nextview.data.scene_drawing import draw_scenes
+    from nextview_lab.data.scene_drawing import draw_scenes
 
     def make(folder: Path) -> None:
         list(draw_scenes(furniture, folder / "scenes", scenes=1, seed=3, workers=0))
@@ -397,7 +397,7 @@ def cluttered(shared, furniture) -> Path:
 @pytest.fixture(scope="session")
 def cluttered_views(shared, cluttered, furniture) -> Path:
     """A store of ``cluttered``: 40 views, 48 pixels."""
-    from nextview.data.rendering import RenderOptions, render
+    from nextview_lab.data.rendering import RenderOptions, render
 
     options = RenderOptions(meshes=furniture)
 

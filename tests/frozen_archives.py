@@ -10,14 +10,14 @@ import trimesh
 from PIL import Image
 from small_tables import camera_over, meshes_of, view
 
-from nextview.benchmark.frozen import (
+from nextview.files import write_record
+from nextview_lab.benchmark.frozen import (
     EpisodeTruth,
     FrozenEpisode,
     FrozenThing,
     as_matrix,
     seal,
 )
-from nextview.files import write_record
 
 SHOWN = ("mug", "cracker_box")
 OTHER = "banana"  # may be shown, but is not

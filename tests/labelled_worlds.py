@@ -13,8 +13,8 @@ from nextview.geometry.ray_caster import RayCaster
 from nextview.segmentation.instances import Segmentation
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable
-from nextview.simulation.worlds import BACKGROUND, SURFACE, slab
+from nextview_lab.worlds.tables import SimulatedTable
+from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, slab
 
 FLOOR = (slab((8, 8, 0.05), (0, 0), 0.0), SURFACE)
 

@@ -8,15 +8,20 @@ fetched.
 import sysconfig
 import tomllib
 import venv
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-OWN = ("nextview", "nextview-research")  # what is installed from this repository
-COMMAND = "import sys; from nextview_command import main; sys.exit(main())"
+# what is installed from this repository: the folder of each project, and that of its modules
+PROJECTS = {
+    "nextview": (".", "src"),
+    "nextview-lab": ("lab", "lab/src"),
+    "nextview-research": ("research", "."),
+}
+COMMANDS = {"nextview": "nextview_command", "nextview-lab": "nextview_lab_command"}
 
 # by the name, in lower case, and the extra of it that is asked for
 Found = dict[tuple[str, str], Distribution]
@@ -47,7 +52,7 @@ def asked_for(
     found = {} if found is None else found
     for text, extra in requirements:
         needed = Requirement(text)
-        if needed.name in OWN or (
+        if needed.name in PROJECTS or (
             needed.marker and not needed.marker.evaluate({"extra": extra})
         ):
             continue
@@ -83,55 +88,69 @@ def link(installed: Distribution, packages: Path) -> None:
 
 def installation(
     folder: Path,
-    extras: Iterable[str] = (),
-    research: Iterable[str] | None = None,
+    projects: Mapping[str, Iterable[str]] = {"nextview": ()},
 ) -> Path:
-    """Make an environment in which this clone is installed, with its command; returns its Python.
+    """Make an environment in which this clone is installed, with its commands; returns its Python.
 
     Args:
         folder: to be made.
-        extras: of nextview.
-        research: extras of the package research; None if that is not installed.
+        projects: extras by the name of the project, as in PROJECTS. What a project asks for of
+            the others is installed, too.
 
     Raises:
         PackageNotFoundError: something that is asked for is not installed in the environment of the
             tests.
     """
     python, packages = empty_environment(folder)
-    paths = [ROOT / "src"]
-    requirements = _requirements(ROOT / "pyproject.toml", extras)
-    if research is not None:
-        paths.append(ROOT)  # of which research is a package
-        requirements += _requirements(ROOT / "research/pyproject.toml", research)
-
-    for installed in asked_for(requirements).values():
+    requirements = requirements_of(projects)
+    others = [(text, "") for texts in requirements.values() for text in texts]
+    for installed in asked_for(others).values():
         link(installed, packages)
-    for name in OWN[: len(paths)]:
+
+    for name in requirements:
         about = f"{name.replace('-', '_')}-{distribution(name).version}.dist-info"
         (packages / about).symlink_to(distribution(name).locate_file(about))
+        if name in COMMANDS:
+            command = python.parent / name
+            run = f"import sys; from {COMMANDS[name]} import main; sys.exit(main())"
+            command.write_text(f"#!{python}\n{run}\n", encoding="utf-8")
+            command.chmod(0o755)
     (packages / "this_clone.pth").write_text(
-        "".join(f"{path}\n" for path in paths),
+        "".join(f"{ROOT / PROJECTS[name][1]}\n" for name in requirements),
         encoding="utf-8",
     )
-
-    command = python.parent / "nextview"
-    command.write_text(f"#!{python}\n{COMMAND}\n", encoding="utf-8")
-    command.chmod(0o755)
     return python
 
 
-def _requirements(project: Path, extras: Iterable[str]) -> list[tuple[str, str]]:
-    """What a project asks for, and for some of its extras, those of nextview itself included."""
-    table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
-    asked = [Requirement(text) for text in table["dependencies"]]
-    for extra in extras:
-        asked += map(Requirement, table["optional-dependencies"][extra])
-    own = {
-        extra
-        for needed in asked
-        if needed.name == "nextview"
-        for extra in needed.extras
-    }
-    return [(str(needed), "") for needed in asked] + (
-        _requirements(ROOT / "pyproject.toml", own) if own else []
-    )
+def requirements_of(projects: Mapping[str, Iterable[str]]) -> dict[str, set[str]]:
+    """What projects of this repository and their extras ask for, those that they need included.
+
+    Args:
+        projects: extras by the name of the project.
+
+    Returns:
+        Requirements of other distributions, by the name of the project that asks for them.
+    """
+    found: dict[str, set[str]] = {}
+    waiting = [
+        (name, extra) for name, extras in projects.items() for extra in ("", *extras)
+    ]
+    done = set()
+    while waiting:
+        name, extra = waiting.pop()
+        if (name, extra) in done:
+            continue
+        done.add((name, extra))
+        file = ROOT / PROJECTS[name][0] / "pyproject.toml"
+        table = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        texts = (
+            table["optional-dependencies"][extra] if extra else table["dependencies"]
+        )
+        found.setdefault(name, set())
+        for text in texts:
+            needed = Requirement(text)
+            if needed.name in PROJECTS:
+                waiting += [(needed.name, each) for each in ("", *needed.extras)]
+            else:
+                found[name].add(text)
+    return found

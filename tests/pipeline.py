@@ -19,20 +19,20 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from onnx import TensorProto, helper, numpy_helper
+from programs import main
 from scipy.spatial.transform import Rotation
 
-from nextview.cli.main import main
 from nextview.data.folders import Entry
-from nextview.data.measures import MeasuredView
-from nextview.data.predictions import Predictions
 from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
-from nextview.data.store import DONE, ViewStore, describe
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import BINS_OUTPUT
 from nextview.recognition.map_names import measure_of
+from nextview_lab.data.measures import MeasuredView
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.store import DONE, ViewStore, describe
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["ball", "box", "pillar"]
@@ -304,10 +304,7 @@ def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
 
 
 def benchmark(predictions: Path, out: Path, **settings):
-    from nextview.benchmark.classes import (  # takes pandas
-        ClassSettings,
-        benchmark_classes,
-    )
+    from nextview_lab.benchmark.classes import ClassSettings, benchmark_classes
 
     return benchmark_classes(predictions, out, ClassSettings(**settings))
 

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.resting import resting_poses
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import (
+from nextview.things.memory import taught_meshes
+from nextview_lab.worlds.tables import (
     PlacedThing,
     SimulatedTable,
     TableCamera,
     poses_around,
 )
-from nextview.things.memory import taught_meshes
 
 CENTRE = np.array([0, 0, 0.03])
 

@@ -10,19 +10,19 @@ import numpy as np
 import pandas as pd
 import pytest
 from pipeline import benchmark, refused
+from programs import main
 
 from benchmarks.reproduction import page
-from nextview.benchmark import leaderboard
-from nextview.benchmark.classes import load
-from nextview.benchmark.leaderboard import promised_risks
-from nextview.benchmark.published import ACCURACY, published, read_table
-from nextview.benchmark.replay import make_specs, replay, truncate
-from nextview.benchmark.report import report
-from nextview.cli.main import main
-from nextview.data.metrics import calibration_error
-from nextview.data.predictions import Predictions
 from nextview.recognition.belief import Calibration, RiskBounds, Stopping
 from nextview.recognition.own_stopping import own_stopping
+from nextview_lab.benchmark import leaderboard
+from nextview_lab.benchmark.classes import load
+from nextview_lab.benchmark.leaderboard import promised_risks
+from nextview_lab.benchmark.published import ACCURACY, published, read_table
+from nextview_lab.benchmark.replay import make_specs, replay, truncate
+from nextview_lab.benchmark.report import report
+from nextview_lab.data.metrics import calibration_error
+from nextview_lab.data.predictions import Predictions
 
 TEN = tuple(read_table(ACCURACY[10]))
 

@@ -16,21 +16,21 @@ from bop_datasets import (
 )
 from PIL import Image
 from pipeline import refused
+from programs import main
 from scipy.spatial.transform import Rotation
 from small_tables import meshes_of
 
-from nextview.benchmark.bop import BopOptions, look_for_models
-from nextview.benchmark.pose_recall import (
+from nextview.captured.folders import is_capture, read_capture
+from nextview.errors import NextviewError
+from nextview_lab.benchmark.bop import BopOptions, look_for_models
+from nextview_lab.benchmark.bop_dataset import BopModelInfo, ContinuousSymmetry
+from nextview_lab.benchmark.pose_recall import (
     hits_of,
     matched,
     mspd,
     mssd,
     symmetries_of,
 )
-from nextview.captured.bop_dataset import BopModelInfo, ContinuousSymmetry
-from nextview.captured.folders import is_capture, read_capture
-from nextview.cli.main import main
-from nextview.errors import NextviewError
 
 HOW = BopOptions(models="ycb", ids=IDS)
 
@@ -399,7 +399,7 @@ MISTAKES = {
     "an unknown model": (None, ("--ids", "mug=99"), "has no model 99; it has 2, 14"),
     "an unknown thing": (None, ("--ids", "mag=14"), "knows nothing called mag"),
     "no number": (None, ("--ids", "mug"), "NAME=NUMBER"),
-    "other things": (None, ("--ids",), "none of its things"),
+    "no thing": (None, ("--ids",), "--ids: its value is missing"),
 }
 
 

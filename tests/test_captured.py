@@ -12,21 +12,21 @@ import pytest
 import trimesh
 from PIL import Image
 from pipeline import refused
+from programs import main
 from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.check import check_capture
 from nextview.captured.folders import read_box, read_capture
-from nextview.captured.writing import write_capture
-from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
+from nextview_lab.data.writing import write_capture
+from nextview_lab.worlds.scene import square
 
 TWELVE = ViewSphere.named("12")
 RADIUS = 0.55

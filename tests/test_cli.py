@@ -21,24 +21,25 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 from pipeline import run_python, some_predictions
+from programs import COMMANDS, PROGRAMS, called, main
 
 from nextview import errors
 from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
 from nextview.cli.call_with_arguments import call, entry, find
-from nextview.cli.commands import COMMANDS
-from nextview.cli.main import main
+from nextview.cli.commands import NEXTVIEW
 from nextview.cli.option_names import option_names
 from nextview.cli.option_values import value_word
-from nextview.cli.predict import summed_up
-from nextview.cli.words import EXAMPLES, OTHER_WORDS
 from nextview.data import pool
-from nextview.data.store import ViewStore
 from nextview.errors import MissingExtraError, NextviewError, shell_words
 from nextview.files import check_new
+from nextview_lab.cli.predict import summed_up
+from nextview_lab.data.store import ViewStore
+from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 
 ROOT = Path(__file__).parents[1]
 COMMAND = [sys.executable, "-m", "nextview"]
+LAB_COMMAND = [sys.executable, "-m", "nextview_lab"]
 
 
 def ended(capsys, *arguments):
@@ -52,11 +53,12 @@ def ended(capsys, *arguments):
 def test_every_command_explains_itself(name, capsys):
     pytest.importorskip("torch")
     with pytest.raises(SystemExit) as end:
-        main([*name.split(), "--help"])
+        called(f"{name} --help")
     assert end.value.code == 0
     shown = capsys.readouterr().out
-    assert shown.startswith(f"usage: nextview {name} ")
-    assert "(required)" in shown or name in ("demo", "demo-episode", "explore")
+    assert shown.startswith(f"usage: {name} ")
+    without = ("nextview demo", "nextview demo-episode", "nextview explore")
+    assert "(required)" in shown or name in without
     rows = [row.replace("│", " ").rstrip() for row in shown.splitlines()]
     for row, following in pairwise(rows):  # each option has a help, beside it or below
         beside = re.search(r"\S {2,}(\S)", row) or re.match(r" +(\S)", following)
@@ -66,7 +68,12 @@ def test_every_command_explains_itself(name, capsys):
     assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
     explained = {row.split()[0] for row in rows if re.match(r"  --[a-z]", row)}
     assert explained == option_names(entry(COMMANDS[name])[0])
-    assert shown.splitlines()[-1] == f"example: nextview {EXAMPLES[name]}"
+    assert shown.splitlines()[-1] == f"example: {example_of(name)}"
+
+
+def example_of(name):
+    """The command line in the help of a command, with its program."""
+    return f"{name.partition(' ')[0]} {COMMANDS[name].example}"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -81,21 +88,30 @@ def test_the_example_of_a_help_is_a_command_line(name, monkeypatch):
         called.append((arguments, options))
 
     monkeypatch.setattr(f"{module}.{function}", run)
-    words = EXAMPLES[name].split()
+    words = example_of(name).split()
     assert " ".join(words[: len(name.split())]) == name
     call(name, command, words[len(name.split()) :], None)
     assert len(called) == 1
 
 
-@pytest.mark.parametrize("name", ["completion", "list", "capture", "demo-episode"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nextview completion",
+        "nextview list",
+        "nextview demo-episode",
+        "nextview-lab list",
+        "nextview-lab capture",
+    ],
+)
 def test_the_example_of_a_quick_command_runs(name, monkeypatch, tmp_path):
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     monkeypatch.chdir(tmp_path)
     with suppress(SystemExit):
-        main(EXAMPLES[name].split())
+        called(example_of(name))
     assert {path.name for path in tmp_path.iterdir()} - {"samples"} == {
-        "capture": {"captured"},
-        "demo-episode": {"chair.png"},
+        "nextview-lab capture": {"captured"},
+        "nextview demo-episode": {"chair.png"},
     }.get(name, set())
 
 
@@ -129,8 +145,12 @@ def test_the_placeholder_of_a_value(kind, word):
             "check a --intrinsics",
             "--intrinsics: its value is missing: FX FY CX CY|PATH",
         ),
+        ("predict no-store a.npz --maps", "no-store: there is no view store"),
         ("learn a b --turntable left", "Expected one of ('ccw', 'cw')."),
-        ("check a --worker 2", "no option --worker; did you mean '--workers'?"),
+        (
+            "check a --intrinsic 2",
+            "no option --intrinsic; did you mean '--intrinsics'?",
+        ),
         (
             "learn --tabletop=no a b",
             "no option --tabletop; did you mean '--turntable'?",
@@ -152,14 +172,16 @@ def test_help_is_a_word_too(words, capsys):
     assert capsys.readouterr().out.startswith("usage: nextview look ")
 
 
-def test_the_list_of_commands_imports_no_command():
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+def test_the_list_of_commands_imports_no_command(program):
+    module = program.name.replace("-", "_")
     code = (
-        "import sys; from nextview.cli.main import main; main(['--help'])\nslow = {'torch',"
+        f"import sys; from {module}.cli.main import main; main(['--help'])\nslow = {{'torch',"
         " 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
     )
     listed = run_python(code)
     assert listed.returncode == 0, listed.stderr
-    for name, command in COMMANDS.items():
+    for name, command in program.commands.items():
         assert f"  {name} " in listed.stdout
         assert command.line in listed.stdout
     assert max(map(len, listed.stdout.splitlines())) <= 80
@@ -167,8 +189,19 @@ def test_the_list_of_commands_imports_no_command():
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_suggested_next_commands_exist(name):
-    named = re.findall(r"nextview (\w+(?: \w+)?)", COMMANDS[name].then)
-    assert all(words in COMMANDS or words.split()[0] in COMMANDS for words in named)
+    named = re.findall(r"nextview(?:-lab)? \w+(?: \w+)?", COMMANDS[name].then)
+    known = {*COMMANDS, *(" ".join(each.split()[:2]) for each in COMMANDS)}
+    assert all(words in known or words.rpartition(" ")[0] in known for words in named)
+
+
+@pytest.mark.parametrize("word", NEXTVIEW.elsewhere[0])
+def test_a_command_of_the_laboratory_says_where_it_is(word, capsys):
+    with pytest.raises(SystemExit) as end:
+        called(f"nextview {word} x")
+    assert end.value.code == 2
+    said = f"nextview {word} is now nextview-lab {word}: pip install ./lab"
+    assert said in capsys.readouterr().err
+    assert any(name.startswith(f"nextview-lab {word}") for name in COMMANDS)
 
 
 def kinds(hint):
@@ -213,17 +246,20 @@ def test_an_option_has_the_same_type_in_every_command():
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
-        ("recognize", "recognise"),
-        ("train recognizer", "train recogniser"),
-        ("benchmark thing", "benchmark things"),
-        ("exprot map", "export"),
+        ("nextview recognize", "recognise"),
+        ("nextview-lab train recognizer", "train recogniser"),
+        ("nextview-lab benchmark thing", "benchmark things"),
+        ("nextview-lab exprot map", "export"),
     ],
 )
 def test_a_misspelt_command_is_guessed(words, meant, capsys):
-    assert ended(capsys, *words.split()) == (
-        2,
-        f"nextview: there is no command {words.replace(' map', '')!r}; did you mean"
-        f" {meant!r}?\n",
+    with pytest.raises(SystemExit) as end:
+        called(words)
+    program, _, command = words.partition(" ")
+    assert end.value.code == 2
+    assert capsys.readouterr().err == (
+        f"{program}: there is no command {command.replace(' map', '')!r}; did you mean"
+        f" {meant!r}?\n"
     )
 
 
@@ -235,7 +271,6 @@ def test_a_misspelt_command_is_guessed(words, meant, capsys):
         ("serach", ["look"]),
         ("teach", ["learn"]),
         ("train-on", ["learn"]),
-        ("train samples", ["learn"]),
         ("classify", ["recognise"]),
         ("scan", ["look", "learn"]),
         ("visualize", ["explore"]),
@@ -244,15 +279,16 @@ def test_a_misspelt_command_is_guessed(words, meant, capsys):
 )
 def test_what_a_newcomer_calls_a_command_leads_to_it(word, meant, capsys):
     status, said = ended(capsys, *word.split())
-    named = [f"{name!r} ({COMMANDS[name].line})" for name in meant]
+    named = [f"{name!r} ({NEXTVIEW.commands[name].line})" for name in meant]
     assert status == 2
     assert f"did you mean {' or '.join(named)}?\n" in said
 
 
-def test_other_words_are_of_commands_and_no_command_themselves():
-    assert COMMANDS.keys() >= OTHER_WORDS.keys()
-    for words in OTHER_WORDS.values():
-        assert not COMMANDS.keys() & set(words.split())
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+def test_other_words_are_of_commands_and_no_command_themselves(program):
+    assert program.commands.keys() >= program.other_words.keys()
+    for words in program.other_words.values():
+        assert not program.commands.keys() & set(words.split())
 
 
 def test_messages_name_an_option_as_it_is_typed_where_they_are_read(tmp_path, capsys):
@@ -303,9 +339,11 @@ def test_no_message_names_a_python_argument_to_a_shell():
 
 @pytest.mark.parametrize("preset", [None, "thesis"])
 def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
-    stage = pytest.importorskip("nextview.training.recogniser_training")
+    stage = pytest.importorskip("nextview_lab.training.recogniser_training")
     kind, called = stage.RecogniserRecipe, []
-    recipe = find("nextview.training.recipes:THESIS_RECOGNISER") if preset else kind()
+    recipe = (
+        find("nextview_lab.training.recipes:THESIS_RECOGNISER") if preset else kind()
+    )
 
     def train(store: str, out: str, recipe: kind = kind()) -> list[str]:
         called.append(recipe)
@@ -341,7 +379,11 @@ def interrupted(command, ready):
     _, said = running.communicate(timeout=60)
     return (
         running.returncode,
-        [line for line in said.splitlines() if line.startswith("nextview: ")][-1],
+        [
+            line
+            for line in said.splitlines()
+            if line.startswith(("nextview: ", "nextview-lab: "))
+        ][-1],
     )
 
 
@@ -352,8 +394,8 @@ def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, furniture):
     def begun():
         return len(list(store.glob("image/c/*"))) > 1
 
-    again = "nextview: stopped; run the same command again; it resumes"
-    assert interrupted([*COMMAND, *command], begun) == (130, again)
+    again = "nextview-lab: stopped; run the same command again; it resumes"
+    assert interrupted([*LAB_COMMAND, *command], begun) == (130, again)
     main(command)
     assert ViewStore.open(store).done.all()
 
@@ -419,16 +461,20 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 )
 def test_a_missing_extra_is_named_with_its_install_command(package, arguments, extra):
     code = (
-        f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main;"
+        f"import sys; sys.modules[{package!r}] = None; from nextview_lab.cli.main import main;"
         f" main({arguments!r})"
     )
     done = run_python(code)
     assert done.returncode == 2
-    assert f"pip install 'nextview[{extra}]'" in done.stderr
+    assert f"pip install 'nextview-lab[{extra}]'" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-MISSING = [package for packages in EXTRAS.values() for package in packages]
+MISSING = [
+    package
+    for packages in (*EXTRAS.values(), *EXTRAS_OF_LAB.values())
+    for package in packages
+]
 HIDDEN = f"""
 from importlib.machinery import PathFinder
 missing, plain = {MISSING!r}, PathFinder.find_spec
@@ -439,19 +485,19 @@ PathFinder.find_spec = staticmethod(find)
 
 
 NEED_EXTRAS = {
-    "from nextview.viewers.recording import Recorder": "record",
-    "import nextview.benchmark.environments": "envs",
-    "from nextview.benchmark.classes import benchmark_classes": "benchmark",
-    "from nextview.benchmark.report import report": "benchmark",
-    "from nextview.benchmark.evaluation_page import write_evaluation": "benchmark",
-    "from nextview.viewers.page import Page": "explore",
-    "from nextview.training.recogniser_training import train_recogniser": "train",
-    "from nextview.training.export import export_map": "train",
-    "from nextview.training.gain_training import train_gain": "train",
+    "from nextview.viewers.recording import Recorder": "nextview[record]",
+    "import nextview_lab.benchmark.environments": "nextview-lab[envs]",
+    "from nextview_lab.benchmark.classes import benchmark_classes": "nextview-lab[benchmark]",
+    "from nextview_lab.benchmark.report import report": "nextview-lab[benchmark]",
+    "import nextview_lab.benchmark.evaluation_page": "nextview-lab[benchmark]",
+    "from nextview.viewers.page import Page": "nextview[explore]",
+    "from nextview_lab.training.recogniser_training import train_recogniser": "nextview-lab[train]",
+    "from nextview_lab.training.export import export_map": "nextview-lab[train]",
+    "from nextview_lab.training.gain_training import train_gain": "nextview-lab[train]",
     (
         "from nextview.data.pool import each;"
         " list(each(print, [1], None, 'tcp://localhost:1'))"
-    ): "cluster",
+    ): "nextview[cluster]",
 }
 WITHOUT_EXTRAS = f"""
 import json
@@ -477,7 +523,7 @@ def without_extras():
 
 @pytest.mark.parametrize("code", NEED_EXTRAS)
 def test_python_without_an_extra_names_it_too(code, without_extras):
-    assert f"pip install 'nextview[{NEED_EXTRAS[code]}]'" in without_extras[code]
+    assert f"pip install '{NEED_EXTRAS[code]}'" in without_extras[code]
     assert "\n" not in without_extras[code]
 
 
@@ -497,7 +543,7 @@ HELPS = [
 ]
 ALL_HELPS = f"""
 from contextlib import suppress
-from nextview.cli.main import main
+from nextview_lab.cli.main import main
 for name in {HELPS!r}:
     with suppress(SystemExit):
         main([*name.split(), "--help"])
@@ -516,32 +562,33 @@ def test_help_needs_no_extra(name, helps):
     """The packages are hidden from the search of installed ones."""
     done = run_python(
         HIDDEN
-        + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
+        + f"from nextview_lab.cli.main import main; main({[*name.split(), '--help']!r})"
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"usage: nextview {name} ")
-    assert "pip install 'nextview[" in done.stderr
+    assert done.stdout.startswith(f"usage: nextview-lab {name} ")
+    assert "pip install 'nextview-lab[" in done.stderr
     assert done.stdout == helps[name]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_completes_the_whole_command(shell, capsys):
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+def test_a_shell_completes_the_whole_command(program, shell, capsys):
     pytest.importorskip("torch")
     with pytest.raises(SystemExit) as end:
-        main(["completion", shell])
+        called(f"{program.name} completion {shell}")
     assert end.value.code in (0, None)
     script = capsys.readouterr().out
-    assert all(word in script for name in COMMANDS for word in name.split())
-    assert "--held-out" in script
+    assert all(word in script for name in program.commands for word in name.split())
+    assert "--models" in script
 
 
 @pytest.fixture(scope="module")
 def completions_for_bash(tmp_path_factory):
     pytest.importorskip("torch")
-    path = tmp_path_factory.mktemp("bash") / "nextview.sh"
+    path = tmp_path_factory.mktemp("bash") / "nextview-lab.sh"
     said = io.StringIO()
     with redirect_stdout(said), suppress(SystemExit):
-        main(["completion", "bash"])
+        called("nextview-lab completion bash")
     path.write_text(said.getvalue())
     return path
 
@@ -550,16 +597,16 @@ def completions_for_bash(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        ("re", {"recognise", "render", "report"}),
+        ("re", {"render", "report"}),
         ("fit s", {"size"}),
         ("train recogniser --lay", {"--layers"}),
     ],
 )
 def test_bash_completes_commands_and_options(words, offered, completions_for_bash):
     ask = (
-        f"source {completions_for_bash}; f=$(complete -p nextview | sed 's/.*-F \\([^"
-        f" ]*\\).*/\\1/'); COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1));"
-        " $f; echo ${COMPREPLY[@]}"
+        f"source {completions_for_bash}; f=$(complete -p nextview-lab | sed 's/.*-F \\([^"
+        f" ]*\\).*/\\1/'); COMP_WORDS=(nextview-lab {words});"
+        " COMP_CWORD=$((${#COMP_WORDS[@]}-1)); $f; echo ${COMPREPLY[@]}"
     )
     done = subprocess.run(
         ["bash", "-c", ask],

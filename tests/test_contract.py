@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import main
 
 import nextview
-from nextview.cli.main import main
-from nextview.data.predictions import Predictions
 from nextview.sensing import Frame, ObservedObject
+from nextview_lab.data.predictions import Predictions
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -41,7 +41,6 @@ NAMES = {
     "ObservationError",
     "Policy",
     "PolicyError",
-    "PredictionsError",
     "Recognition",
     "ResultsError",
     "Session",
@@ -171,9 +170,9 @@ def _constrained():
 
 def _cluttered():
     """A chair with a wall and a block before it, seen through a sensor."""
-    from nextview.simulation.robot_camera import RobotCamera
-    from nextview.simulation.scene import build_scene
-    from nextview.simulation.scene_layout import Block, Placement, SceneLayout
+    from nextview_lab.worlds.robot_camera import RobotCamera
+    from nextview_lab.worlds.scene import build_scene
+    from nextview_lab.worlds.scene_layout import Block, Placement, SceneLayout
 
     sha = {
         name: hashlib.sha256((SAMPLES / name).read_bytes()).hexdigest()

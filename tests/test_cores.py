@@ -5,11 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from programs import COMMANDS, called, main
 from small_tables import camera_over, meshes_of, view
 
 import nextview
-from nextview.cli.commands import COMMANDS
-from nextview.cli.main import main
 from nextview.cores import CORES, cores, limit_blas
 from nextview.data import pool
 from nextview.data.samples import sample_mesh
@@ -42,13 +41,21 @@ def test_what_is_no_number_of_cores_is_refused(monkeypatch, capsys, wrong):
     assert "NEXTVIEW_CORES" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["look", "learn", "explore", "benchmark things"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "nextview look",
+        "nextview learn",
+        "nextview explore",
+        "nextview-lab benchmark things",
+    ],
+)
 def test_the_help_of_what_computes_names_the_setting(capsys, command):
     with pytest.raises(SystemExit):
-        main([*command.split(), "--help"])
+        called(f"{command} --help")
     assert CORES in capsys.readouterr().out
     assert COMMANDS[command].computes
-    assert not COMMANDS["completion"].computes
+    assert not COMMANDS["nextview completion"].computes
 
 
 def test_matrix_products_of_a_command_are_limited(monkeypatch):

@@ -26,8 +26,8 @@ from nextview.session.result_json import episode_as_json
 from nextview.session.view import View
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
 from nextview.things.doubt import unknown_turn
+from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 NAMES = ("chair", "table")
 

@@ -12,8 +12,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from nextview.data.downloading import Archive, download
 from nextview.errors import DatasetError
+from nextview_lab.data.downloading import Archive, download
 
 MESH = b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NOISE = np.random.default_rng(0).bytes(600_000)

@@ -15,13 +15,13 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env
 
-import nextview.benchmark.environments  # noqa: F401
-from nextview.data.predictions import Predictions
+import nextview_lab.benchmark.environments  # noqa: F401
 from nextview.errors import DatasetError
 from nextview.policies.baselines import Spread
 from nextview.policies.learned_tables import cells_to
 from nextview.recognition.belief import Calibration, Stopping
 from nextview.session.episode import run_episodes
+from nextview_lab.data.predictions import Predictions
 
 RECOGNISE = "nextview/Recognise-v0"
 INPUTS = ("belief", "view", "place", "lem", "azimuth_bin")

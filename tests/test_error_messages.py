@@ -22,7 +22,7 @@ def texts() -> str:
     What an f-string puts in is left out, except for options, which are named as in a shell.
     """
     found = []
-    for top in ("src/nextview", "ros2/nextview_ros/nextview_ros"):
+    for top in ("src/nextview", "lab/src", "ros2/nextview_ros/nextview_ros"):
         for path in sorted((ROOT / top).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.JoinedStr):

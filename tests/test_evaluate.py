@@ -11,14 +11,14 @@ from pipeline import some_predictions
 from scipy.special import softmax
 from scipy.stats import bootstrap
 
-from nextview.benchmark.evaluation import evaluate, fused_views
-from nextview.benchmark.published import (
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.recognition.belief import Calibration
+from nextview_lab.benchmark.evaluation import evaluate, fused_views
+from nextview_lab.benchmark.published import (
     published_map,
     published_recognisers,
     read_table,
 )
-from nextview.geometry.viewsphere import ViewSphere
-from nextview.recognition.belief import Calibration
 
 TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
 

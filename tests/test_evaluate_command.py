@@ -1,4 +1,4 @@
-"""``nextview evaluate`` from a file of predictions to a folder, and what it refuses."""
+"""``nextview-lab evaluate`` from a file of predictions to a folder, and what it refuses."""
 
 import csv
 import json
@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 from pipeline import refused, some_predictions
+from programs import main
 
-from nextview.benchmark import evaluation_page
-from nextview.cli.main import main
-from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
 from nextview.recognition.model_card import ModelCard, read_card, write_card
 from nextview.recognition.network_input import InputSpec
+from nextview_lab.benchmark import evaluation_page
+from nextview_lab.data.predictions import Predictions
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 

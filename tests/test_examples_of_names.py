@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import nextview
-import nextview.data.measures
-import nextview.data.predictions
 from nextview.data.samples import sample_mesh
 from nextview.teaching.learn import LearnOptions, learn_things
 from nextview.teaching.thing_views import TeachingOptions

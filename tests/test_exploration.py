@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import nextview
-from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, PolicyError, UsageError
 from nextview.geometry.viewsphere import ViewSphere, angle_between
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.viewers.exploration import Exploration, shown_objects
+from nextview_lab.data.rendering import render
+from nextview_lab.data.stored_views import objects_of
 
 SAMPLES, SPHERE = Path(__file__).parents[1] / "samples", ViewSphere.named("40")
 
@@ -125,7 +126,7 @@ def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
     (tmp_path / "meshes" / "chair" / "broken.off").write_text("OFF\n")
     shutil.copy(SAMPLES / "chair.off", tmp_path / "meshes" / "chair" / "seat.off")
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 112, workers=0))
-    (shown,) = shown_objects(tmp_path / "views.zarr")
+    (shown,) = objects_of(tmp_path / "views.zarr")
     assert (shown.name, shown.label) == ("seat", "chair")
     exploration = Exploration([shown], start=3, threads=1)
     assert exploration.mesh is None

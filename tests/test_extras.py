@@ -9,14 +9,21 @@ from importlib.metadata import PackageNotFoundError, packages_distributions
 from pathlib import Path
 
 import pytest
-from linked_environment import ROOT, asked_for, installation
+from linked_environment import (
+    PROJECTS,
+    ROOT,
+    asked_for,
+    installation,
+    requirements_of,
+)
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from nextview.checks import EXTRAS
+from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 from research.extras import EXTRAS as EXTRAS_OF_RESEARCH
 
-SOURCES = sorted((ROOT / "src").rglob("*.py"))
+SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "lab/src").rglob("*.py")])
 SCRIPTS = [
     path
     for folder in ("benchmarks", "examples", "research", "workflow")
@@ -62,47 +69,46 @@ def brought_by() -> dict[str, set[str]]:
     }
 
 
-def faults(code: str) -> list[str]:
-    """What is wrong with the imports of some code, a phrase each."""
-    table = project(".")
+def faults(code: str, folder: str = ".") -> list[str]:
+    """What is wrong with the imports of some code of a project, a phrase each."""
+    table = project(folder)
     base = names(table["dependencies"])
     by_extra = {
         extra: names(asked) for extra, asked in table["optional-dependencies"].items()
     }
+    declared = EXTRAS if folder == "." else EXTRAS_OF_LAB
+    own = ("nextview", "nextview_command")
+    if folder == "lab":
+        own += ("nextview_lab", "nextview_lab_command")
     found = []
     for package, in_extras in sorted(set(imported(ast.parse(code)))):
-        if package in sys.stdlib_module_names or package in (
-            "nextview",
-            "nextview_command",
-        ):
+        if package in sys.stdlib_module_names or package in own:
             continue
         distributions = brought_by().get(package, set())
         if distributions & base:
             continue
-        extras = [extra for extra, packages in EXTRAS.items() if package in packages]
+        extras = [extra for extra, packages in declared.items() if package in packages]
         if not any(distributions & by_extra[extra] for extra in extras):
-            found.append(
-                f"{package}: neither a dependency nor of an extra in checks.EXTRAS"
-            )
+            found.append(f"{package}: neither a dependency nor of an extra in EXTRAS")
         elif not in_extras:
             found.append(f"{package}: imported outside of extras()")
     return found
 
 
-@pytest.mark.parametrize(
-    "path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src"))
-)
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_all_imports_are_declared_dependencies(path):
-    assert faults(path.read_text(encoding="utf-8")) == []
+    folder = "lab" if path.is_relative_to(ROOT / "lab") else "."
+    assert faults(path.read_text(encoding="utf-8"), folder) == []
 
 
 @pytest.mark.parametrize(
     ("code", "wrong"),
     [
         ("import numpy\nfrom scipy.optimize import minimize\nimport os.path", []),
-        ("def f():\n    with extras():\n        import torch", []),
-        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch", []),
-        ("import torch", ["torch: imported outside of extras()"]),
+        ("def f():\n    with extras():\n        import rerun", []),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import rerun", []),
+        ("import rerun", ["rerun: imported outside of extras()"]),
+        ("import nextview_lab", ["nextview_lab: neither"]),
         (
             "class A:\n    def f(self):\n        from faiss import Index",
             ["faiss: imported outside of extras()"],
@@ -123,15 +129,13 @@ def test_a_wrong_import_is_found(code, wrong):
     )
 
 
-@pytest.mark.parametrize("folder", [".", "research"])
+@pytest.mark.parametrize("folder", [".", "lab", "research"])
 def test_an_extra_contains_the_package_that_its_error_names(folder):
-    optional = project(folder)["optional-dependencies"]
-    of_nextview = project(".")["optional-dependencies"]
-    for extra, packages in (EXTRAS if folder == "." else EXTRAS_OF_RESEARCH).items():
-        texts = list(optional[extra])
-        for needed in map(Requirement, optional[extra]):
-            if needed.name == "nextview":
-                texts += [text for own in needed.extras for text in of_nextview[own]]
+    (name,) = [name for name, (place, _) in PROJECTS.items() if place == folder]
+    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB, "research": EXTRAS_OF_RESEARCH}
+    for extra, packages in declared[folder].items():
+        asked = requirements_of({name: [extra]}).values()
+        texts = [text for of_project in asked for text in of_project]
         try:
             brought = {
                 canonicalize_name(name)
@@ -145,8 +149,8 @@ def test_an_extra_contains_the_package_that_its_error_names(folder):
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory) -> Path:
-    """The Python of an installation without any extra."""
-    return installation(tmp_path_factory.mktemp("base") / "venv")
+    """The Python of an installation of package and laboratory without any extra."""
+    return installation(tmp_path_factory.mktemp("base") / "venv", {"nextview-lab": ()})
 
 
 def in_base(base: Path, code: str, *arguments: str) -> str:
@@ -164,15 +168,16 @@ def in_base(base: Path, code: str, *arguments: str) -> str:
 IMPORT_ALL = """
 import pkgutil, sys
 from importlib import import_module
-import nextview
+import nextview, nextview_lab
 
-for module in pkgutil.walk_packages(nextview.__path__, "nextview."):
-    if module.name == "nextview.__main__":
-        continue
-    try:
-        import_module(module.name)
-    except nextview.MissingExtraError as error:
-        print(module.name, error)
+for package in (nextview, nextview_lab):
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if module.name.endswith(".__main__"):
+            continue
+        try:
+            import_module(module.name)
+        except nextview.MissingExtraError as error:
+            print(module.name, error)
 print("torch" in sys.modules)
 """
 
@@ -180,12 +185,16 @@ print("torch" in sys.modules)
 def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
     *missing, torch_is_there = in_base(base, IMPORT_ALL).splitlines()
     assert torch_is_there == "False"
-    assert any(line.startswith("nextview.training.export ") for line in missing)
+    assert any(line.startswith("nextview_lab.training.export ") for line in missing)
     for line in missing:
         named = [
             extra
-            for extra in EXTRAS
-            if line.endswith(f": pip install 'nextview[{extra}]'")
+            for project, declared in (
+                ("nextview", EXTRAS),
+                ("nextview-lab", EXTRAS_OF_LAB),
+            )
+            for extra in declared
+            if line.endswith(f": pip install '{project}[{extra}]'")
         ]
         assert len(named) == 1, line
 
@@ -195,7 +204,7 @@ import os, runpy, sys, tempfile
 
 # Once, before each is run in a process of its own.
 import matplotlib.figure, rich.progress, scipy.optimize, scipy.stats, trimesh, tyro
-import nextview.data.rendering, nextview.data.store
+import nextview_lab.data.rendering, nextview_lab.data.store
 import nextview.session.system, nextview.things.recogniser
 
 options, scripts = sys.argv[1], sys.argv[2:]
@@ -246,20 +255,20 @@ def test_the_help_of_every_script_shows_in_the_base_installation(base):
     for name, (status, said) in ended.items():
         assert status == 0, (name, said)
         assert "usage: " in said, name
-    assert "pip install 'nextview[benchmark]'" in ended["benchmarks/scenes.py"][1]
+    assert "pip install 'nextview-lab[benchmark]'" in ended["benchmarks/scenes.py"][1]
     assert "pip install './research[film]'" in ended["research/film.py"][1]
 
 
 def test_a_script_without_its_extra_prints_installation_advice(base):
     needing = {
-        "benchmarks/scenes.py": "nextview[benchmark]",
-        "research/example_maps.py": "nextview[benchmark]",
+        "benchmarks/scenes.py": "nextview-lab[benchmark]",
+        "research/example_maps.py": "nextview-lab[benchmark]",
         "research/film.py": "./research[film]",
-        "research/measure_study.py": "nextview[benchmark]",
+        "research/measure_study.py": "nextview-lab[benchmark]",
         "research/point_pairs.py": "./research[ppf]",
-        "research/thing_features.py": "nextview[train]",
+        "research/thing_features.py": "nextview-lab[train]",
         "research/train_agent.py": "./research[rl]",
-        "research/train_grid.py": "nextview[train]",
+        "research/train_grid.py": "nextview-lab[train]",
     }
     for name, (status, said) in runs(base, "", list(needing)).items():
         assert status == 2, (name, said)

@@ -12,16 +12,8 @@ from scipy.special import log_softmax, softmax
 from scipy.stats import binomtest
 
 from nextview import SimulatedCamera
-from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
-from nextview.data.splits import divide
-from nextview.errors import (
-    DatasetError,
-    ModelError,
-    PredictionsError,
-    ResultsError,
-    UsageError,
-)
+from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
@@ -31,8 +23,11 @@ from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import values_of
 from nextview.teaching.view_features import embeddings
-from nextview.training import card_fits as calibration
-from nextview.training.card_fits import (
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.splits import divide
+from nextview_lab.errors import PredictionsError
+from nextview_lab.training import card_fits as calibration
+from nextview_lab.training.card_fits import (
     error_bound,
     fit_calibration,
     fit_risk,
@@ -40,8 +35,8 @@ from nextview.training.card_fits import (
     loss,
     valley_gains,
 )
-from nextview.training.fitting_set import blind_walks, card_to_fit
-from nextview.training.unknown import fit_novelty, fit_unknown
+from nextview_lab.training.fitting_set import blind_walks, card_to_fit
+from nextview_lab.training.unknown import fit_novelty, fit_unknown
 from research.fit_policies import (
     fit_class_table,
     fit_policies,
@@ -368,13 +363,13 @@ def test_a_calibration_goes_into_the_card_and_is_used(
 ):
     card, path = training_predictions
     before = json.loads(card.read_text())
-    monkeypatch.setattr("sys.argv", ["/bin/nextview", "fit", "calibration", "a b"])
+    monkeypatch.setattr("sys.argv", ["/bin/nextview-lab", "fit", "calibration", "a b"])
     fitted = fit_calibration(path, card)
     after = json.loads(card.read_text())
     assert {name: after[name] for name in before} == before | {
         "schema": 2
     }  # written anew
-    assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
+    assert after["training"]["commands"] == ["nextview-lab fit calibration 'a b'"]
     assert NetworkRecogniser(card).calibration == fitted.calibration
     assert fitted.after < fitted.before
     assert "45 objects" in after["fitted_to"]["calibration"]

@@ -19,11 +19,11 @@ pytest.importorskip("mujoco")
 from benchmarks import frozen as script
 from benchmarks.poses_alone import attacked, episodes_of, tell_something
 from benchmarks.staged_things import staged
-from nextview.benchmark.frozen import FrozenArchive, SealedTruth, seal
-from nextview.benchmark.standings import leaderboard_of
-from nextview.benchmark.submit import SubmitOptions, submit
 from nextview.errors import DatasetError
 from nextview.files import read_record
+from nextview_lab.benchmark.frozen import FrozenArchive, SealedTruth, seal
+from nextview_lab.benchmark.standings import leaderboard_of
+from nextview_lab.benchmark.submit import SubmitOptions, submit
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"

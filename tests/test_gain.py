@@ -19,10 +19,9 @@ from test_policies import SPHERE, state_of
 
 torch = pytest.importorskip("torch")
 
+from programs import main
+
 import nextview
-from nextview.benchmark.classes import load as load_results
-from nextview.cli.main import main
-from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError
 from nextview.policies.base import Evidence
@@ -33,15 +32,17 @@ from nextview.policies.policy_card import PolicyCard
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration
 from nextview.session.session import Session
-from nextview.training.gain_training import (
+from nextview_lab.benchmark.classes import load as load_results
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.training.gain_training import (
     Perceptrons,
     Score,
     best_epoch,
     train,
     write_gain,
 )
-from nextview.training.recipes import GainRecipe
-from nextview.training.rollout import (
+from nextview_lab.training.recipes import GainRecipe
+from nextview_lab.training.rollout import (
     OBJECTIVES,
     ReplayTable,
     candidate_values,

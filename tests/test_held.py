@@ -14,7 +14,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.sensing import Frame, ObservedObject
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 PLACE = np.array([0.1, 0.0, 0.35])  # of the thing, above a table
 SENSOR = SENSORS["stereo"]

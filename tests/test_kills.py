@@ -157,7 +157,7 @@ import shutil
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.captured.folders import is_capture
-from nextview.captured.writing import write_capture
+from nextview_lab.data.writing import write_capture
 
 folder = Path(sys.argv[1])
 old, new, out = folder / "old", folder / "new", folder / "place/out"

@@ -13,8 +13,6 @@ from pipeline import refused, write_off
 from scipy.special import logsumexp
 
 import nextview
-from nextview.benchmark.replay import make_specs, replay, truncate
-from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
@@ -28,12 +26,14 @@ from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.teaching.learn import learn
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.viewers.card import preview_card, walk_card
 from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
+from nextview_lab.benchmark.replay import make_specs, replay, truncate
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from programs import main
 
 import nextview.teaching.learn as teaching
 from nextview import learn
-from nextview.cli.main import main
 from nextview.data.progress import silently
 from nextview.errors import DatasetError, UsageError
 from nextview.recognition.model_card import read_card

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from pipeline import SAMPLE_FILES
 
-from nextview.captured.writing import write_capture
-from nextview.data.predicting import predict
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
 from nextview.files import MARKER, new_folder, only_one
@@ -21,6 +19,8 @@ from nextview.recognition.novelty import unit
 from nextview.teaching import learn as module
 from nextview.teaching.learn import learn
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
+from nextview_lab.data.predicting import predict
+from nextview_lab.data.writing import write_capture
 
 
 @pytest.fixture

@@ -12,18 +12,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from skimage.measure import shannon_entropy
 
-from nextview.data.measures import (
+from nextview.errors import DatasetError
+from nextview_lab.data.measures import (
     QUANTUM,
     confidence_maps,
     depth_entropy,
     measure,
     normalise_per_object,
 )
-from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, MeasureError
+from nextview_lab.data.store import ViewStore
+from nextview_lab.errors import MeasureError
 
 OWN = """
-from nextview.data.measures import Measure
+from nextview_lab.data.measures import Measure
 def rows(view):
     return view.near.shape[0]
 def upright(view):
@@ -150,7 +151,7 @@ def test_a_stopped_run_is_completed_by_the_next(store):
     steps.close()
     with pytest.raises(
         DatasetError,
-        match=r"rows of .* is missing; nextview measure .* makes it",
+        match=r"rows of .* is missing; nextview-lab measure .* makes it",
     ):
         ViewStore.open(store).measure("own_measures:rows")
     assert len(list(measure(store, ["own_measures:rows"], workers=0))) == 18

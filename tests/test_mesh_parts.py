@@ -12,13 +12,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.data.rendering import RenderOptions, render
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
 from nextview.geometry.mesh_parts import mesh_doubts, thickness
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.teaching import thing_views
+from nextview_lab.data.rendering import RenderOptions, render
+from nextview_lab.data.store import ViewStore
 
 NOISE = np.random.default_rng(0)
 
@@ -303,7 +303,7 @@ def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
 
 
 def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("nextview.data.rendering.ODD_MESHES", 2)
+    monkeypatch.setattr("nextview_lab.data.rendering.ODD_MESHES", 2)
     scans = tmp_path / "scans" / "eggs"
     scans.mkdir(parents=True)
     saved(scans / "plain.ply", thing())

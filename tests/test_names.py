@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import trimesh
 from pipeline import benchmark, refused, some_predictions
+from programs import main
 
 import nextview
-from nextview.benchmark.figures import confusion_matrix
-from nextview.benchmark.report import report
 from nextview.cli.episode_table import print_episode
 from nextview.cli.exit_status import printable
 from nextview.cli.look import print_scene
-from nextview.cli.main import main
 from nextview.data.folders import list_dataset
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
 from nextview.session.style import to_svg
+from nextview_lab.benchmark.figures import confusion_matrix
+from nextview_lab.benchmark.report import report
 
 MATH = "$x^{$"
 """What matplotlib takes for a formula, and a broken one."""

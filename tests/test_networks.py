@@ -14,14 +14,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
-from nextview.training.architectures import (
+from nextview_lab.training.architectures import (
     InvertedBottleneck,
     LiteNet,
     PointNet,
     ResNet,
 )
-from nextview.training.export import export_onnx
-from nextview.training.runs import start_from
+from nextview_lab.training.export import export_onnx
+from nextview_lab.training.runs import start_from
 
 LITE0 = (
     (16, 3, 1),

@@ -12,11 +12,7 @@ from scipy.special import softmax
 
 import nextview
 from nextview import SimulatedCamera, Stopping, ViewSphere
-from nextview.data.predicting import predict
-from nextview.data.predictions import Predictions
-from nextview.data.rendering import render
 from nextview.data.samples import sample_mesh
-from nextview.data.store import ViewStore
 from nextview.geometry.observation import Observation, pinhole
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Unidirectional
@@ -24,6 +20,10 @@ from nextview.recognition.belief import Calibration
 from nextview.recognition.model_card import read_card
 from nextview.session.episode import Episodes
 from nextview.session.session import Session
+from nextview_lab.data.predicting import predict
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.rendering import render
+from nextview_lab.data.store import ViewStore
 
 SPHERE = ViewSphere.named("40")
 

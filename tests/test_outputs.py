@@ -15,18 +15,20 @@ import numpy as np
 import pytest
 from PIL import Image
 from pipeline import refused, run_python
+from programs import main
 from small_tables import camera_over, meshes_of, view
 
-from nextview.benchmark.submit import SubmitOptions, submit
-from nextview.captured.writing import write_capture
-from nextview.cli.commands import COMMANDS
-from nextview.cli.main import main
-from nextview.data.predictions import Predictions
+from nextview.cli.commands import NEXTVIEW
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
+from nextview_lab.benchmark.submit import SubmitOptions, submit
+from nextview_lab.cli.commands import LABORATORY
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.writing import write_capture
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = str(ROOT / "samples/chair.off")
+COMMANDS = {**NEXTVIEW.commands, **LABORATORY.commands}
 FITS = {name for name in COMMANDS if name.startswith("fit ")}
 GAIN = "--episodes 1 --networks-per-fold 1 --inputs belief view"
 SMALL = "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.3"
@@ -327,7 +329,12 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
     with pytest.raises(SystemExit) as end:
         main(command)
     assert end.value.code == 2
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("nextview: ")
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .splitlines()[-1]
+        .startswith(("nextview: ", "nextview-lab: "))
+    )
     assert contents(tmp_path) == mine
 
     if name in OWN_ONLY:
@@ -388,7 +395,7 @@ def test_who_wants_telemetry_keeps_it():
         if name != "ORT_DISABLE_TELEMETRY"
     }
     assert run_python(code, env=environment).stdout.strip() == "1"
-    tops = ("src", "benchmarks", "research", "examples", "docs", "workflow")
+    tops = ("src", "lab", "benchmarks", "research", "examples", "docs", "workflow")
     sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
     with_it = {
         path.name

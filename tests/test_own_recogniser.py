@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 import nextview
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.folders import read_capture
-from nextview.captured.writing import write_capture
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.policies.base import Evidence
@@ -22,6 +21,7 @@ from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.data.writing import write_capture
 
 NAMES = ("chair", "monitor", "table")
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFilter
 from pipeline import SAMPLE_FILES
+from programs import main
 from small_tables import camera_over, view
 
 import nextview
-from nextview.cli.commands import COMMANDS
-from nextview.cli.main import main
+from nextview.cli.commands import NEXTVIEW
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))
@@ -273,7 +273,11 @@ def test_each_page_names_what_its_commands_need():
         for step in documented_commands.steps_of(page):
             for wanted in step.needs if step.why_not is None else ():
                 project, _, extra = wanted.rstrip("]").partition("[")
-                name = r"(nextview|\.)" if project == "nextview" else r"\./research"
+                name = {
+                    "nextview": r"(nextview|\.)",
+                    "nextview-lab": r"(nextview-lab|\./lab)",
+                    "research": r"\./research",
+                }[project]
                 said = re.search(
                     name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""),
                     text,
@@ -289,14 +293,14 @@ def test_each_page_names_what_its_commands_need():
 
 def test_a_command_runs_with_only_its_own_dependencies(tmp_path):
     environments = documented_commands.Environments(tmp_path / "environments")
-    asked = "python -c 'import nextview.training.export'"
-    done = environments.run(asked, tmp_path)
+    asked = "python -c 'import nextview_lab.training.export'"
+    done = environments.run(asked, tmp_path, frozenset(["nextview-lab"]))
     assert done.returncode == 1
-    assert "pip install 'nextview[train]'" in done.stderr
+    assert "pip install 'nextview-lab[train]'" in done.stderr
     done = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
     assert done.stdout.startswith("nextview 0")
     assert "No module named 'pandas'" in done.stderr
-    needs = frozenset(["nextview[benchmark]"])
+    needs = frozenset(["nextview-lab[benchmark]"])
     done = environments.run("python -c 'import pandas'", tmp_path, needs)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
@@ -313,7 +317,7 @@ def test_ci_runs_the_commands_of_all_pages():
 def test_its_options_are_there(line, capsys):
     """Every option that a line gives stands in the help of its command."""
     words = line.split()[1:]
-    group = 1 if words[0] in COMMANDS else 2
+    group = 1 if words[0] in NEXTVIEW.commands else 2
     with pytest.raises(SystemExit) as end:
         main([*words[:group], "--help"])
     assert end.value.code == 0

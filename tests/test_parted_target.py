@@ -9,8 +9,8 @@ from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
 from nextview.segmentation.instances import Segmentation
 from nextview.sensing import ObservedObject
-from nextview.simulation.scene import upright_boxes
-from nextview.simulation.tables import PlacedThing, SimulatedTable
+from nextview.simulation.boxes import upright_boxes
+from nextview_lab.worlds.tables import PlacedThing, SimulatedTable
 
 
 def standing(mesh: Mesh, place) -> PlacedThing:

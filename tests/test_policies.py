@@ -24,7 +24,6 @@ from nextview.policies.baselines import (
 )
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.policies.maps import MapPeak, SpherePeak, local_peaks
-from nextview.policies.oracle import OracleGain, OracleValley
 from nextview.policies.policy_card import (
     bundled_policies,
     read_policy_card,
@@ -32,6 +31,7 @@ from nextview.policies.policy_card import (
 )
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.recognition.belief import Calibration
+from nextview_lab.benchmark.oracle import OracleGain, OracleValley
 
 SPHERE = ViewSphere.named("40")
 RING = ViewSphere.named("12")

@@ -14,11 +14,11 @@ import trimesh
 from matplotlib.contour import ContourSet
 from matplotlib.path import Path
 from pipeline import INTRINSICS, TABLE, box, cast, pose_at
+from programs import main
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
 
 import nextview
-from nextview.cli.main import main
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.pinhole import PinholeCamera

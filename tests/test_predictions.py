@@ -15,20 +15,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pipeline import SPHERE, refused, some_predictions
+from programs import main
 from scipy.special import softmax
 
-from nextview.cli.main import main
-from nextview.data.predicting import predict
-from nextview.data.predictions import Predictions
-from nextview.data.rendering import render
-from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, PredictionsError
+from nextview.errors import DatasetError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.network_input import InputSpec, from_store
+from nextview_lab.data.predicting import predict
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.rendering import render
+from nextview_lab.data.store import ViewStore
+from nextview_lab.errors import PredictionsError
 
 SPEC = InputSpec("geometry", 32)
 
@@ -132,7 +133,7 @@ def test_a_split_is_its_objects_and_nothing_else():
     with pytest.raises(
         PredictionsError,
         match="no objects of the split 'train', only of 'test': take"
-        r" split='test', or predict the others with nextview predict STORE OUT --split train",
+        r" split='test', or predict the others with nextview-lab predict STORE OUT --split train",
     ):
         test.of_split("train")
 
@@ -256,7 +257,7 @@ def test_maps_of_other_viewpoints_are_left_out_or_refused_before_any_work(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from nextview.data.predicting import predict
+from nextview_lab.data.predicting import predict
 from nextview.recognition.model_card import read_card
 
 if __name__ == "__main__":

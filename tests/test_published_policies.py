@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from test_expected_views import SPHERE, outlook_of
 
-from nextview.benchmark.published_policies import PredictedEntropy, SampledInformation
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import angle_between
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
+from nextview_lab.benchmark.published_policies import (
+    PredictedEntropy,
+    SampledInformation,
+)
 
 BOTH = pytest.mark.parametrize("policy", [SampledInformation, PredictedEntropy])
 KNOB_AT = np.array([1.0, 0, 0])

@@ -14,10 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.font_manager import fontManager
 from matplotlib.text import Text
 from pipeline import SAMPLE_FILES, refused, run_python
+from programs import main
 
 import nextview
 from nextview import ViewSphere
-from nextview.cli.main import main
 from nextview.errors import ModelError, NextviewError, ResultsError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
@@ -170,7 +170,7 @@ def test_every_bundled_policy_runs_live(chair, capsys):
         (["chair.off", "--policy", "discriminate"], "is for taught things"),
         (
             ["chair.off", "--policy", "true-depth_entropy"],
-            "runs only in nextview benchmark",
+            "runs only in nextview-lab benchmark",
         ),
         (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
         (["."], "is a folder of meshes, not of captured views; recognise one of them"),

@@ -15,17 +15,17 @@ import pytest
 import trimesh
 
 from nextview.data.pool import WorkerDied, each
-from nextview.data.rendering import render
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
+from nextview_lab.data.rendering import render
+from nextview_lab.data.store import ViewStore
 
 SPHERE = ViewSphere.named("12")
 SIZE = 64
 SCRIPT = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
-from nextview.data.rendering import RenderOptions, render
+from nextview_lab.data.rendering import RenderOptions, render
 from nextview.geometry.viewsphere import ViewSphere
 dataset, path = sys.argv[1:]
 for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 64, workers=2), 1):
@@ -225,7 +225,7 @@ def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_other
     command = [
         sys.executable,
         "-m",
-        "nextview",
+        "nextview_lab",
         "render",
         meshes,
         path,

@@ -10,10 +10,7 @@ import pytest
 from pipeline import some_predictions
 from scipy.special import log_softmax, softmax
 
-from nextview.benchmark.entries import default_entries
-from nextview.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
-from nextview.data.predictions import Predictions
-from nextview.errors import EntryError, UsageError
+from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
@@ -24,6 +21,10 @@ from nextview.recognition.own_stopping import own_stopping
 from nextview.session.episode import Episodes, run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.errors import EntryError
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pipeline import benchmark, scene_predictions, some_predictions, store_of
 
-from nextview.benchmark.classes import load
-from nextview.benchmark.leaderboard import level_differences
-from nextview.benchmark.published import ACCURACY, read_table
-from nextview.benchmark.report import pictures_of, report
-from nextview.cli.benchmark_tables import print_leaderboard
 from nextview.errors import ResultsError
+from nextview_lab.benchmark.classes import load
+from nextview_lab.benchmark.leaderboard import level_differences
+from nextview_lab.benchmark.published import ACCURACY, read_table
+from nextview_lab.benchmark.report import pictures_of, report
+from nextview_lab.cli.benchmark_tables import print_leaderboard
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,14 @@ import pipeline
 import pytest
 import trimesh
 
-from nextview.data.room_drawing import LIFE_SIZES, draw_rooms
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import level_pose
 from nextview.sensing import ObservedObject
-from nextview.simulation.room import UNEVEN_HEIGHT, Room, RoomCamera, build_room
-from nextview.simulation.room_layout import RoomLayout, Slab, Standing
-from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.sensor import SENSORS
+from nextview_lab.data.room_drawing import LIFE_SIZES, draw_rooms
+from nextview_lab.worlds.room import UNEVEN_HEIGHT, Room, RoomCamera, build_room
+from nextview_lab.worlds.room_layout import RoomLayout, Slab, Standing
+from nextview_lab.worlds.scene import footprint, mesh_hash, separation
 
 FOUR_LEGS = 4
 

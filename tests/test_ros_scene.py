@@ -49,8 +49,8 @@ from test_scene_changes import shifted
 import nextview
 from nextview.sensing import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera
 from nextview.teaching.learn import learn
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"

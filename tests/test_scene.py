@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from programs import main
 from scipy.spatial import cKDTree
 from small_tables import camera_over, view, without
 
 import nextview
-from nextview.cli.main import main
 from nextview.errors import ObservationError, SessionError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.sensing.plausibility import check_sizes
-from nextview.simulation.tables import SimulatedTable, TableCamera
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 
 def by_name(scene) -> dict:

@@ -12,7 +12,7 @@ import nextview
 from nextview.data.samples import sample_mesh
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 NAMES = ("cracker_box", "mustard_bottle", "tuna_fish_can", "scissors", "foam_brick")
 

@@ -11,7 +11,7 @@ from nextview.scene.state import MOST_VERIFIED
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
+from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 K = [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]
 FROM_ABOVE = np.diag([1.0, -1, -1, 1])

@@ -13,14 +13,7 @@ from test_scenes import GRID, scene_of
 
 import nextview
 from benchmarks.scenes import Believed
-from nextview.benchmark import statistics
-from nextview.benchmark.entries import default_entries
-from nextview.benchmark.published import ACCURACY, read_table
-from nextview.benchmark.replay import make_specs, replay
-from nextview.data.predictions import Predictions
-from nextview.data.scene_views import SceneSight, scene_intrinsics, scene_views
-from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, EntryError, PredictionsError
+from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.gain import (
@@ -35,9 +28,17 @@ from nextview.policies.registry import make_policy
 from nextview.recognition.belief import FixedLength
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.session.session import Session
-from nextview.simulation.robot_camera import RobotCamera
-from nextview.simulation.scene_layout import Block
-from nextview.simulation.simulated import SHOWS_TARGET, OccludedCamera, SceneCamera
+from nextview_lab.benchmark import statistics
+from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.published import ACCURACY, read_table
+from nextview_lab.benchmark.replay import make_specs, replay
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.scene_views import SceneSight, scene_intrinsics, scene_views
+from nextview_lab.data.store import ViewStore
+from nextview_lab.errors import EntryError, PredictionsError
+from nextview_lab.worlds.robot_camera import RobotCamera
+from nextview_lab.worlds.scene_cameras import SHOWS_TARGET, OccludedCamera, SceneCamera
+from nextview_lab.worlds.scene_layout import Block
 from research.plan import plan
 
 TEN = tuple(read_table(ACCURACY[10]))
@@ -256,8 +257,8 @@ def test_views_without_the_target_are_no_evidence(predictions):
 
 
 def test_gain_learns_to_use_visibility_in_scenes(predictions, tmp_path):
-    from nextview.training.gain_training import train_gain
-    from nextview.training.recipes import GainRecipe
+    from nextview_lab.training.gain_training import train_gain
+    from nextview_lab.training.recipes import GainRecipe
 
     train = np.array(["train"] * len(predictions))
     replace(predictions, splits=train).save(tmp_path / "p.npz")

@@ -11,13 +11,13 @@ import trimesh
 from matplotlib.path import Path as Outline
 
 from nextview import SimulatedCamera
-from nextview.data.scene_drawing import SPREAD, VISIBLE_TOLERANCE, draw_scenes
-from nextview.data.scene_views import scene_views
-from nextview.data.store import ViewStore, check
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.simulation.robot_camera import RobotCamera
-from nextview.simulation.scene import (
+from nextview_lab.data.scene_drawing import SPREAD, VISIBLE_TOLERANCE, draw_scenes
+from nextview_lab.data.scene_views import scene_views
+from nextview_lab.data.store import ViewStore, check
+from nextview_lab.worlds.robot_camera import RobotCamera
+from nextview_lab.worlds.scene import (
     SCENE_TABLE,
     TargetScene,
     block_item,
@@ -25,8 +25,7 @@ from nextview.simulation.scene import (
     footprint,
     separation,
 )
-from nextview.simulation.scene_layout import CLUTTER_LEVELS, Block, SceneLayout
-from nextview.simulation.simulated import (
+from nextview_lab.worlds.scene_cameras import (
     SHOWS_NOTHING,
     SHOWS_OTHER,
     SHOWS_TABLE,
@@ -34,6 +33,7 @@ from nextview.simulation.simulated import (
     OccludedCamera,
     SceneCamera,
 )
+from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS, Block, SceneLayout
 
 GRID = ViewSphere.named("40")
 BALL = pipeline.meshed(trimesh.creation.icosphere(4))

@@ -11,19 +11,10 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from programs import main
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from nextview.cli.main import main
-from nextview.data.labelled_frames import (
-    Example,
-    LabelledFrames,
-    WorldMeshes,
-    draw_frames,
-    frame_files,
-    output_scores,
-    solids_of,
-)
 from nextview.errors import DatasetError, ModelError, UsageError
 from nextview.files import sha256_of
 from nextview.geometry.pinhole import PinholeCamera
@@ -36,7 +27,16 @@ from nextview.segmentation.network import (
     read_segmentation_card,
     write_segmentation_card,
 )
-from nextview.simulation.worlds import BACKGROUND, SURFACE, World, photograph, slab
+from nextview_lab.data.labelled_frames import (
+    Example,
+    LabelledFrames,
+    WorldMeshes,
+    draw_frames,
+    frame_files,
+    output_scores,
+    solids_of,
+)
+from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, World, photograph, slab
 
 # size, middle of the foot, height of the top and turn of each box, and its label
 BOXES = (
@@ -150,7 +150,7 @@ def test_a_varied_frame_is_of_the_same_world(drawn):
 KILLED = """
 import os, sys
 from pathlib import Path
-from nextview.data.labelled_frames import draw_frames, frame_files
+from nextview_lab.data.labelled_frames import draw_frames, frame_files
 
 finish = os.replace
 def fatal(source, target):
@@ -253,11 +253,14 @@ def test_scores_of_outputs_that_are_right_and_wrong(drawn):
 torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
-from nextview.training import segmentation_training as training
-from nextview.training.architectures import SegmentationNet
-from nextview.training.recipes import Hardware, SegmentationRecipe
-from nextview.training.runs import load_run
-from nextview.training.segmentation_training import fit_segmentation, train_segmentation
+from nextview_lab.training import segmentation_training as training
+from nextview_lab.training.architectures import SegmentationNet
+from nextview_lab.training.recipes import Hardware, SegmentationRecipe
+from nextview_lab.training.runs import load_run
+from nextview_lab.training.segmentation_training import (
+    fit_segmentation,
+    train_segmentation,
+)
 
 RECIPE = SegmentationRecipe(
     frames=8, width=4, epochs=6, batch=2, lr=0.01, validation_share=0.25, seed=3

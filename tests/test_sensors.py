@@ -12,13 +12,13 @@ from scipy.stats import norm
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
-from nextview.data.rendering import Deform, RenderOptions, render, rotations
 from nextview.data.samples import sample_mesh
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
+from nextview_lab.data.rendering import Deform, RenderOptions, render, rotations
+from nextview_lab.data.store import ViewStore
 
 SPHERE, FEW = ViewSphere.named("40"), ViewSphere((20.0,), 3)
 BALL = meshed(trimesh.creation.icosphere(4))

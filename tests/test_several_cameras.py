@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 from pipeline import TABLE, box, pose_at, refused
+from programs import main
 from ros_messages import (
     CAMERA_INFO,
     DEPTH,
@@ -29,7 +30,6 @@ import nextview
 from nextview.captured.check import check_capture
 from nextview.captured.folders import read_capture
 from nextview.captured.still_moments import still_moments
-from nextview.cli.main import main
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
@@ -37,7 +37,7 @@ from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.known_frames import KnownFrames
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
+from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))

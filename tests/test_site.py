@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from nextview.cli.commands import COMMANDS
+from nextview.cli.commands import NEXTVIEW
+from nextview.cli.main import run
 from nextview.recognition.model_card import bundled_cards
+from nextview_lab.cli.commands import LABORATORY
 
 for package in ("material", "mkdocs_jupyter", "mkdocstrings_handlers"):
     pytest.importorskip(package, reason="the site needs pip install 'nextview[docs]'")
@@ -19,7 +21,7 @@ pytest.importorskip("pandas", reason="a notebook needs pip install 'nextview[doc
 
 pytestmark = pytest.mark.long  # `make docs` builds the site in CI as well
 ROOT = Path(__file__).parent.parent
-SOURCE = str(ROOT / "src")
+SOURCE = os.pathsep.join([str(ROOT / "src"), str(ROOT / "lab/src")])
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +62,14 @@ def pages(site):
 
 
 def test_every_command_has_a_page_with_its_own_help(site, capsys):
-    from nextview.cli.main import main
-
     shown = pages(site)
-    for name in COMMANDS:
-        page = shown[f"commands/{name.replace(' ', '-')}.html"]
-        with pytest.raises(SystemExit):
-            main([*name.split(), "--help"])
-        options = re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)
-        assert all(option in page for option in options)
+    for program in (NEXTVIEW, LABORATORY):
+        for name in program.commands:
+            page = shown[f"commands/{program.name}-{name.replace(' ', '-')}.html"]
+            with pytest.raises(SystemExit):
+                run(program, [*name.split(), "--help"])
+            options = re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)
+            assert all(option in page for option in options)
 
 
 def test_the_home_page_tells_how_to_cite(site):

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 import trimesh
 from pipeline import change_card, make_recogniser, refused, train_predictions
+from programs import main
 from scipy.stats import norm
 
-from nextview.cli.main import main
-from nextview.data.predicting import predict
-from nextview.data.predictions import Predictions
-from nextview.data.rendering import RenderOptions, render
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.training.card_fits import ANY_SIZE, RADII, densities, fit_weight
+from nextview_lab.data.predicting import predict
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.rendering import RenderOptions, render
+from nextview_lab.data.store import ViewStore
+from nextview_lab.training.card_fits import ANY_SIZE, RADII, densities, fit_weight
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["big", "small"]

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from test_verification import mesh_of, verifier_of
 
 from nextview.sensing import ObservedObject
-from nextview.simulation.worlds import BACKGROUND, slab
 from nextview.things.depth_view import MetricImage
 from nextview.things.stability import is_stable
+from nextview_lab.worlds.worlds import BACKGROUND, slab
 
 SIZE = (0.16, 0.06, 0.04)
 THING = mesh_of((SIZE, (0, 0, 0)), ((0.03, 0.03, 0.03), (0.05, 0, 0.035)))

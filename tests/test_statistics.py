@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nextview.benchmark import statistics as st
-from nextview.data import metrics
+from nextview_lab.benchmark import statistics as st
+from nextview_lab.data import metrics
 
 
 def test_ratios_and_class_means_agree_with_plain_loops():

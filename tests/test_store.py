@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from pipeline import SPHERE, refused
 
-from nextview.data.measures import measure
-from nextview.data.rendering import RenderOptions, render
-from nextview.data.store import RENDERED_ARRAYS, ViewStore, check
 from nextview.errors import DatasetError
+from nextview_lab.data.measures import measure
+from nextview_lab.data.rendering import RenderOptions, render
+from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore, check
 
 
 @pytest.fixture
@@ -94,6 +94,7 @@ def test_a_damaged_object_ends_the_command_that_reads_it(
     assert not (tmp_path / "out.npz").exists()
     assert "1 of 18 objects are damaged" in refused(
         capsys,
+        "nextview-lab",
         "check",
         store,
         "--workers",
@@ -104,7 +105,10 @@ def test_a_damaged_object_ends_the_command_that_reads_it(
 @pytest.mark.parametrize("name", RENDERED_ARRAYS)
 def test_check_and_render_say_which_array_is_missing(store, furniture, capsys, name):
     shutil.rmtree(store / name)
-    for command in (["check", store], ["render", furniture, store, "--size", 32]):
+    for command in (
+        ["nextview-lab", "check", store],
+        ["render", furniture, store, "--size", 32],
+    ):
         assert f"the array {name} is missing" in refused(
             capsys,
             *command,

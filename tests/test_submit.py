@@ -16,16 +16,16 @@ from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
 from markdown_it import MarkdownIt
 from PIL import Image
 from pipeline import refused, run_python
+from programs import main
 from scipy.spatial.transform import Rotation
 
-from nextview.benchmark.frozen import FrozenArchive
-from nextview.benchmark.line_process import LineProcess
-from nextview.benchmark.methods import FrozenLook, MethodAnswer, aimed_at
-from nextview.benchmark.standings import KnownShape, leaderboard_of
-from nextview.benchmark.submit import SubmitOptions, submit
-from nextview.cli.main import main
-from nextview.cli.submit import print_leaderboard
 from nextview.errors import DatasetError, ResultsError
+from nextview_lab.benchmark.frozen import FrozenArchive
+from nextview_lab.benchmark.line_process import LineProcess
+from nextview_lab.benchmark.methods import FrozenLook, MethodAnswer, aimed_at
+from nextview_lab.benchmark.standings import KnownShape, leaderboard_of
+from nextview_lab.benchmark.submit import SubmitOptions, submit
+from nextview_lab.cli.submit import print_leaderboard
 
 ROOT = Path(__file__).parents[1]
 BLIND = SubmitOptions("fixed", max_views=2)
@@ -449,7 +449,7 @@ def test_the_leaderboard_needs_no_other_package(submitted, archive, tmp_path):
     arguments = ["leaderboard", str(submitted), str(archive), str(tmp_path / "board")]
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('pandas', 'jinja2', 'pyarrow')));"
-        f" from nextview.cli.main import main; main({[*arguments, '--samples', '100']!r})"
+        f" from nextview_lab.cli.main import main; main({[*arguments, '--samples', '100']!r})"
     )
     done = run_python(code)
     assert done.returncode == 0, done.stderr

@@ -16,8 +16,8 @@ from nextview.scene.scene import Scene
 from nextview.segmentation.instances import Segmentation, instances_of
 from nextview.sensing import Box, Frame, ObservedObject
 from nextview.sensing.segmented_frame import segmented_frame
-from nextview.simulation.tables import poses_around
-from nextview.simulation.worlds import BACKGROUND, SURFACE, slab
+from nextview_lab.worlds.tables import poses_around
+from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, slab
 
 UP = np.array([0.0, 0.0, 1.0])
 TABLE = 0.75  # metres, height of its top

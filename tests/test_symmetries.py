@@ -16,10 +16,10 @@ from benchmarks.machine_parts import (
 from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry
 from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
-from nextview.simulation.solids import extruded, joined, moved, ring_points
 from nextview.teaching.symmetries import named_symmetries
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
+from nextview_lab.worlds.solids import extruded, joined, moved, ring_points
 
 PARTS = parts()
 NEAR = 3.0  # degrees by which an axis may be off

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pipeline import SAMPLE_FILES, make_map_network, make_recogniser, run_python
+from programs import main
 
 import nextview
-from nextview.cli.main import main
 from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 
 SAMPLE = SAMPLE_FILES / "chair.off"

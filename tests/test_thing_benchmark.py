@@ -11,24 +11,9 @@ import pandas as pd
 import pytest
 import trimesh
 from msgspec.structs import replace as replace_record
+from programs import main
 
 from benchmarks import joined_things
-from nextview.benchmark import things as stage
-from nextview.benchmark.confusable import Alikeness, how_alike
-from nextview.benchmark.results import compared_markdown, latex
-from nextview.benchmark.thing_episodes import (
-    EPISODE_SPHERE,
-    VISIBLE_SHARES,
-    KeptArrays,
-    Setting,
-    ThingEpisode,
-    hiding_boxes,
-)
-from nextview.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
-from nextview.benchmark.thing_runs import EpisodeRuns, ThingRun, opened
-from nextview.benchmark.thing_tables import summarise_things
-from nextview.benchmark.things import ThingSettings, benchmark_things
-from nextview.cli.main import main
 from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import UNITS, load_mesh
@@ -37,6 +22,21 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview_lab.benchmark import things as stage
+from nextview_lab.benchmark.confusable import Alikeness, how_alike
+from nextview_lab.benchmark.results import compared_markdown, latex
+from nextview_lab.benchmark.thing_episodes import (
+    EPISODE_SPHERE,
+    VISIBLE_SHARES,
+    KeptArrays,
+    Setting,
+    ThingEpisode,
+    hiding_boxes,
+)
+from nextview_lab.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
+from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun, opened
+from nextview_lab.benchmark.thing_tables import summarise_things
+from nextview_lab.benchmark.things import ThingSettings, benchmark_things
 
 SETTINGS = ThingSettings(
     views=(1, 2),

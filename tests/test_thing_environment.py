@@ -10,10 +10,10 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env
 
-import nextview.benchmark.environments  # noqa: F401
-from nextview.benchmark.thing_episodes import EPISODE_SPHERE
+import nextview_lab.benchmark.environments  # noqa: F401
 from nextview.errors import DatasetError, SessionError, UsageError
 from nextview.policies.learned_tables import cells_from
+from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 
 NAME = "nextview/RecogniseThings-v0"
 ROOT = Path(__file__).parent.parent

@@ -16,8 +16,6 @@ from pipeline import store_of
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
 
-from nextview.data.rendering import Deform, render_object
-from nextview.data.store import ViewStore
 from nextview.errors import ModelError, ResultsError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere
@@ -25,21 +23,27 @@ from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.network_input import InputSpec, from_store
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.training import recogniser_training as training
-from nextview.training.architectures import ResNet, ViewMap
-from nextview.training.export import export_map, export_recogniser, run_network
-from nextview.training.fitting_set import hold_out
-from nextview.training.inputs import load_inputs
-from nextview.training.map_training import Windows, train_map
-from nextview.training.recipes import (
+from nextview_lab.data.rendering import Deform, render_object
+from nextview_lab.data.store import ViewStore
+from nextview_lab.training import recogniser_training as training
+from nextview_lab.training.architectures import ResNet, ViewMap
+from nextview_lab.training.export import export_map, export_recogniser, run_network
+from nextview_lab.training.fitting_set import hold_out
+from nextview_lab.training.inputs import load_inputs
+from nextview_lab.training.map_training import Windows, train_map
+from nextview_lab.training.recipes import (
     THESIS_MAP,
     THESIS_RECOGNISER,
     Hardware,
     MapRecipe,
     RecogniserRecipe,
 )
-from nextview.training.recogniser_training import StoredInputs, Views, train_recogniser
-from nextview.training.runs import fit, load_run, read_run, start_from
+from nextview_lab.training.recogniser_training import (
+    StoredInputs,
+    Views,
+    train_recogniser,
+)
+from nextview_lab.training.runs import fit, load_run, read_run, start_from
 from research.training_curves import read_log
 
 V = 5

@@ -17,8 +17,8 @@ from nextview.errors import DatasetError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
+from nextview_lab.worlds.scene import square
 
 RADIUS, N, SHAPE = 0.3, 12, (240, 320)
 # first pixel's corner at 0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from pipeline import INTRINSICS, TABLE, box, cast, meshed, pose_at
+from programs import main
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
@@ -18,7 +19,6 @@ from scipy.stats import kstest
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import print_episode
-from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.errors import UsageError
 from nextview.files import sha256_of
@@ -34,7 +34,7 @@ from nextview.recognition.novelty import (
 )
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.result_json import episode_as_json
-from nextview.training.unknown import quantiles
+from nextview_lab.training.unknown import quantiles
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
@@ -131,7 +131,9 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
         score.neighbours,
         atol=1e-3,
     )
-    with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
+    with pytest.raises(
+        ModelError, match="other features; run nextview-lab fit unknown"
+    ):
         again.scores(np.zeros((1, 8)))
     with pytest.raises(ModelError, match="no such file"):
         read_novelty(tmp_path / "b.novelty.safetensors", sha256)

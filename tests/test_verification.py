@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.folders import read_capture
-from nextview.captured.writing import write_capture
 from nextview.errors import MeshError, ModelError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
@@ -52,6 +51,7 @@ from nextview.things.weighing import (
     JudgedEpisode,
     fit_weights,
 )
+from nextview_lab.data.writing import write_capture
 
 SIDE = 40
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees

@@ -8,10 +8,10 @@ import pytest
 from small_tables import camera_over, view
 
 import nextview
-from nextview.benchmark.table_runs import TableSettings
-from nextview.benchmark.tables import benchmark_tables
 from nextview.errors import PolicyError
 from nextview.scene.view_policies import SCENE_POLICIES, NamedPolicy
+from nextview_lab.benchmark.table_runs import TableSettings
+from nextview_lab.benchmark.tables import benchmark_tables
 
 MINE = """
 import numpy as np

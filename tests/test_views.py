@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from pipeline import benchmark, refused, some_predictions
+from programs import main
 
 from benchmarks.views import main as compare
-from nextview.cli.main import main
 
 NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
 
@@ -73,7 +73,7 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
 
 
 def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
-    """``nextview benchmark classes --views``, from the same first views; then figures
+    """``nextview-lab benchmark classes --views``, from the same first views; then figures
     and tables for papers.
     """
     out = made / "command"

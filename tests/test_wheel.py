@@ -1,4 +1,4 @@
-"""The wheel: built, installed into an empty environment, and run with nothing but what it asks for.
+"""The wheels: built, installed into an empty environment, and run with only what they ask for.
 
 Always: what the wheel asks for is linked from the environment of the tests, so that nothing else
 can be imported. With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a
@@ -21,33 +21,54 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
-EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
-    "optional-dependencies"
-]
+PROJECTS = {"nextview": ROOT, "nextview-lab": ROOT / "lab"}
+
+
+def asked(name: str) -> dict:
+    """The table ``project`` of a project."""
+    return tomllib.loads((PROJECTS[name] / "pyproject.toml").read_text())["project"]
+
+
 EXAMPLES = {
-    "": (
+    ("nextview", ""): (
         "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'"
     ),
-    "benchmark": (
-        "from nextview.benchmark.classes import benchmark_classes;"
-        " from nextview.benchmark.report import report"
+    ("nextview", "cluster"): (
+        "from distributed import LocalCluster; import nextview.data.pool"
     ),
-    "cluster": "from distributed import LocalCluster; import nextview.data.pool",
-    "bags": "import rosbags; from nextview.captured.bag import Bag",
-    "train": "import lightning, torch; from nextview.training import export, runs",
-    "workflow": "import snakemake",
-    "explore": "import viser; from nextview.viewers.exploration import Exploration",
-    "browser": "import playwright",
-    "large": "import faiss",
-    "record": "import rerun; from nextview.viewers.recording import Recorder",
-    "envs": (
-        "import gymnasium, nextview.benchmark.environments; gymnasium.spec('nextview/Recognise-v0')"
+    ("nextview", "bags"): "import rosbags; from nextview.captured.bag import Bag",
+    ("nextview", "workflow"): "import snakemake",
+    ("nextview", "explore"): (
+        "import viser; from nextview.viewers.exploration import Exploration"
     ),
-    "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
-    "dev": "import hypothesis, mypy, pytest, ruff, skimage",
+    ("nextview", "browser"): "import playwright",
+    ("nextview", "large"): "import faiss",
+    ("nextview", "record"): (
+        "import rerun; from nextview.viewers.recording import Recorder"
+    ),
+    ("nextview", "docs"): (
+        "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python"
+    ),
+    ("nextview", "dev"): "import hypothesis, mypy, pytest, ruff, skimage",
+    ("nextview-lab", ""): "import nextview_lab.data.rendering, nextview_lab.data.store",
+    ("nextview-lab", "benchmark"): (
+        "from nextview_lab.benchmark.classes import benchmark_classes;"
+        " from nextview_lab.benchmark.report import report"
+    ),
+    ("nextview-lab", "train"): (
+        "import lightning, torch; from nextview_lab.training import export, runs"
+    ),
+    ("nextview-lab", "envs"): (
+        "import gymnasium, nextview_lab.benchmark.environments;"
+        " gymnasium.spec('nextview/Recognise-v0')"
+    ),
 }
-"""One line for each extra, and for none."""
-QUICK = ("", "bags", "benchmark", "cluster", "envs", "record")
+"""One line for each extra of each project, and for none."""
+QUICK = [
+    (project, extra)
+    for project, extra in EXAMPLES
+    if extra in ("", "bags", "benchmark", "cluster", "envs", "record")
+]
 """Those that are tried always: the others import for seconds."""
 EMPTY_ENVIRONMENT = {
     name: value
@@ -70,32 +91,32 @@ def run(*command, cwd=ROOT, timeout=600):
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """Built from a copy, which setuptools may fill with what it makes; by the environment's own
-    setuptools.
+def wheels(tmp_path_factory):
+    """The wheel of each project, built from a copy, which setuptools may fill with what it makes;
+    by the environment's own setuptools.
     """
-    folder = tmp_path_factory.mktemp("wheel")
-    for name in ("src", "samples"):
-        shutil.copytree(
-            ROOT / name,
-            folder / name,
-            ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"),
-        )
+    folder = tmp_path_factory.mktemp("wheels")
+    unwanted = shutil.ignore_patterns("*.egg-info", "__pycache__")
+    for name in ("src", "samples", "lab"):
+        shutil.copytree(ROOT / name, folder / name, ignore=unwanted)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    run(
-        *pip,
-        "wheel",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--no-build-isolation",
-        "-w",
-        folder / "dist",
-        folder,
-    )
-    (built,) = (folder / "dist").glob("*.whl")
+    built = {}
+    for project, source in PROJECTS.items():
+        dist = folder / "dist" / project
+        run(
+            *pip,
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--no-index",
+            "--no-build-isolation",
+            "-w",
+            dist,
+            folder / source.relative_to(ROOT),
+        )
+        (built[project],) = dist.glob("*.whl")
     return built
 
 
@@ -117,7 +138,9 @@ HOLES = {
 """Versions with known holes, the last before each was mended."""
 
 
-@pytest.mark.parametrize("project", ["pyproject.toml", "research/pyproject.toml"])
+@pytest.mark.parametrize(
+    "project", ["pyproject.toml", "lab/pyproject.toml", "research/pyproject.toml"]
+)
 def test_no_version_with_a_known_hole_is_asked_for(project):
     table = tomllib.loads((ROOT / project).read_text())
     parts = table["project"].get("optional-dependencies", {}).values()
@@ -142,52 +165,70 @@ def test_the_constraints_satisfy_the_requirements():
         for name, _, version in (line.partition("==") for line in lines)
         if version
     }
-    table = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    for needed in map(
-        Requirement,
-        table["dependencies"] + [each for extra in EXTRAS.values() for each in extra],
-    ):
-        assert needed.specifier.contains(pinned[canonicalize_name(needed.name)]), needed
+    texts = [
+        text
+        for table in map(asked, PROJECTS)
+        for texts in (table["dependencies"], *table["optional-dependencies"].values())
+        for text in texts
+    ]
+    for needed in map(Requirement, texts):
+        if needed.name not in PROJECTS:
+            version = pinned[canonicalize_name(needed.name)]
+            assert needed.specifier.contains(version), needed
 
 
 def test_every_extra_has_an_example():
-    assert set(EXAMPLES) == {"", *EXTRAS}
+    assert set(EXAMPLES) == {
+        (project, extra)
+        for project in PROJECTS
+        for extra in ("", *asked(project)["optional-dependencies"])
+    }
 
 
 @pytest.mark.parametrize(
-    "extra",
+    ("project", "extra"),
     EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK,
 )
-def test_it_runs_with_its_declared_requirements(wheel, extra, tmp_path):
+def test_it_runs_with_its_declared_requirements(wheels, project, extra, tmp_path):
     python, packages = empty_environment(tmp_path / "venv")
-    zipfile.ZipFile(wheel).extractall(packages)
-    (own,) = packages.glob("nextview-*.dist-info")
+    needed = PROJECTS if project == "nextview-lab" else ("nextview",)
+    texts = []
+    for name in needed:
+        zipfile.ZipFile(wheels[name]).extractall(packages)
+        (own,) = packages.glob(f"{name.replace('-', '_')}-*.dist-info")
+        texts += [
+            (text, extra if name == project else "")
+            for text in Distribution.at(own).requires
+        ]
     try:
-        found = asked_for([(text, extra) for text in Distribution.at(own).requires])
+        found = asked_for(texts)
     except PackageNotFoundError as missing:
         pytest.skip(
             f"the extra {extra} is not installed here: {missing.name} is missing"
         )
     for installed in found.values():
         link(installed, packages)
-    code = f"{EXAMPLES[extra]}; import nextview; print(nextview.__file__)"
-    assert f"{packages}" in run(python, "-c", code, cwd=wheel.parents[1])
+    module = project.replace("-", "_")
+    code = f"{EXAMPLES[project, extra]}; import {module}; print({module}.__file__)"
+    assert f"{packages}" in run(python, "-c", code, cwd=wheels[project].parents[2])
 
 
-def test_it_contains_only_the_package(wheel):
-    names = zipfile.ZipFile(wheel).namelist()
+@pytest.mark.parametrize("project", PROJECTS)
+def test_it_contains_only_the_package(wheels, project):
+    names = zipfile.ZipFile(wheels[project]).namelist()
+    module = project.replace("-", "_")
     tops = {name.split("/")[0] for name in names}
     assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {
-        "nextview",
-        "nextview_command.py",
+        module,
+        f"{module}_command.py",
     }
-    source = ROOT / "src/nextview"
+    source = PROJECTS[project] / "src" / module
     data = [
         path
         for path in source.rglob("*")
         if path.is_file() and path.suffix not in (".py", ".pyc", ".toml")
     ]
-    assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(
+    assert {f"{module}/{path.relative_to(source).as_posix()}" for path in data} <= set(
         names
     )
 
@@ -196,11 +237,14 @@ def test_it_contains_only_the_package(wheel):
     os.environ.get("NEXTVIEW_WHEELS") != "all",
     reason="NEXTVIEW_WHEELS=all installs from an index",
 )
-@pytest.mark.parametrize("extra", EXAMPLES)
-def test_pip_installs_it(wheel, extra, tmp_path):
+@pytest.mark.parametrize(("project", "extra"), EXAMPLES)
+def test_pip_installs_it(wheels, project, extra, tmp_path):
     run(sys.executable, "-m", "venv", tmp_path / "venv")
     python = tmp_path / "venv/bin/python"
-    wanted = f"nextview[{extra}] @ {wheel.as_uri()}" if extra else wheel
+    part = f"[{extra}]" if extra else ""
+    wanted = [f"{project}{part} @ {wheels[project].as_uri()}"]
+    if project != "nextview":
+        wanted.append(f"nextview @ {wheels['nextview'].as_uri()}")
     run(
         python,
         "-m",
@@ -210,8 +254,8 @@ def test_pip_installs_it(wheel, extra, tmp_path):
         "--no-compile",
         "-c",
         ROOT / "constraints.txt",
-        wanted,
+        *wanted,
         timeout=3000,
     )
-    run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
+    run(python, "-c", EXAMPLES[project, extra], cwd=wheels[project].parents[2])
     assert "nextview 0" in run(tmp_path / "venv/bin/nextview", "--version")

@@ -141,7 +141,7 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
         "benchmark classes",
         "report",
     ):
-        assert f"nextview {command} " in planned
+        assert f"nextview-lab {command} " in planned
     for script in (
         "fit_policies validation.npz policies",
         "measure_study views.zarr measures --meshes",

@@ -58,6 +58,7 @@ PAGES = (
 )
 PROGRAMS = (
     "nextview ",
+    "nextview-lab ",
     "python",
     "make ",
     "pip ",
@@ -82,12 +83,12 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
     r"benchmarks\.(real_frames|segmentation)": "needs real frames, which are not part of this",
-    r"^nextview benchmark tables|benchmarks\.moves": (
+    r"^nextview-lab benchmark tables|benchmarks\.moves": (
         "needs scans of all things that the bundled memory knows"
     ),
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
-    r"^nextview download": (
+    r"^nextview-lab download": (
         "473 MB from a server of others; tests/test_download.py has a server of its own"
     ),
     r"^nextview explore": (
@@ -129,7 +130,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"SceneLayout\.load": (
         "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
     ),
-    r"nextview scenes YCB ": "needs the YCB scans; tests/test_room_scenes.py draws tables",
+    r"nextview-lab scenes YCB ": "needs the YCB scans; tests/test_room_scenes.py draws tables",
     r"RoomLayout\.load": "names one of the drawn rooms; tests/test_room_scenes.py looks into some",
     r"agent_on_things": (
         "needs things that were taught; tests/test_thing_environment.py lets it learn"
@@ -139,31 +140,34 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
-    r"nextview (train|export) ": "nextview[train]",
-    r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
+    r"nextview-lab |nextview_lab|benchmarks\.": "nextview-lab",
+    r"nextview-lab (train|export) ": "nextview-lab[train]",
+    r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
     r"benchmarks\.(views|scenes)|research\.(measure_study|example_maps)": (
-        "nextview[benchmark]"
+        "nextview-lab[benchmark]"
     ),
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
     r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
     r"explorer_pictures": "nextview[browser]",
-    r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
+    r"(?<![.:])\b(volumetric|coverage)\b|\bresearch\.\w": "research",  # by short names, too
     r"research\.train_agent": "research[rl]",
     r"research\.arm|examples/(panda|bin_picking)": "research[arm]",
 }
 SMALL = {  # options that make a command quick
-    "nextview render": "--workers 1",
-    "nextview predict": "--workers 1 --overwrite",
-    "nextview measure": "--workers 1",
+    "nextview-lab render": "--workers 1",
+    "nextview-lab predict": "--workers 1 --overwrite",
+    "nextview-lab measure": "--workers 1",
     "nextview learn": "--workers 1",
-    "nextview scenes": "--scenes 4 --workers 1",
-    "nextview train recogniser": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
-    "nextview train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
-    "nextview train segmentation": "--frames 8 --epochs 1 --batch 4 --width 4 --workers 1",
-    "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
-    "nextview fit calibration": "--delta 0.2",
-    "nextview benchmark classes": "--runs 2 --samples 100",
-    "nextview benchmark things": (
+    "nextview-lab scenes": "--scenes 4 --workers 1",
+    "nextview-lab train recogniser": (
+        "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
+    ),
+    "nextview-lab train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
+    "nextview-lab train segmentation": "--frames 8 --epochs 1 --batch 4 --width 4 --workers 1",
+    "nextview-lab train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
+    "nextview-lab fit calibration": "--delta 0.2",
+    "nextview-lab benchmark classes": "--runs 2 --samples 100",
+    "nextview-lab benchmark things": (
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
     "python -m research.train_agent": "--steps 2000",
@@ -188,7 +192,7 @@ import numpy as np
 
 from nextview.data.samples import sample_mesh
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import taught_meshes
 
 rng = np.random.default_rng(4)
@@ -256,7 +260,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import taught_meshes
 
 rng = np.random.default_rng(4)
@@ -425,7 +429,7 @@ def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
 def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
     """The last cell of a row of research/README.md: how a file is run."""
     cells = (
-        re.findall(r"`((?:nextview|python) [^`]+)`", line)
+        re.findall(r"`((?:nextview|nextview-lab|python) [^`]+)`", line)
         if line.startswith("|")
         else []
     )
@@ -513,7 +517,7 @@ def make_rig(folder: Path) -> None:
 FILES = {
     "mine.py": (
         """
-from nextview.data.measures import Measure
+from nextview_lab.data.measures import Measure
 
 def clutter(view):
     return float(view.seen.mean())
@@ -581,8 +585,9 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/your_table.md": "nextview learn samples mine --unit cm",
     # Predictions name their store: those that are planned for have to be of the one in this folder.
     "research/README.md": (
-        "nextview predict views.zarr test.npz --split test --workers 1 --overwrite; nextview train"
-        " map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
+        "nextview-lab predict views.zarr test.npz --split test --workers 1 --overwrite;"
+        " nextview-lab train map views.zarr runs/lem --epochs 1 --views-per-object 2"
+        " --batch 8 --validation-share 0.4"
     ),
 }
 # pages of which each Python block runs by itself
@@ -590,9 +595,9 @@ ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
 # pages whose Python blocks do again what their commands did: in a folder of its own
 BESIDE = ("docs/your_objects.md",)
 STORES = (  # made once, for all pages
-    "nextview render data/ModelNet10 views.zarr --workers 1",
-    "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
-    "nextview predict views.zarr test.npz --split test --workers 1",
+    "nextview-lab render data/ModelNet10 views.zarr --workers 1",
+    "nextview-lab predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
+    "nextview-lab predict views.zarr test.npz --split test --workers 1",
 )
 
 
@@ -615,30 +620,20 @@ class Environments:
 
         Args:
             needs: what is installed besides the base installation, as pip is told:
-                "nextview[train]", "research".
+                "nextview-lab[train]", "research".
         """
         if self.base is not None:
             return self.base
         from linked_environment import installation
 
         if needs not in self._made:
-            extras = {
-                text.partition("[")[2].rstrip("]")
-                for text in needs
-                if text.startswith("nextview[")
-            }
-            research = [
-                text.partition("[")[2].rstrip("]")
-                for text in needs
-                if text.startswith("research")
-            ]
-            wanted = set(filter(None, research)) if research else None
+            projects: dict[str, set[str]] = {"nextview": set()}
+            for text in needs:
+                name, _, extra = text.rstrip("]").partition("[")
+                name = "nextview-research" if name == "research" else name
+                projects.setdefault(name, set()).update(filter(None, [extra]))
             try:
-                python = installation(
-                    self.folder / str(len(self._made)),
-                    extras,
-                    wanted,
-                )
+                python = installation(self.folder / str(len(self._made)), projects)
             except PackageNotFoundError as missing:
                 raise SystemExit(
                     f"{', '.join(sorted(needs))}: not installed here, {missing.name} is missing"

@@ -16,6 +16,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,6 +137,11 @@ def with_parts(page: str) -> str:
     return text
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write what pages repeat, the table of what is measured and the citation, into the pages."""
     for page in PARTS:
         (ROOT / page).write_text(with_parts(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -15,16 +15,16 @@ from math import isfinite
 from pathlib import Path
 from textwrap import wrap
 
-from nextview.cli.exit_status import require
+from nextview_lab.extras import require
 
 require("benchmark")
 
 import pandas as pd
 
-from nextview.benchmark.comparison import ALL, SIGNIFICANT
-from nextview.benchmark.entries import is_oracle
-from nextview.data.predictions import Predictions
-from nextview.data.store import ViewStore
+from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT
+from nextview_lab.benchmark.entries import is_oracle
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.store import ViewStore
 
 WIDTH = 98
 """Columns of the page's prose."""
@@ -431,7 +431,7 @@ SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
 def commands(stage: Path) -> list[str]:
     """Those that made a stage, for the reader."""
     made = json.loads(stage.with_name(f"{stage.name}.done").read_text())["commands"]
-    return [command for command in made if command.startswith(("nextview ", "python "))]
+    return [command for command in made if command.startswith(("nextview", "python "))]
 
 
 def page(stages: Iterable[str]) -> str:

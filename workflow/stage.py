@@ -57,6 +57,10 @@ def _identifying(path: Path) -> Iterable[Path]:
     return [file for file in sorted(path.rglob("*")) if file.is_file()]
 
 
+# modules that run the programs
+PROGRAMS = {"nextview": "nextview", "nextview-lab": "nextview_lab"}
+
+
 def remove(path: Path) -> None:
     """Remove a file or a folder; of a link only the link."""
     if path.is_dir() and not path.is_symlink():
@@ -70,8 +74,9 @@ def runnable(command: str) -> str:
     wherever they are.
     """
     python = shlex.quote(sys.executable)
-    if command.startswith("nextview "):
-        return f"{python} -m nextview.cli.main {command.removeprefix('nextview ')}"
+    for program, module in PROGRAMS.items():
+        if command.startswith(f"{program} "):
+            return f"{python} -m {module} {command.removeprefix(f'{program} ')}"
     if command.startswith("python workflow/"):
         script, _, rest = command.removeprefix("python ").partition(" ")
         return f"{python} {shlex.quote(str(ROOT / script))} {rest}"

@@ -9,22 +9,26 @@ from functools import cache
 from pathlib import Path
 
 import nextview
+import nextview_lab
 
-PACKAGE = Path(nextview.__file__).parent
+SOURCES = {
+    "nextview": Path(nextview.__file__).parent,
+    "nextview_lab": Path(nextview_lab.__file__).parent,
+}
 ROOMS = {
-    "Front door": ["session", "scene", "errors"],
-    "Geometry": ["geometry"],
-    "Sensing": ["sensing"],
-    "Recognition": ["recognition"],
-    "Simulation": ["simulation"],
-    "Policies": ["policies"],
-    "Data": ["data"],
-    "Things": ["things"],
-    "Captured frames": ["captured"],
-    "Teaching": ["teaching"],
-    "Training": ["training"],
-    "Benchmark": ["benchmark"],
-    "Viewers": ["viewers"],
+    "Front door": ["nextview.session", "nextview.scene", "nextview.errors"],
+    "Geometry": ["nextview.geometry"],
+    "Sensing": ["nextview.sensing"],
+    "Recognition": ["nextview.recognition"],
+    "Simulation": ["nextview.simulation"],
+    "Policies": ["nextview.policies"],
+    "Data": ["nextview.data", "nextview_lab.data", "nextview_lab.worlds"],
+    "Things": ["nextview.things"],
+    "Captured frames": ["nextview.captured"],
+    "Teaching": ["nextview.teaching"],
+    "Training": ["nextview_lab.training"],
+    "Benchmark": ["nextview_lab.benchmark", "nextview_lab.errors"],
+    "Viewers": ["nextview.viewers"],
 }
 """Pages, and the modules and packages that each shows."""
 
@@ -55,12 +59,14 @@ def api_pages() -> dict[str, str]:
 
 def _modules(room: str) -> list[str]:
     """A module, or those of a package, that have something public to show."""
-    path = PACKAGE / room
+    package, _, name = room.partition(".")
+    folder = SOURCES[package]
+    path = folder / name
     files = (
         [path.with_suffix(".py")] if not path.is_dir() else sorted(path.rglob("*.py"))
     )
     names = [
-        ".".join(("nextview", *file.relative_to(PACKAGE).with_suffix("").parts))
+        ".".join((package, *file.relative_to(folder).with_suffix("").parts))
         for file in files
     ]
     return [name for name in names if not name.endswith("__init__")]

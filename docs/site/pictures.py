@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import nextview
-from nextview.data.measures import depth_entropy
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.maps import local_peaks
@@ -24,6 +23,7 @@ from nextview.recognition.model_card import find_card
 from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, PlainFigure
 from nextview.session.view import View
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview_lab.data.measures import depth_entropy
 
 IMAGES = Path(__file__).parents[1] / "images"
 RESULTS = Path(__file__).parents[1] / "results_classes.md"

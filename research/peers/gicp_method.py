@@ -1,7 +1,7 @@
-"""A method in another process for nextview submit (docs/submit.md): GICP of small_gicp.
+"""A method in another process for nextview-lab submit (docs/submit.md): GICP of small_gicp.
 
     pip install numpy scipy pillow trimesh small_gicp
-    nextview submit ARCHIVE gicp.json --command "python research/peers/gicp_method.py SCANS" \
+    nextview-lab submit ARCHIVE gicp.json --command "python research/peers/gicp_method.py SCANS" \
         --name "GICP of small_gicp" --version 1 --blind
 
 It registers the points of all views so far with each scan, from those 6 of the 60 orientations of

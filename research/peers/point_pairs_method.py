@@ -1,7 +1,8 @@
-"""A method in another process for nextview submit (docs/submit.md): OpenCV's point-pair features.
+"""A method in another process for nextview-lab submit (docs/submit.md): OpenCV's point-pair
+features.
 
     pip install numpy scipy pillow trimesh opencv-contrib-python-headless
-    nextview submit ARCHIVE pairs.json --name "point pairs of OpenCV" --version 1 --blind \
+    nextview-lab submit ARCHIVE pairs.json --name "point pairs of OpenCV" --version 1 --blind \
         --command "python research/peers/point_pairs_method.py SCANS"
 
 It matches the points of all views so far, with their normals, with each scan, refines the poses

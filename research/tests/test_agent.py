@@ -15,14 +15,15 @@ from scipy.special import log_softmax
 
 pytest.importorskip("stable_baselines3")
 
-from nextview.cli.main import main
-from nextview.data.predictions import Predictions
+from programs import main
+
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import RandomAll
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration
-from nextview.training.rollout import ReplayTable, judge, rollout
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.training.rollout import ReplayTable, judge, rollout
 from research import train_agent as module
 
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)

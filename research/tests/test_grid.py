@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from nextview.training.recipes import RecogniserRecipe
+from nextview_lab.training.recipes import RecogniserRecipe
 from research import train_grid
 from research.train_grid import published_cells
 

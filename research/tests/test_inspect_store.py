@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.data.measures import measure
-from nextview.data.rendering import render
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import to_svg
+from nextview_lab.data.measures import measure
+from nextview_lab.data.rendering import render
+from nextview_lab.data.store import ViewStore
 from research.inspect_store import (
     inspect,
     median_radii,

@@ -9,12 +9,13 @@ from pipeline import of_depth
 from skimage.draw import disk, polygon
 from skimage.measure import perimeter_crofton
 
-from nextview.data.measures import find_measure, measure
-from nextview.data.rendering import Deform, RenderOptions, deformed, render
-from nextview.data.store import ViewStore, check
-from nextview.errors import DatasetError, MeasureError
+from nextview.errors import DatasetError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere
+from nextview_lab.data.measures import find_measure, measure
+from nextview_lab.data.rendering import Deform, RenderOptions, deformed, render
+from nextview_lab.data.store import ViewStore, check
+from nextview_lab.errors import MeasureError
 from research.area import view_area
 from research.depth_spread import BIN, depth_distribution, max_depth
 from research.measure import main as measure_with_meshes

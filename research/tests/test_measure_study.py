@@ -11,9 +11,9 @@ import pytest
 from pipeline import some_predictions
 from scipy.stats import spearmanr
 
-from nextview.data.measures import measure
-from nextview.data.predictions import Predictions
-from nextview.data.store import ViewStore
+from nextview_lab.data.measures import measure
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.store import ViewStore
 from research import measure_study
 
 STUDY = vars(measure_study)

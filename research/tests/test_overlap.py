@@ -5,11 +5,11 @@ import pytest
 import trimesh
 from pipeline import box
 
-from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.data.store import ViewStore
 from research.overlap import overlap, overlap_maps, shared_points
 
 SPHERE = ViewSphere.named("40")

@@ -1,4 +1,4 @@
-"""The methods of other libraries that nextview submit runs, where these libraries are installed."""
+"""Methods of other libraries that nextview-lab submit runs, where they are installed."""
 
 import sys
 from pathlib import Path
@@ -9,9 +9,9 @@ import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from nextview.benchmark.frozen import FrozenArchive
-from nextview.benchmark.methods import CommandMethod, FrozenLook
-from nextview.benchmark.standings import KnownShape
+from nextview_lab.benchmark.frozen import FrozenArchive
+from nextview_lab.benchmark.methods import CommandMethod, FrozenLook
+from nextview_lab.benchmark.standings import KnownShape
 from research.peers.looks import FARTHEST, Fit, Scan, Seen, View, averaged, said_of
 
 PEERS = Path(__file__).parents[1] / "peers"

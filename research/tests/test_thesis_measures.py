@@ -12,10 +12,10 @@ from pipeline import of_depth
 from scipy.spatial.transform import Rotation
 
 from nextview.data.folders import list_dataset
-from nextview.data.measures import Measure, all_measures, find_measure
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.data.measures import Measure, all_measures, find_measure
 from research import measures as table
 from research.area import bits
 from research.bending import BentSurface
@@ -454,7 +454,7 @@ def test_they_are_sixteen_and_one():
 def test_a_measure_of_ones_own_says_what_it_needs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lowest_and_faces.py").write_text(
-        "from nextview.data.measures import Measure\n"
+        "from nextview_lab.data.measures import Measure\n"
         "def lowest(view):\n    return -view.depths.min() if len(view.depths) else 0\n"
         "faces = Measure(lambda view: len(view.pixels[0]), 'mesh', 'mine', 'valley')\n"
     )

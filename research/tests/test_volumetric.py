@@ -11,25 +11,25 @@ from pipeline import some_predictions
 from scipy.ndimage import maximum_filter
 
 import nextview
-from nextview.benchmark.entries import default_entries, is_oracle
-from nextview.benchmark.replay import make_specs, replay
-from nextview.data.measures import measure
-from nextview.data.predictions import Predictions
-from nextview.data.rendering import render
-from nextview.data.store import PLANNED, ViewStore
-from nextview.errors import EntryError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere, viewpoints_of
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import SpherePeak, sphere_peaks
-from nextview.policies.oracle import OracleMeasure
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import FixedLength
 from nextview.sensing.expected_visibility import VoxelGrid
 from nextview.session.episode import run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.benchmark.entries import default_entries, is_oracle
+from nextview_lab.benchmark.oracle import OracleMeasure
+from nextview_lab.benchmark.replay import make_specs, replay
+from nextview_lab.data.measures import measure
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.rendering import render
+from nextview_lab.data.store import PLANNED, ViewStore
+from nextview_lab.errors import EntryError
 from research.new_volume import new_surface, new_volume
 from research.plan import main as plan
 from research.plan import plan as plan_store
@@ -276,7 +276,7 @@ def test_true_measures_come_from_the_store(stored):
     specs = make_specs(predictions, 4, 0)
     with pytest.raises(
         EntryError,
-        match=r"nextview measure \S+ --measures view_area makes it",
+        match=r"nextview-lab measure \S+ --measures view_area makes it",
     ):
         replay("true-view_area-all", specs, 3, 0)
     list(measure(store, ["view_area"], workers=0))

@@ -26,13 +26,10 @@ from nextview.types import Float
 
 EXTRAS = {  # packages by the optional part of the installation that brings them
     "bags": ("lz4", "rosbags"),
-    "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
     "explore": ("viser", "websockets"),
     "large": ("faiss",),
     "record": ("rerun",),
-    "envs": ("gymnasium",),
-    "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 # an environment variable: set, the whole traceback of a plugin's error is printed too
 TRACEBACK = "NEXTVIEW_TRACEBACK"

@@ -214,35 +214,6 @@ class DatasetError(NextviewError):
     """
 
 
-class MeasureError(NextviewError):
-    """A view measure is not known, cannot be computed for these views, or failed.
-
-    Example:
-        >>> nextview.data.measures.find_measure("missing")
-        Traceback (most recent call last):
-        nextview.errors.MeasureError: no measure is called 'missing'; there are ...
-    """
-
-
-class PredictionsError(NextviewError):
-    """Predictions cannot be used.
-
-    Example:
-        >>> nextview.data.predictions.Predictions.load("missing.npz")
-        Traceback (most recent call last):
-        nextview.errors.PredictionsError: missing.npz: there is no such file; ...
-    """
-
-
-class EntryError(NextviewError):
-    """An entry of the benchmark cannot be run to its end.
-
-    Example:
-        >>> issubclass(nextview.EntryError, nextview.NextviewError)
-        True
-    """
-
-
 class ResultsError(NextviewError):
     """Results are missing, cannot be written, or must not be replaced.
 

@@ -25,10 +25,9 @@ from tf2_msgs.msg import TFMessage
 
 from nextview.captured.folders import read_capture
 from nextview.captured.messages import pose_of
-from nextview.errors import NextviewError, ObservationError
+from nextview.errors import MissingExtraError, NextviewError, ObservationError
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import taught_meshes
 from nextview.types import Float
 from nextview_ros.conversion import fill_transform
@@ -75,19 +74,34 @@ class RecordedFrames:
 
 
 class TableFrames:
-    """Frames of a simulated camera over a table."""
+    """Frames of a simulated camera over a table, which nextview-lab draws.
+
+    Raises:
+        MissingExtraError: nextview-lab is not installed.
+    """
 
     def __init__(self) -> None:
+        try:
+            from nextview_lab.worlds.tables import (
+                SimulatedTable,
+                TableCamera,
+                poses_around,
+            )
+        except ModuleNotFoundError as error:
+            raise MissingExtraError(
+                "the simulated table needs nextview-lab: pip install ./lab; or name a"
+                " recording"
+            ) from error
+
         rng = np.random.default_rng(5)
         table = SimulatedTable.draw(taught_meshes("ycb", ON_TABLE), rng, gap=0.08)
         self.camera = TableCamera(table, SENSORS["stereo"], rng)
+        place = np.array([0.0, 0.0, 0.03])
+        self._above = poses_around(np.zeros(1), np.radians(50), 0.65, place)[0]
 
     def first(self) -> Frame:
         """Return a frame from 0.65 m, 50 degrees above the table."""
-        place = np.array([0.0, 0.0, 0.03])
-        return self.camera.frame(
-            poses_around(np.zeros(1), np.radians(50), 0.65, place)[0]
-        )
+        return self.camera.frame(self._above)
 
     def towards(self, pose: Float) -> Frame:
         """Return a frame from a pose."""

@@ -23,6 +23,9 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
     Raises:
         DatasetError: its clouds are not depth images.
     """
+    if cloud := next((path for path in _some(folder, "*.pcd")), None):
+        read_pcd_header(cloud)  # raises an error that says why it is no depth image
+
     above = folder / ".." if folder.name in ("", "..") else folder.parent
     if is_capture(above):
         return f"{folder}: is only a part of a capture: give the folder above, {above}"
@@ -43,9 +46,6 @@ def why_unread(folder: Path, is_capture: Callable[[Path], bool]) -> str:
             f"{folder}: is a folder of meshes, not of captured views; recognise one of them"
             f" ({mesh}), or teach it them: nextview learn {folder} OUT"
         )
-    if cloud := next((file for file in files if file.suffix == ".pcd"), None):
-        read_pcd_header(cloud)  # raises an error that says why it is no depth image
-
     if any(file.suffix.lower() in LIKELY_IMAGES for file in _some(folder, "*")):
         return (
             f"{folder}: {_content(folder)} and has no folder depth/; give one image, or put 16-bit"

@@ -13,7 +13,6 @@ import tyro
 from nextview.cli.commands import OUTPUT_NAMES, Command
 from nextview.cli.option_names import GROUPS, HELP_OPTIONS, check_options
 from nextview.cli.option_values import CONFIG, OPTION_VALUES, described, explained
-from nextview.cli.words import EXAMPLES
 from nextview.cores import CORES_HELP
 from nextview.files import check_writable
 
@@ -35,7 +34,7 @@ def call(
     """Call the function of a command with the arguments of a command line.
 
     Args:
-        name: of the command.
+        name: of the program and the command.
         command: the command.
         arguments: of the command line.
         track: callable that shows the progress of the command.
@@ -46,18 +45,19 @@ def call(
     run, called = entry(command, arguments, track)
     helped = not HELP_OPTIONS.isdisjoint(arguments)
     if not helped:
-        check_options(f"nextview {name}", run, arguments)
+        check_options(name, run, arguments)
     try:
         returned = tyro.cli(
             run,
-            prog=f"nextview {name}",
+            prog=name,
             args=arguments,
             config=CONFIG,
             registry=OPTION_VALUES,
         )
     except SystemExit:
         if helped:
-            print(f"\nexample: nextview {EXAMPLES[name]}")
+            program = name.partition(" ")[0]
+            print(f"\nexample: {program} {command.example}")
         raise
     return returned, called
 

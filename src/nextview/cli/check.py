@@ -1,15 +1,11 @@
-"""``nextview check``: check captured frames and the poses of cameras, or a view store."""
+"""``nextview check``: check captured frames and the poses of cameras."""
 
 from pathlib import Path
 
 from nextview.captured.check import check_capture, errors_of_cameras
 from nextview.captured.folders import read_capture
-from nextview.captured.frames import Capture
-from nextview.cli.common_options import Workers, check_there
-from nextview.cli.progress import console, track_all
-from nextview.data import store as view_store
-from nextview.data.store import ViewStore
-from nextview.errors import DatasetError
+from nextview.cli.common_options import check_there
+from nextview.cli.progress import console
 
 
 def check(
@@ -17,34 +13,24 @@ def check(
     /,
     intrinsics: tuple[float, float, float, float] | Path | None = None,
     depth_scale: float | None = None,
-    workers: Workers = Workers(),
 ) -> None:
-    """Check captured frames, or a view store.
+    """Check captured frames, and the poses of their cameras.
 
     Captured frames are compared with each other: wrong poses, units and axes are named. If several
     cameras took them, the error of the pose of each camera is estimated from the surfaces that it
     sees in common with others, relative to the first camera by name.
 
-    Of a view store the checksum of every object is verified.
-
-    The exit status is 2 if the frames contradict each other, or if an object is damaged.
+    The exit status is 2 if the frames contradict each other.
 
     Args:
-        path: folder or bag of captured frames, or view store made by nextview render.
-        intrinsics: for captured frames: FX FY CX CY in pixels, or a camera file; by default read
+        path: folder or bag of captured frames.
+        intrinsics: FX FY CX CY in pixels, or a camera file; by default read
             from the folder.
-        depth_scale: for captured frames: metres per unit of the depth images, such as 0.001 for
+        depth_scale: metres per unit of the depth images, such as 0.001 for
             millimetres; by default read from the folder.
     """
     check_there(path)
-    if path.suffix == ".zarr" or (path / "zarr.json").exists():
-        _check_store(path, workers)
-    else:
-        _check_frames(read_capture(path, intrinsics, depth_scale=depth_scale))
-
-
-def _check_frames(read: Capture) -> None:
-    """Check the poses of captured frames and of their cameras."""
+    read = read_capture(path, intrinsics, depth_scale=depth_scale)
     console.print(f"{read!r}", soft_wrap=True)
     capture, left_out = check_capture(read, masked=False)
     for name, reason in left_out.items():
@@ -77,29 +63,3 @@ def _check_frames(read: Capture) -> None:
                 style="yellow",
                 soft_wrap=True,
             )
-
-
-def _check_store(store: Path, workers: Workers) -> None:
-    """Verify the checksum of every object in a view store."""
-    views = ViewStore.open(store)
-    done = int(views.done.sum())
-
-    damaged = track_all(
-        view_store.check(store, **vars(workers)),
-        done,
-        f"checking {store.name}",
-    )
-    for reason in views.attributes.failures.values():
-        console.print(f"left out: {reason}", style="yellow")
-
-    missing = len(views) - done - len(views.attributes.failures)
-    console.print(
-        f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not"
-        " rendered"
-    )
-
-    if damaged:
-        raise DatasetError(
-            f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render"
-            " again"
-        )

@@ -5,6 +5,7 @@ from typing import Literal
 from tyro.extras import SubcommandApp
 
 from nextview.cli.call_with_arguments import entry
+from nextview.cli.commands import NEXTVIEW, Program
 from nextview.cli.option_values import CONFIG, OPTION_VALUES
 from nextview.cli.stand_ins import stand_ins
 
@@ -20,11 +21,19 @@ def completion(
     Args:
         shell: name of the shell.
     """
-    from nextview.cli.commands import COMMANDS
+    print_completion(NEXTVIEW, shell)
 
+
+def print_completion(program: Program, shell: str) -> None:
+    """Print a script for tab completion of a program.
+
+    Args:
+        program: the program.
+        shell: name of the shell.
+    """
     groups: dict[str, SubcommandApp] = {"": SubcommandApp()}
-    with stand_ins():
-        for name, command in COMMANDS.items():
+    with stand_ins(program.extras):
+        for name, command in program.commands.items():
             group, _, word = name.rpartition(" ")
             if group not in groups:
                 groups[group] = SubcommandApp()
@@ -36,7 +45,7 @@ def completion(
             function, _ = entry(command)
             groups[group].command(name=word, help=command.line)(function)
         groups[""].cli(
-            prog="nextview",
+            prog=program.name,
             args=["--tyro-print-completion", shell],
             config=CONFIG,
             registry=OPTION_VALUES,

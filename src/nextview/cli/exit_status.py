@@ -25,7 +25,7 @@ def printable(text: str) -> str:
 
 
 @contextmanager
-def orderly_end(after_stop: str) -> Iterator[None]:
+def orderly_end(after_stop: str, program: str = "nextview") -> Iterator[None]:
     """Turn the exceptions of a command into one sentence and an exit status.
 
     The status is 1 if the output cannot be written, 2 after a user error or if an extra is
@@ -33,6 +33,7 @@ def orderly_end(after_stop: str) -> Iterator[None]:
 
     Args:
         after_stop: advice that is printed after Ctrl-C.
+        program: its name begins each sentence.
     """
     _prepare_outputs()
     try:
@@ -44,17 +45,17 @@ def orderly_end(after_stop: str) -> Iterator[None]:
         )
         if sentence is None:
             raise
-        _end(sentence, 2)
+        _end(program, sentence, 2)
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
         _discard(sys.stdout)
         sys.exit(1)
     except OSError as error:
         if error.filename is not None:
-            _end(f"{error.filename}: {error.strerror}", 2)
+            _end(program, f"{error.filename}: {error.strerror}", 2)
         if error.errno != errno.ENOSPC:
             raise
         _discard(sys.stdout)
-        _end(f"standard output cannot be written ({error.strerror})", 1)
+        _end(program, f"standard output cannot be written ({error.strerror})", 1)
     except (KeyboardInterrupt, SystemExit) as ended:
         stop = ended.__context__ if isinstance(ended, SystemExit) else ended
         if not isinstance(stop, KeyboardInterrupt):
@@ -62,7 +63,7 @@ def orderly_end(after_stop: str) -> Iterator[None]:
         warnings.simplefilter("ignore")
         # unfinished reads of zarr would print errors
         sys.unraisablehook = lambda unraisable: None
-        _end(f"stopped; {after_stop}", 130)
+        _end(program, f"stopped; {after_stop}", 130)
 
 
 def _prepare_outputs() -> None:
@@ -75,9 +76,9 @@ def _prepare_outputs() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _end(sentence: str, status: int) -> NoReturn:
+def _end(program: str, sentence: str, status: int) -> NoReturn:
     try:
-        print(f"nextview: {printable(sentence)}", file=sys.stderr)
+        print(f"{program}: {printable(sentence)}", file=sys.stderr)
     except OSError:  # standard error is full; the exit status still reports the error
         _discard(sys.stderr)
     sys.exit(status)

@@ -3,11 +3,14 @@
 import os
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from nextview.checks import extras
 from nextview.cli.common_options import EpisodeOptions, Unit
 from nextview.cli.progress import console
+
+if TYPE_CHECKING:
+    from nextview.viewers.exploration import Exploration
 
 
 def explore(
@@ -31,8 +34,7 @@ def explore(
     with a simulated sensor.
 
     Args:
-        path: mesh file, folder of meshes or of class folders, or view store; by default the sample
-            objects.
+        path: mesh file, or folder of meshes or of class folders; by default the sample objects.
         looking: Models and policies. More views can be taken after the end of an episode.
         compare: second policy, which runs side by side with the first.
         sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
@@ -44,26 +46,42 @@ def explore(
         port: port of the page; if it is taken, the next free one is used.
         browser: by default the page is opened in a browser.
     """
-    with extras():
-        import viser  # noqa: F401  # fails early, before the models are loaded
-
+    check_viser()
     from nextview.viewers.exploration import Exploration, shown_objects
-    from nextview.viewers.page import Page
 
     options = dict(vars(looking))
     policies = [options.pop("policy"), *([] if compare is None else [compare])]
-    page = Page(
-        Exploration(
-            shown_objects(path, up, unit),
-            policies,
-            sensor,
-            start,
-            seed,
-            **options,
-        ),
+    shown = shown_objects(path, up, unit)
+    serve(
+        Exploration(shown, policies, sensor, start, seed, **options),
         host,
         port,
+        browser,
     )
+
+
+def check_viser() -> None:
+    """Fail early, before models are loaded, if the package of the page is missing.
+
+    Raises:
+        MissingExtraError: it is.
+    """
+    with extras():
+        import viser  # noqa: F401
+
+
+def serve(exploration: "Exploration", host: str, port: int, browser: bool) -> None:
+    """Serve the page of an exploration until it is stopped.
+
+    Args:
+        exploration: what the page shows.
+        host: address at which the page is served.
+        port: port of the page; if it is taken, the next free one is used.
+        browser: whether the page is opened in a browser.
+    """
+    from nextview.viewers.page import Page
+
+    page = Page(exploration, host, port)
     console.print(
         f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it"
     )

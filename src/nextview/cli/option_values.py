@@ -103,6 +103,12 @@ def _tyros_own(info: PrimitiveTypeInfo | StructTypeInfo) -> Iterator[None]:
         _asked.pop()
 
 
+def _may_be_empty(kind: Any) -> bool:
+    """Return True for a list whose absence means something else than an empty one."""
+    lists = [part for part in get_args(kind) if get_args(part)[-1:] == (Ellipsis,)]
+    return bool(lists) and type(None) in get_args(kind)
+
+
 @OPTION_VALUES.primitive_rule
 def _value(
     info: PrimitiveTypeInfo,
@@ -117,7 +123,7 @@ def _value(
         return spec
 
     def read(words: list[str]) -> Any:
-        if not words:
+        if not words and not _may_be_empty(info.type):
             raise ValueError(f"its value is missing: {word}")
         try:
             return spec.instance_from_str(words)

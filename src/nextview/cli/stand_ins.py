@@ -8,15 +8,13 @@ the help; no other code runs with stand-ins.
 
 import sys
 from abc import ABCMeta
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
-
-from nextview.checks import EXTRAS
 
 
 class _StandIn(ABCMeta):
@@ -87,9 +85,15 @@ class _Finder(MetaPathFinder, Loader):
 
 
 @contextmanager
-def stand_ins() -> Iterator[None]:
-    """Import stand-ins for missing extras; only for a process that ends afterwards."""
-    named = {package for packages in EXTRAS.values() for package in packages}
+def stand_ins(
+    extras: Mapping[str, tuple[str, ...]],
+) -> Iterator[None]:
+    """Import stand-ins for missing extras; only for a process that ends afterwards.
+
+    Args:
+        extras: packages by the optional part of the installation that brings them.
+    """
+    named = {package for packages in extras.values() for package in packages}
     finder = import_stand_ins(
         package for package in named if find_spec(package) is None
     )

@@ -222,8 +222,8 @@ class Gain:
     """The unvisited view with the highest predicted value minus weighted travel.
 
     Small networks, trained on replayed predictions, estimate the belief in the true class after
-    each possible next view (``nextview train gain``). This is fitted one-step lookahead, as in the
-    value functions for sensor planning of Denzler and Brown, "Information theoretic sensor data
+    each possible next view (``nextview-lab train gain``). This is fitted one-step lookahead, as in
+    the value functions for sensor planning of Denzler and Brown, "Information theoretic sensor data
     selection for active object recognition", PAMI 24 (2002), but regressed from the decision state
     instead of simulated. The networks use ``features`` alone.
 

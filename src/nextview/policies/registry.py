@@ -123,7 +123,7 @@ def make_policy(
         "-oracle-valley"
     ):
         raise PolicyError(
-            f"{name} uses information that no robot has, so it runs only in nextview benchmark"
+            f"{name} uses information that no robot has, so it runs only in nextview-lab benchmark"
         )
 
     known = [

@@ -393,7 +393,8 @@ class Calibration(
         """
         if self.risk is None:
             raise RiskError(
-                "this recogniser promises no error rate; calibrate it with nextview fit calibration"
+                "this recogniser promises no error rate; calibrate it with nextview-lab"
+                " fit calibration"
             )
         return self.risk.threshold(risk, max_views)
 

@@ -186,7 +186,7 @@ class NetworkRecogniser:
             known = self.novelty.neighbours.shape[1]
             if known != self._known.size:
                 file = novelty_path(self.card.path)
-                hint = "run nextview fit unknown again"
+                hint = "run nextview-lab fit unknown again"
                 raise ModelError(
                     f"{file}: was fitted to {known} features, not {self._known.size}; {hint}"
                 )

@@ -182,7 +182,7 @@ class Novelty(Quantiles):
         """
         if embeddings.shape[1] != self.neighbours.shape[1]:
             raise ModelError(
-                "the novelty score was fitted to other features; run nextview fit unknown again"
+                "the novelty score was fitted to other features; run nextview-lab fit unknown again"
             )
         nearness = np.asarray(embeddings, np.float32) @ self.neighbours.T
         distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(

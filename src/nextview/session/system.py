@@ -550,7 +550,7 @@ def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> 
     can_tell = tells_unknown(recogniser)
     if asked and not can_tell:
         raise ModelError(
-            f"{called}: cannot tell unknown objects; nextview fit unknown teaches it"
+            f"{called}: cannot tell unknown objects; nextview-lab fit unknown teaches it"
         )
     if asked is None:
         return UNKNOWN_ALPHA if can_tell else 0.0

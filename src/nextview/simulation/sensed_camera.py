@@ -16,7 +16,7 @@ from nextview.sensing.frame import Part, spans, within
 from nextview.sensing.masks import inside_sphere
 from nextview.sensing.resampling import virtual_pose
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
-from nextview.simulation.scene import boxes_around
+from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float, Float32, Mask

@@ -1,11 +1,8 @@
-"""Error-free cameras that cast rays with Embree at a mesh, a target, or a scene."""
+"""An error-free camera that casts rays with Embree at a mesh."""
 
-from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.geometry.depth import AMBIENT
@@ -16,13 +13,9 @@ from nextview.geometry.observation import (
     checked_pose,
     pinhole,
 )
-from nextview.geometry.pinhole import PinholeCamera
-from nextview.geometry.ray_caster import RayCaster, embree_scene
+from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
-from nextview.types import Float, Float32, Mask
-
-if TYPE_CHECKING:
-    from nextview.simulation.scene import TargetScene
+from nextview.types import Float, Float32
 
 EDGE_ON = 0.01
 SLIVER = 1e-6
@@ -38,10 +31,6 @@ def _dot(a: Float32, b: Float32) -> Float32:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-# labels of pixels
-SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(4, dtype=np.uint8)
-# least distance of an occluder in front of the target, object radii, as the table touches it
-OCCLUDER_GAP = 1e-4
 LARGEST_IMAGE = 16_384  # pixels, largest height or width of an image
 
 
@@ -176,106 +165,3 @@ def _rays_of(
     for array in (rays, lengths):
         array.flags.writeable = False
     return rays, lengths
-
-
-class OccludedCamera:
-    """A camera in front of the target of a scene, without the occluded pixels."""
-
-    def __init__(
-        self,
-        scene: "TargetScene",
-        size: int = 224,
-        distance: float = CAMERA_DISTANCE,
-    ) -> None:
-        self.scene = scene
-        self._target = SimulatedCamera(scene.target, size, distance)
-        self._others = RayCaster(
-            [
-                (mesh.vertices, mesh.faces)
-                for mesh in (scene.table, scene.around)
-                if mesh
-            ]
-        )
-        self._rays = PinholeCamera.of(pinhole(size, distance), (size, size)).rays
-
-    def observe(self, pose: Float) -> Observation:
-        """Render an observation from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
-        seen = self._target.observe(pose)
-        hidden = self._hidden(seen)
-        assert seen.image is not None
-        return replace(
-            seen,
-            depth=np.where(hidden, 0, seen.depth),
-            image=np.where(hidden, np.uint8(0), seen.image),
-        )
-
-    def visible_share(self, pose: Float) -> float:
-        """Return the visible share of the target's pixels from a pose, (4, 4)."""
-        seen = self._target.observe(pose)
-        return (
-            1 - np.count_nonzero(self._hidden(seen)) / seen.visible
-            if seen.visible
-            else 0.0
-        )
-
-    def _hidden(self, seen: Observation) -> Mask:
-        """Return the occluded pixels of the target, (H, W)."""
-        there = seen.depth > 0
-        rays = self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32)
-        depth, _ = self._others.cast(seen.pose[:3, 3], rays)
-        hidden = np.zeros(there.shape, bool)
-        hidden[there] = depth < seen.depth[there] - OCCLUDER_GAP
-        return hidden
-
-
-class SceneCamera:
-    """Renders a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
-
-    def __init__(
-        self,
-        scene: "TargetScene",
-        intrinsics: Float,
-        shape: tuple[int, int],
-    ) -> None:
-        meshes = (scene.target, scene.table, scene.around)
-        self._caster = RayCaster(
-            [(mesh.vertices, mesh.faces) for mesh in meshes if mesh]
-        )
-        self._rays = PinholeCamera.of(checked_intrinsics(intrinsics, shape), shape).rays
-        self._owners = np.array([SHOWS_TARGET, SHOWS_TABLE, SHOWS_OTHER, SHOWS_NOTHING])
-
-    def look(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
-        """Render the scene from a camera-to-world pose, (4, 4), object frame and radii.
-
-        Returns:
-            Depth, (H, W) float32, object radii, 0 = nothing; and SHOWS_NOTHING, SHOWS_TARGET,
-            SHOWS_OTHER or SHOWS_TABLE, (H, W) uint8.
-        """
-        pose = checked_pose(pose)
-        rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
-        depth, which = self._caster.cast(pose[:3, 3].astype(np.float32), rays)
-        shape = self._rays.shape[:2]
-        return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[
-            which
-        ].reshape(shape)
-
-
-def visible_shares(
-    scene: "TargetScene",
-    poses: Float,
-    size: int,
-    distance: float,
-) -> Float:
-    """Return the visible share of the target's pixels from each pose.
-
-    Args:
-        scene: the scene.
-        poses: camera-to-world, (V, 4, 4).
-        size: side of the images, pixels.
-        distance: of the cameras, object radii.
-
-    Returns:
-        Shares, (V,) float64.
-    """
-    camera = OccludedCamera(scene, size, distance)
-    return np.array([camera.visible_share(pose) for pose in poses])

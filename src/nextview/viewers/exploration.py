@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from nextview.checks import whole
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLE_MESHES, sample_mesh
-from nextview.data.store import ViewStore
-from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.errors import MeshError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import (
     azimuth_of,
-    direction_of,
     level_pose,
     look_at_origin,
 )
@@ -32,31 +30,6 @@ from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_views import RivalPictures
 from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
 from nextview.types import Float, Float32
-
-
-class StoredViews:
-    """A camera that answers with the nearest stored view of an object."""
-
-    def __init__(self, store: ViewStore, row: int) -> None:
-        self.sphere = store.sphere
-        self._intrinsics = store.intrinsics
-        self._depth = store.depth(row)
-        self._image = store.image(row)
-        radius = float(store.radii[row])
-        self._exact = store.attributes.sensor is None
-        self._radius = radius if 0 < radius < np.inf else None
-
-    def observe(self, pose: Float) -> Observation:
-        """Return the stored view nearest to a pose, (4, 4), object frame, with its actual pose."""
-        k, _ = self.sphere.nearest(direction_of(pose))
-        seen = (
-            self._depth[k],
-            self.sphere.poses[k],
-            self._intrinsics,
-            self._radius,
-            self._image[k],
-        )
-        return Observation(*seen, exact=self._exact)
 
 
 @dataclass(frozen=True)
@@ -82,7 +55,7 @@ def shown_objects(
     """List the objects of a path.
 
     Args:
-        path: mesh file, folder of meshes or view store; None for the samples.
+        path: mesh file or folder of meshes; None for the samples.
         up: up axis of the mesh files; None for that of their format.
         unit: of the mesh files; None if it is not known.
 
@@ -99,16 +72,6 @@ def shown_objects(
         )
     if not path.is_dir():
         return (ShownObject(path.stem, partial(load_mesh, path, up, unit)),)
-    if (path / "zarr.json").exists():
-        store = ViewStore.open(path)
-        rows = np.flatnonzero(store.done).tolist()
-        if not rows:
-            raise DatasetError(f"{path}: no object in it is rendered yet")
-        labels = [store.classes[label] for label in store.labels]
-        return tuple(
-            ShownObject(store.names[k], partial(StoredViews, store, k), labels[k])
-            for k in rows
-        )
     # A single mesh outside class folders has no label.
     return tuple(
         ShownObject(

@@ -1,0 +1,526 @@
+"""Things in the images of a BOP dataset: their poses in BOP's file of results, and their recall."""
+
+import csv
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from nextview.captured.frames import MILLIMETRES
+from nextview.checks import one_line
+from nextview.data.progress import TrackProgress, silently
+from nextview.errors import DatasetError, ObservationError, UsageError
+from nextview.files import (
+    check_new,
+    new_file,
+    only_one,
+    read_record,
+    sha256_of,
+    unfinished,
+    write_record,
+)
+from nextview.geometry.mesh import load_mesh
+from nextview.recognition.model_card import Taught
+from nextview.scene.scene import Scene
+from nextview.session.system import System, load
+from nextview.teaching.learn import CARD, Learned, learn_things
+from nextview.teaching.thing_views import TeachingOptions
+from nextview.things.memory import open_memory
+from nextview.types import Float
+from nextview_lab.benchmark.bop_dataset import (
+    MODELS_FOLDER,
+    BopDataset,
+    BopImage,
+    TrueObject,
+    model_number,
+    read_bop_dataset,
+)
+from nextview_lab.benchmark.pose_recall import (
+    NO_HITS,
+    Hits,
+    hits_of,
+    mspd,
+    mssd,
+    symmetries_of,
+)
+
+BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+UPWARDS = (0.0, 0.0, 1.0)  # in the world of camera poses
+MOST_NAMED = 5  # of many in a sentence
+
+
+@dataclass(frozen=True)
+class BopOptions:
+    """What is looked for, and in which images.
+
+    Attributes:
+        models: memory that was taught with the models of the dataset (nextview learn
+            DATASET/models MEMORY --unit mm), or with things in the same frames; by default they
+            are taught, and the memory is kept beside OUT.
+        ids: numbers of the models that things of the memory are, NAME=NUMBER; things called
+            obj_000012 need none.
+        split: folder of the scenes, such as test_primesense.
+        targets: file that lists the images; by default DATASET/test_targets_bop19.json, or
+            test_targets_bop24.json.
+        camera: the one whose images are looked at, where each has files of its own:
+            photoneo of scene_camera_photoneo.json; by default the only one with depth images.
+        frames: number of images to look at, evenly spread over those of the targets, for a first
+            try; by default all.
+        camera_poses: use the poses of the cameras in scene_camera.json, in whose world z points
+            up; by default the normal of the support plane does.
+        unknown: p-value below which an object is called unknown, and is not written; by default
+            0.02, so one known thing in 50 is. 0 always names a thing.
+        sensor: camera that the models are taught for: kinect, stereo, setup, wrist or none, or
+            NAME:STRENGTH.
+        seed: seed of all random draws.
+    """
+
+    models: str | None = None
+    ids: tuple[str, ...] = ()
+    split: str = "test"
+    targets: Path | None = None
+    camera: str | None = None
+    frames: int | None = None
+    camera_poses: bool = False
+    unknown: float | None = None
+    sensor: str = "wrist"
+    seed: int = 0
+
+
+class FoundPose(msgspec.Struct, frozen=True):
+    """A model that was found in an image.
+
+    Attributes:
+        model: its number.
+        score: belief that it is this one, 0 to 1.
+        pose: of the model in the camera, (3, 4) row by row, millimetres.
+    """
+
+    model: int
+    score: float
+    pose: tuple[float, ...]
+
+    @property
+    def matrix(self) -> Float:
+        """The pose, (4, 4) float64, millimetres."""
+        return np.vstack([np.reshape(self.pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+
+
+class FoundInImage(msgspec.Struct, frozen=True):
+    """What was found in an image.
+
+    Attributes:
+        poses: of all things that were named.
+        seconds: that it took to read the image and to look at it.
+        width: of the image, pixels.
+        others: names of things that were found and are no models of the dataset.
+    """
+
+    poses: tuple[FoundPose, ...]
+    seconds: float
+    width: int
+    others: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BopRun:
+    """What was found in a dataset.
+
+    Attributes:
+        out: the file of results.
+        images: how many were looked at.
+        left_out: why images could not be, by their names.
+        poses: how many lines were written.
+        seconds: a looked-at image, mean.
+        others: how often things were found that are no models of the dataset, by name.
+        hits: of each model that is in the images, by its number; None where the truth is not known.
+        not_known: models that the memory does not know, by their numbers.
+        learned: what was taught; None where a memory was there.
+        without_model: how often objects without a model are in the images, by their numbers.
+        round_ones: models that can be turned by any angle, of which models_info.json says nothing,
+            by their numbers.
+    """
+
+    out: Path
+    images: int
+    left_out: dict[str, str]
+    poses: int
+    seconds: float
+    others: dict[str, int]
+    hits: dict[int, Hits] | None
+    not_known: tuple[int, ...] = ()
+    learned: Learned | None = None
+    without_model: dict[int, int] = field(default_factory=dict)
+    round_ones: tuple[int, ...] = ()
+
+
+def look_for_models(
+    dataset: Path,
+    out: Path,
+    how: BopOptions = BopOptions(),
+    overwrite: bool = False,
+    track: TrackProgress = silently,
+) -> BopRun:
+    """Name and locate the models of a BOP dataset in its depth images.
+
+    Each image of the targets is looked at by itself: nothing is told of what is in it, nor of where
+    its camera is. Every thing that is named becomes a line of OUT with the belief as its score, as
+    BOP's 6D detection wants it and bop_toolkit reads it. Where scene_gt.json is there, the recall
+    by MSSD and MSPD is printed; the official figures, with VSD, are bop_toolkit's. An interrupted
+    run resumes.
+
+    Args:
+        dataset: folder of a whole BOP dataset: models/, test/ and the file of its targets.
+        out: file to write, .csv; BOP wants METHOD_DATASET-SPLIT.csv, such as
+            nextview_lmo-test.csv.
+        how: models and images.
+        overwrite: replace OUT.
+        track: follows the images, and the models that are taught.
+
+    Returns:
+        What was found.
+
+    Raises:
+        DatasetError: a file of the dataset is missing or damaged, or no image can be looked at.
+        ResultsError: ``out`` exists, or cannot be written.
+        UsageError: an option makes no sense, or the memory knows none of the models.
+    """
+    out = Path(out)
+    check_new(out, overwrite)
+    if out.suffix.lower() != ".csv":
+        raise UsageError(f"{out}: the name ends in .csv")
+    if how.frames is not None and how.frames < 1:
+        raise UsageError(f"at least one frame is looked at, not {how.frames}")
+    read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
+    images = _evenly(read.images, how.frames)
+    given = _numbers_given(how.ids, read)
+    # a mistake in them is told before any work is done
+    truths = {image: read.true_objects(image) for image in images}
+    learned = None
+    memory = how.models
+    if memory is None:
+        memory, learned = _memory(read, out, how, track)
+    numbers = _numbers_of_things(memory, given, read)
+    system = load(memory, unknown=how.unknown)
+
+    left_out: dict[str, str] = {}
+    with only_one(out), unfinished(out, _key(read, memory, how)) as parts:
+        looks = _looks(read, images, system, numbers, how.camera_poses, parts, left_out)
+        track(looks, len(images), "images")
+        found = {
+            image: _part(parts, image)
+            for image in images
+            if _part_file(parts, image).exists()
+        }
+        if not found:
+            raise DatasetError(
+                f"{dataset}: no image can be looked at: {next(iter(left_out.values()))}"
+            )
+        hits = _recall(read, truths, found)
+        with new_file(out, overwrite) as new:
+            _write(new, found)
+
+    names = [name for one in found.values() for name in one.others]
+    return BopRun(
+        out,
+        len(found),
+        left_out,
+        sum(len(one.poses) for one in found.values()),
+        float(np.mean([one.seconds for one in found.values()])),
+        {name: names.count(name) for name in sorted(set(names))},
+        hits,
+        tuple(sorted(set(read.models) - set(numbers.values()))),
+        learned,
+        dict(sorted(Counter(n for i in images for n in read.without_model(i)).items())),
+        _round_ones(memory, numbers, read),
+    )
+
+
+def _evenly(images: Sequence[BopImage], most: int | None) -> tuple[BopImage, ...]:
+    """At most so many images, evenly spread."""
+    if most is None or most >= len(images):
+        return tuple(images)
+    few = np.unique(np.linspace(0, len(images) - 1, most).round().astype(int))
+    return tuple(images[row] for row in few)
+
+
+def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
+    """The numbers of models that a person gave, by the names of things."""
+    numbers = {}
+    for text in ids:
+        name, equals, digits = text.rpartition("=")
+        if not (name and equals and digits.isdecimal()):
+            raise UsageError(
+                f"--ids takes NAME=NUMBER, such as mug=14, not {one_line(repr(text))}"
+            )
+
+        number = int(digits)
+        if number not in dataset.models:
+            there = ", ".join(map(str, sorted(dataset.models)))
+            raise UsageError(
+                f"--ids {one_line(text)}: {dataset.folder} has no model {number}; it has {there}"
+            )
+        numbers[name] = number
+    return numbers
+
+
+def _memory(
+    dataset: BopDataset,
+    out: Path,
+    how: BopOptions,
+    track: TrackProgress,
+) -> tuple[str, Learned | None]:
+    """The folder of the memory of the models, and what was taught, unless an earlier run did."""
+    folder = out.with_name(f"{out.stem}-memory")
+    if not (folder / CARD).exists():
+        options = TeachingOptions(unit="mm", sensor=how.sensor, seed=how.seed)
+        models = dataset.folder / MODELS_FOLDER
+        return str(folder), learn_things(models, folder, options, track=track)
+
+    if reason := _out_of_date(folder, dataset, how.sensor):
+        raise UsageError(
+            f"{folder}: {reason}; remove it, and the models are taught again, or name the right"
+            " one with --models"
+        )
+    return str(folder), None
+
+
+def _out_of_date(folder: Path, dataset: BopDataset, sensor: str) -> str:
+    """Why the memory that an earlier run taught is not that of the models; "" if it is.
+
+    Models that are not in it may be some that could not be taught: they are told at the end.
+    """
+    taught = _taught(str(folder))
+    if not taught.sensor:
+        return "was taught by an earlier version"
+    if taught.sensor != sensor:
+        return f"was taught for the sensor {taught.sensor}, not for {sensor}"
+    models = {path.stem: path for path in dataset.models.values()}
+    for thing in taught.things:
+        if thing.name not in models:
+            return f"holds the memory of another dataset ({thing.name})"
+        if thing.sha256 != sha256_of(models[thing.name]):
+            return f"was taught with another file than {models[thing.name]} is now"
+    return ""
+
+
+def _taught(memory: str) -> Taught:
+    """What a memory is of."""
+    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
+    assert card.memory is not None
+    return card.memory
+
+
+def _things_of(memory: str) -> list[str]:
+    """Names of the things that a memory knows."""
+    return [thing.name for thing in _taught(memory).things]
+
+
+def _round_ones(
+    memory: str,
+    numbers: dict[str, int],
+    dataset: BopDataset,
+) -> tuple[int, ...]:
+    """Models that can be turned by any angle, of which ``models_info.json`` says nothing."""
+    turned = {
+        numbers[thing.name]
+        for thing in _taught(memory).things
+        if thing.name in numbers and any(not one.order for one in thing.symmetries)
+    }
+    return tuple(
+        number
+        for number in sorted(turned)
+        if not dataset.info[number].symmetries_continuous
+    )
+
+
+def _numbers_of_things(
+    memory: str,
+    given: dict[str, int],
+    dataset: BopDataset,
+) -> dict[str, int]:
+    """The number of each thing that is a model of the dataset, by its name."""
+    things = _things_of(memory)
+    for name in given:
+        if name not in things:
+            raise UsageError(f"--ids: {memory} knows nothing called {one_line(name)}")
+
+    named = {
+        name: number for name in things if (number := model_number(name)) is not None
+    }
+    numbers = {
+        name: number
+        for name, number in (named | given).items()
+        if number in dataset.models
+    }
+
+    if not numbers:
+        raise UsageError(
+            f"{memory}: none of its things ({_few(things)}) is called as a model of"
+            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); leave out --models,"
+            " and the models are taught, or say which things they are with --ids NAME=NUMBER"
+        )
+    return numbers
+
+
+def _few(names: Sequence[str]) -> str:
+    more = ", ..." if len(names) > MOST_NAMED else ""
+    return ", ".join(one_line(name) for name in names[:MOST_NAMED]) + more
+
+
+def _key(dataset: BopDataset, memory: str, how: BopOptions) -> str:
+    """What the part of each image depends on."""
+    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
+    depends = [
+        str(dataset.folder.resolve()),
+        how.split,
+        how.camera,
+        card.sha256,
+        sorted(how.ids),
+        how.camera_poses,
+        how.unknown,
+    ]
+    return hashlib.sha256(msgspec.json.encode(depends)).hexdigest()
+
+
+def _part_file(parts: Path, image: BopImage) -> Path:
+    return parts / f"{image.scene:06d}-{image.image:06d}.json"
+
+
+def _part(parts: Path, image: BopImage) -> FoundInImage:
+    what = "what was found in an image"
+    return read_record(_part_file(parts, image), FoundInImage, what, DatasetError)
+
+
+def _looks(
+    dataset: BopDataset,
+    images: Sequence[BopImage],
+    system: System,
+    numbers: dict[str, int],
+    in_world: bool,
+    parts: Path,
+    left_out: dict[str, str],
+) -> Iterator[int]:
+    """Look at each image that is not done, and write what is found; yields how many are done."""
+    for done, image in enumerate(images, 1):
+        if not _part_file(parts, image).exists():
+            try:
+                found = _look(dataset, image, system, numbers, in_world)
+            except (DatasetError, ObservationError) as error:
+                left_out[image.name] = str(error)
+            else:
+                write_record(_part_file(parts, image), found)
+        yield done
+
+
+def _look(
+    dataset: BopDataset,
+    image: BopImage,
+    system: System,
+    numbers: dict[str, int],
+    in_world: bool,
+) -> FoundInImage:
+    """Look at one image.
+
+    Raises:
+        DatasetError: a file is missing or damaged.
+        ObservationError: it shows no plane, or nothing.
+    """
+    begun = time.perf_counter()
+    captured = dataset.frame(image, in_world)
+    scene = Scene(system, UPWARDS if in_world else None)
+    scene.update(captured.read())
+    to_camera = np.linalg.inv(captured.pose)
+
+    poses = []
+    others = []
+    for thing in scene.objects:
+        name = thing.result.pose_of
+        pose = thing.pose
+        if name is None or pose is None:
+            continue
+        if name not in numbers:
+            others.append(name)
+            continue
+        in_camera = (to_camera @ pose)[:3]
+        in_camera[:, 3] /= MILLIMETRES
+        flat = tuple(in_camera.ravel().tolist())
+        poses.append(FoundPose(numbers[name], thing.confidence, flat))
+    seconds = time.perf_counter() - begun
+    return FoundInImage(tuple(poses), seconds, captured.size[0], tuple(others))
+
+
+def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
+    """Write the file of results: all lines of an image have one time, as bop_toolkit checks."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(BOP_COLUMNS)
+
+        for image, one in found.items():
+            for pose in one.poses:
+                matrix = pose.matrix
+                writer.writerow(
+                    [
+                        image.scene,
+                        image.image,
+                        pose.model,
+                        f"{pose.score:.6f}",
+                        " ".join(f"{value:.9f}" for value in matrix[:3, :3].ravel()),
+                        " ".join(f"{value:.6f}" for value in matrix[:3, 3]),
+                        f"{one.seconds:.6f}",
+                    ]
+                )
+
+
+def _recall(
+    dataset: BopDataset,
+    truths: dict[BopImage, tuple[TrueObject, ...] | None],
+    found: dict[BopImage, FoundInImage],
+) -> dict[int, Hits] | None:
+    """Hits of each model that is in the images; None where none of them has a truth.
+
+    Images that could not be looked at count: what is in them is missed.
+    """
+    nothing = FoundInImage((), 0.0, 1)
+    known = {image: true for image, true in truths.items() if true is not None}
+    if not known:
+        return None
+
+    hits: dict[int, Hits] = {}
+    for model in sorted({one.model for true in known.values() for one in true}):
+        mesh = load_mesh(dataset.evaluated_model(model), unit="mm")
+        vertices = (mesh.vertices * mesh.radius + mesh.centre) / MILLIMETRES
+        symmetries = symmetries_of(dataset.info[model])
+        total = NO_HITS
+        for image, true in known.items():
+            there = [one for one in true if one.model == model]
+            if not there:
+                continue
+            one = found.get(image, nothing)
+            poses = [pose for pose in one.poses if pose.model == model]
+            pairs = [[(p.matrix, t.pose) for t in there] for p in poses]
+            surface = [
+                [mssd(*pair, vertices, symmetries) for pair in row] for row in pairs
+            ]
+            projection = [
+                [
+                    mspd(*pair, vertices, symmetries, dataset.camera(image).intrinsics)
+                    for pair in row
+                ]
+                for row in pairs
+            ]
+            total += hits_of(
+                np.array(surface),
+                np.array(projection),
+                [pose.score for pose in poses],
+                [t.counts for t in there],
+                dataset.info[model].diameter,
+                one.width,
+            )
+        hits[model] = total
+    return hits

@@ -1,0 +1,417 @@
+"""Summarise episodes of classes as tables of numbers with intervals, tests and published values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.session.episode import Outcome
+from nextview.types import Float, Index
+from nextview_lab.benchmark import statistics as st
+from nextview_lab.benchmark.comparison import (
+    ALL,
+    Counted,
+    Key,
+    Tables,
+    corrected,
+    measures_of,
+    tests_of,
+)
+from nextview_lab.benchmark.entries import knows_truth
+from nextview_lab.benchmark.published import comparable_classes, published
+from nextview_lab.benchmark.replay import Grid
+from nextview_lab.data import metrics
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.extras import extras
+from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS, clutter_level
+
+with extras():
+    import pandas as pd
+    import pyarrow.parquet as pq
+
+Cell = tuple[str, float | None, Outcome]
+Both = tuple["pd.DataFrame", "pd.DataFrame"]  # measures and tests
+TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
+OF_CLASSES = ("accuracy", "travel_moved")  # measures that are also reported by class
+# thresholds of the curves: from stopping at the first view to taking almost all views
+SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
+LEVEL_VIEWS = (2, 3, 5)  # numbers of views after which the policies are compared
+ONE_STEP = "oracle-gain"  # the policy whose lead over the reference defines the gap
+
+
+@dataclass(frozen=True)
+class ClassTables(Tables):
+    """The results of a benchmark of classes.
+
+    The sets are ``all``; ``class NAME``, the objects of a class; and ``LEVEL clutter``, the scenes
+    of a clutter level.
+
+    Measures at a threshold are ``accuracy``; ``clean_accuracy``, without objects whose identical
+    mesh also has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as
+    published, and ``travel_all``, grid cells; ``arc_all``, radians; ``confident``, the share that
+    reached the threshold, and ``confident_accuracy``, the accuracy of these; and
+    ``calibration_error``. The prefix ``class_`` marks means over classes.
+
+    Measures after a number of views are ``accuracy``; ``travel``, grid cells; and ``share_of_gap``,
+    the lead of a policy over the reference as a share of the lead of ``oracle-gain``. Published
+    values have a column of their own, "published".
+
+    Holm's correction is applied to all tests of a measure at the thresholds, to all tests after
+    fixed numbers of views, without policies that know the truth, and to the tests of all clutter
+    levels.
+
+    Attributes:
+        sweep: the points of the curves of accuracy against views and travel.
+        reliability: confidence and accuracy by bin.
+    """
+
+    sweep: pd.DataFrame
+    reliability: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class ClassResults:
+    """A folder of results: settings, predictions and tables.
+
+    Attributes:
+        folder: with the results.
+        settings: of the benchmark.
+        predictions: that were replayed.
+        tables: the results.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    predictions: Predictions
+    tables: ClassTables
+
+    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
+        """Read the episodes of a policy at a threshold.
+
+        Args:
+            policy: name of the policy.
+            threshold: of the belief; None for fixed views.
+
+        Returns:
+            One episode per row, run by run, with the objects in the order of the predictions.
+        """
+        cell = [("policy", "==", policy)] + (
+            [] if threshold is None else [("threshold", "==", threshold)]
+        )
+        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
+
+
+def class_set(label: str) -> str:
+    """Return the name of the set of the objects of a class."""
+    return f"class {label}"
+
+
+def summarise(
+    grid: Grid,
+    reference: str,
+    samples: int,
+    rng: np.random.Generator,
+    n_views: Sequence[int] = (),
+) -> ClassTables:
+    """Compute all tables of a benchmark.
+
+    Args:
+        grid: the episodes.
+        reference: name of the reference policy.
+        samples: number of bootstrap samples.
+        rng: source of all random numbers.
+        n_views: further numbers of views after which policies are compared; empty for none.
+
+    Returns:
+        The tables.
+    """
+    families = st.target_families(grid.specs.predictions.names)
+    weights = st.resample_families(families, samples, rng)
+    cells = list(grid.cells())
+    counted = _counted(grid, cells, families)
+    whole = counted.tests(ALL, weights, reference, lambda key: key.measure in TESTED)
+    of_measures = [whole[whole["measure"] == measure] for measure in TESTED]
+    parts = [by_level(grid, reference, samples, rng)]
+    parts += [after_views(grid, n_views, weights, [reference])] if n_views else []
+    measures = [_measures(grid, cells, counted, weights), *(part for part, _ in parts)]
+    tests = [*(corrected([some]) for some in of_measures), *(part for _, part in parts)]
+
+    return ClassTables(
+        pd.concat([table for table in measures if len(table)], ignore_index=True),
+        pd.concat(tests, ignore_index=True),
+        reference,
+        _sweep(grid, families),
+        _reliability(grid, cells),
+    )
+
+
+def _counted(grid: Grid, cells: list[Cell], families: Index) -> Counted:
+    """Compute all measures of whole episodes."""
+    sums = {
+        Key(policy, threshold, 0, measure): both
+        for policy, threshold, ends in cells
+        for measure, both in _sums(grid, ends).items()
+    }
+    return Counted.of(sums, families)
+
+
+def _sums(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
+    """Return each measure of a cell as numerator and denominator per object, (N,) each."""
+    right = grid.right(ends.answer).astype(np.float64)
+    clean = np.where(grid.specs.predictions.conflicting, 0.0, 1.0)
+    one = np.ones(right.shape[1])
+
+    def of(values: NDArray) -> NDArray:
+        return values.reshape(grid.runs, -1)
+
+    moved = of(ends.n_views > 1)
+    confident = of(ends.confident)
+    mean = right.mean(0)
+    return {
+        "accuracy": (mean, one),
+        "clean_accuracy": (mean * clean, clean),
+        "n_views": (of(ends.n_views).mean(0), one),
+        "travel_moved": (of(ends.travel).sum(0), moved.sum(0).astype(np.float64)),
+        "travel_all": (of(ends.travel).mean(0), one),
+        "arc_all": (of(ends.arc).mean(0), one),
+        "confident": (confident.mean(0), one),
+        "confident_accuracy": (
+            (right * confident).sum(0),
+            confident.sum(0).astype(np.float64),
+        ),
+    }
+
+
+def _measures(
+    grid: Grid,
+    cells: list[Cell],
+    counted: Counted,
+    weights: Float,
+) -> pd.DataFrame:
+    """Return measures of whole episodes over all objects, over classes, and for each class."""
+    p = grid.specs.predictions
+    over_classes = counted.only([*OF_CLASSES, "n_views"])
+    means = over_classes.measures(ALL, weights, p.labels)
+    found = [
+        counted.measures(ALL, weights),
+        means.assign(measure="class_" + means["measure"]),
+        _spread(grid, cells),
+    ]
+
+    by_class = counted.only(OF_CLASSES)
+    for index in np.unique(p.labels):
+        here = p.labels == index
+        of_one = Counted(
+            by_class.keys,
+            by_class.top[here],
+            by_class.bottom[here],
+            by_class.families[here],
+        )
+        found.append(of_one.measures(class_set(p.classes[index]), weights[:, here]))
+
+    classes = comparable_classes(p)
+    table = pd.concat(found, ignore_index=True)
+    keys = table[["set", "policy", "threshold", "measure"]].to_numpy(object).tolist()
+    beside = [
+        published(
+            policy,
+            None if np.isnan(threshold) else threshold,
+            measure,
+            classes,
+            None if name == ALL else name.removeprefix(class_set("")),
+        )
+        for name, policy, threshold, measure in keys
+    ]
+    return table.assign(published=np.array(beside, np.float64))
+
+
+def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
+    """Return the calibration error, and the spread of the accuracies of the classes."""
+    labels = grid.specs.predictions.labels
+    rows = []
+    for policy, threshold, ends in cells:
+        right = grid.right(ends.answer)
+        between = [right[:, labels == label].mean() for label in np.unique(labels)]
+
+        values = {
+            "calibration_error": metrics.calibration_error(
+                ends.confidence,
+                right.ravel(),
+            ),
+            "class_accuracy_std": np.std(between),
+        }
+        rows += [
+            (policy, threshold, 0, measure, value, np.nan, np.nan)
+            for measure, value in values.items()
+        ]
+    return measures_of(ALL, rows)
+
+
+def _sweep(grid: Grid, families: Index) -> pd.DataFrame:
+    """Return the points of the curves."""
+    measures = ["accuracy", "n_views", "travel_all", "arc_all"]
+    points = []
+    for name, paths in grid.paths.items():
+        if not paths.fixed:
+            ends: list[Cell] = [(name, t, grid.ends(name, t)) for t in SWEEP]
+            curve = _counted(grid, ends, families).only(measures).top.mean(0)
+            points += [
+                (name, t, *values)
+                for t, values in zip(SWEEP, curve.reshape(len(SWEEP), -1), strict=True)
+            ]
+    table = pd.DataFrame(points, columns=["policy", "threshold", *measures])
+    return table.astype({"threshold": "float64"})
+
+
+def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
+    """Return confidence and accuracy in bins of the confidence."""
+    rows = []
+    for policy, threshold, ends in cells:
+        right = grid.right(ends.answer).ravel()
+        sure, accuracy, count = metrics.reliability(ends.confidence, right)
+        rows += [
+            (policy, threshold, i, sure[i], accuracy[i], count[i])
+            for i in np.flatnonzero(count)
+        ]
+    columns = ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"]
+    return pd.DataFrame(rows, columns=columns).astype({"threshold": "float64"})
+
+
+def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
+    """Return the clutter level of each scene, from its name, (N,); "" for a single object."""
+    return np.array([clutter_level(name) for name in names])
+
+
+def by_level(
+    grid: Grid,
+    reference: str,
+    samples: int,
+    rng: np.random.Generator,
+) -> Both:
+    """Compare policies in scenes by clutter level, after 1 view and LEVEL_VIEWS views.
+
+    Args:
+        grid: the episodes.
+        reference: name of the reference policy.
+        samples: number of bootstrap samples.
+        rng: source of all random numbers.
+
+    Returns:
+        Measures and tests; empty without scenes.
+    """
+    names = grid.specs.predictions.names
+    level_of = levels_of(names)
+    counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]
+    choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
+    known = [level for level in CLUTTER_LEVELS if level in level_of]
+    measures = [measures_of("", [])]
+    tests = [tests_of("", reference, [])]
+
+    for level in [*known, *sorted({*level_of} - {*known, ""})]:
+        mine = np.flatnonzero(level_of == level)
+        families = st.target_families([names[i] for i in mine])
+        weights = st.resample_families(families, samples, rng)
+        counted = _after(grid, choosing, counts, mine, families)
+        measures.append(counted.measures(f"{level} clutter", weights))
+        tests.append(
+            counted.tests(f"{level} clutter", weights, reference, _chosen_view)
+        )
+    return pd.concat(measures, ignore_index=True), corrected(tests)
+
+
+def _chosen_view(key: Key) -> bool:
+    """Return True if a measure includes a view chosen by the policy."""
+    return key.measure == "accuracy" and key.views > 1
+
+
+def after_views(
+    grid: Grid,
+    n_views: Sequence[int],
+    weights: Float,
+    references: Sequence[str],
+) -> Both:
+    """Compare policies after fixed numbers of views, without a threshold.
+
+    A policy does not know the number of views, so it is run once and its path is cut after each
+    number.
+
+    Args:
+        grid: the episodes; the paths are long enough, or end by themselves.
+        n_views: numbers of views.
+        weights: bootstrap weight of each object in each sample, (S, N).
+        references: names of the reference policies.
+
+    Returns:
+        Measures and tests.
+    """
+    long = max(n_views)
+    names = [
+        name
+        for name, paths in grid.paths.items()
+        if not paths.fixed or paths.views.shape[1] >= long
+    ]
+    references = [name for name in references if name in names]
+    families = st.target_families(grid.specs.predictions.names)
+    every = np.arange(len(families))
+    counted = _after(grid, names, n_views, every, families)
+    measures = [counted.measures(ALL, weights), _gap(counted, references)]
+    tests = [
+        counted.tests(ALL, weights, reference, lambda key: key.measure == "accuracy")
+        for reference in references
+    ]
+    return pd.concat(measures, ignore_index=True), corrected(tests, knows_truth)
+
+
+def _gap(counted: Counted, references: Sequence[str]) -> pd.DataFrame:
+    """Return the share of the lead of one-step lookahead over the first reference."""
+    right = counted.only(["accuracy"])
+    of_each = dict(zip(right.keys, right.top.T, strict=True))
+    rows = []
+    for key, own in of_each.items():
+        share = np.nan
+        if references:
+            floor = of_each[key._replace(policy=references[0])]
+            ahead = of_each.get(key._replace(policy=ONE_STEP), floor)
+            lead = (ahead - floor).mean()
+            share = (own - floor).mean() / lead if lead > 0 else np.nan
+        rows.append((*key._replace(measure="share_of_gap"), share, np.nan, np.nan))
+    return measures_of(ALL, rows)
+
+
+def _after(
+    grid: Grid,
+    policies: Sequence[str],
+    counts: Sequence[int],
+    objects: Index,
+    families: Index,
+) -> Counted:
+    """Return accuracy and travel of objects after numbers of views, or at the end of a path."""
+    sums: dict[Key, tuple[Float, Float]] = {}
+    for policy in policies:
+        path = grid.paths[policy]
+        last = np.minimum((path.views >= 0).sum(1)[:, None], counts) - 1
+        at = np.arange(len(path.views))[:, None], last
+        right = path.answers[at] == grid.specs.labels[:, None]
+        for measure, values in (("accuracy", right), ("travel", path.travel[at])):
+            mean = grid_mean(grid, values.astype(np.float64))[objects]
+            sums |= {
+                Key(policy, None, k, measure): (mean[:, i], np.ones(len(objects)))
+                for i, k in enumerate(counts)
+            }
+    return Counted.of(sums, families)
+
+
+def grid_mean(grid: Grid, values: NDArray) -> Float:
+    """Average over the runs of each object.
+
+    Args:
+        grid: the episodes.
+        values: of the episodes, (E, ...).
+
+    Returns:
+        Means, (N, ...) float64.
+    """
+    return values.reshape(grid.runs, -1, *values.shape[1:]).mean(0)

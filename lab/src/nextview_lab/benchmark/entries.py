@@ -1,0 +1,320 @@
+"""Entries of the benchmark by name: policies, oracles, fixed views, and custom policies."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_softmax
+
+from nextview.checks import did_you_mean
+from nextview.errors import OtherUseError
+from nextview.policies.base import Policy, Scope
+from nextview.policies.baselines import ViewList, orbit, ranked
+from nextview.policies.maps import MapPeak
+from nextview.policies.policy_card import bundled_policies
+from nextview.policies.registry import (
+    DEFAULT_POLICY,
+    VISIBLE,
+    make_policy,
+    map_policy,
+    map_policy_names,
+    policy_names,
+)
+from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, map_name
+from nextview.recognition.model_card import DISCRIMINATE
+from nextview.types import Index
+from nextview_lab.benchmark.oracle import OracleGain, OracleMeasure, OracleValley
+from nextview_lab.benchmark.true_maps import TRUE, known_maps, stored_rows, true_measure
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.scene_views import SceneSight
+from nextview_lab.errors import EntryError
+
+
+@dataclass(frozen=True)
+class EpisodeSpecs:
+    """The E episodes of every entry: the same objects from the same first views.
+
+    Attributes:
+        predictions: of all objects from every view.
+        objects: object of each episode, (E,).
+        starts: first view of each, (E,).
+        scenes: occluders of the objects; None without occlusion.
+    """
+
+    predictions: Predictions
+    objects: Index
+    starts: Index
+    scenes: SceneSight | None = None
+
+    @property
+    def labels(self) -> Index:
+        """True class of each episode's object, (E,) int64."""
+        return self.predictions.labels[self.objects]
+
+    def valley_classes(self, map_name: str) -> tuple[int, ...]:
+        """Return the classes (indices) for which a map's valley is the better view."""
+        named = self.predictions.valley_classes.get(map_name, ())
+        classes = self.predictions.classes
+        return tuple(classes.index(name) for name in named if name in classes)
+
+
+MAP_ORACLES = {  # oracles of the thesis, by their published names
+    "oracle-valley": ("", LEM, "-oracle-valley"),
+    f"{TRUE}{LEM}": (TRUE, LEM, ""),
+    f"{TRUE}{LEM}-peak": (TRUE, LEM, "-peak"),
+    f"{TRUE}oracle-valley": (TRUE, LEM, "-oracle-valley"),
+    f"{LCM}-oracle-valley": ("", LCM, "-oracle-valley"),
+    f"{TRUE}{LCM}": (TRUE, LCM, "-peak"),
+}
+# upper bound: one-step lookahead with the true outcomes
+GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}
+# policies with access to the ground truth, always compared; more for each map, see MAP_ORACLE
+ORACLES = (*MAP_ORACLES, *GAINS)
+MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
+"""Oracles that use a map. "true-MAP" climbs the true map: to its peaks, or to its valleys if the
+most likely class uses them; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true
+class decides, also on the predicted map."""
+MORE = f"{LEM}{SPHERE_SUFFIX}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
+FIXED_ENTRIES = (
+    "best",
+    "worst",
+    "high-entropy",
+    "low-entropy",
+    "random-fixed",
+    "orbit",
+)
+"""Fixed views by name, followed by their number: "best-5", "orbit-8". They do not stop early.
+
+"best" and "worst" refer to the confidence in the true class; "orbit" moves around the ring of the
+first view, then around the next ring.
+"""
+TRUE_MEASURE = re.compile(r"true-([\w.:]+)-all(-peak)?")
+"""Oracles that use the true value of any measure in the view store, over all views: "true-NAME-all"
+chooses the highest unvisited view, "true-NAME-all-peak" prefers the peaks of its map. "true-NAME-K"
+are fixed views: the K highest."""
+
+
+def is_oracle(policy: str) -> bool:
+    """Return True if a policy uses information that a robot does not have."""
+    return (
+        policy in ORACLES
+        or policy.startswith(TRUE)
+        or policy.endswith("-oracle-valley")
+    )
+
+
+def knows_truth(entry: str) -> bool:
+    """Return True if a policy or fixed views use information that a robot does not have."""
+    return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
+
+
+# additional entries in scenes with occlusion
+IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT_POLICY}", "true-visible_share-all")
+
+
+def default_entries(specs: EpisodeSpecs) -> list[str]:
+    """Return all entries that these predictions allow.
+
+    Fixed views ignore reachability, so they are not used in scenes.
+    """
+    sphere = specs.predictions.sphere
+    n = sphere.azimuths
+    v = len(sphere)
+    maps = [
+        name
+        for name in in_order(specs.predictions.maps)
+        if not name.endswith(SPHERE_SUFFIX)
+    ]
+
+    names = [
+        *policy_names(),
+        *(each for name in maps for each in (name, f"{name}-peak")),
+        MORE,
+    ]
+    names = [
+        name
+        for name in (*names, *bundled_policies(), *ORACLES)
+        if name not in IN_SCENES
+    ]
+    if specs.scenes is not None:
+        return [name for name in (*names, *IN_SCENES) if _ready(name, specs)]
+    names = [name for name in names if _ready(name, specs)]
+    names += [f"{kind}-{min(5, v)}" for kind in FIXED_ENTRIES if kind != "orbit"]
+    return names + [f"orbit-{k}" for k in sorted({n, v})]
+
+
+def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
+    """Create the policy of a benchmark entry.
+
+    Args:
+        name: of the policy.
+        specs: the episodes.
+
+    Returns:
+        The policy.
+
+    Raises:
+        EntryError: the predictions lack what the policy needs.
+    """
+    policy = _make(name, specs)
+    if (
+        "observations" in policy.needs
+    ):  # predictions contain no depth, so the paths are planned in advance
+        return ViewList(
+            stored_rows(specs.predictions, f"plans/{name}")[
+                specs.objects,
+                specs.starts,
+            ].astype(np.int64)
+        )
+
+    p = specs.predictions
+    there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
+    there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
+    there |= {"joint"} if p.calibration.hypotheses else set()
+    lacking = [wanted for wanted in policy.needs if wanted not in there]
+    if lacking:
+        bins = lacking[0] == "azimuth_bins"
+        what = (
+            "what the recogniser says of the azimuth bins"
+            if bins
+            else f"the map {lacking[0]!r}"
+        )
+        raise EntryError(f"policy {name} needs {what}, which these predictions lack")
+
+    return policy
+
+
+def _make(name: str, specs: EpisodeSpecs) -> Policy:
+    p = specs.predictions
+    plain = name.partition("@")[0]
+    if name in MAP_ORACLES:
+        return _oracle(specs, *MAP_ORACLES[name])
+    if name in GAINS:
+        return OracleGain(
+            p.sphere,
+            p.log_evidence,
+            len(p.classes),
+            p.labels,
+            specs.objects,
+            GAINS[name],
+            p.calibration,
+        )
+    if measured := TRUE_MEASURE.fullmatch(name):
+        values = true_measure(p, measured[1])[specs.objects].astype(np.float64)
+        return OracleMeasure(p.sphere, values, measured[2] == "-peak")
+
+    match = MAP_ORACLE.fullmatch(name)
+    true, base, how = match.groups("") if match else ("", "", "")
+    predicted = [
+        name
+        for name in p.maps
+        if how == "-oracle-valley" and not name.endswith(SPHERE_SUFFIX)
+    ]
+    base = map_name(base) if true else base  # the true map of a measure, by either name
+    if base in (known_maps(p) if true else predicted):
+        return _oracle(specs, true, base, how)
+    if true and base.isidentifier():
+        there = ", ".join(f"{TRUE}{known}" for known in known_maps(p))
+        raise EntryError(
+            f"no true map is called {name!r}; there are {there}, and more after"
+            " nextview-lab measure"
+        )
+
+    known = (
+        plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
+    )
+    card = plain.removeprefix(VISIBLE)
+    if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
+        return make_policy(
+            name,
+            p.sphere,
+            specs.valley_classes(plain),
+            p.classes,
+            p.maps,
+        )
+    if plain == DISCRIMINATE:
+        raise EntryError(
+            "the policy discriminate needs the memory of taught things that made these predictions:"
+            " name its models, --models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
+        )
+
+    names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
+    names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED_ENTRIES)]
+    raise EntryError(
+        "no policy is called"
+        f" {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}"
+    )
+
+
+def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
+    """Return the oracle of the map ``base``; ``true`` and ``how`` are parts of its name."""
+    sphere = t.predictions.sphere
+    valleys = t.valley_classes(base)
+    if how == "-oracle-valley":
+        return OracleValley(sphere, t.labels, valleys, true + base)
+    return MapPeak(sphere, true + base, () if how == "-peak" else valleys)
+
+
+def _ready(name: str, specs: EpisodeSpecs) -> bool:
+    """Return True if predictions and view store contain what an entry needs."""
+    try:
+        entry_policy(name, specs)
+    except (EntryError, OtherUseError):
+        return False
+    return True
+
+
+def fixed_views(
+    name: str,
+    specs: EpisodeSpecs,
+    rng: np.random.Generator,
+) -> Index | None:
+    """Return the views of an entry with fixed views.
+
+    Args:
+        name: of the entry, such as "orbit-8" or "best-5".
+        specs: the E episodes.
+        rng: source of all random numbers.
+
+    Returns:
+        Views in order, (E, k) int64; None if the entry does not have fixed views.
+
+    Raises:
+        EntryError: there are fewer views than the name asks for.
+    """
+    match = re.fullmatch(
+        rf"({'|'.join([*FIXED_ENTRIES, 'true-[a-z0-9_]+'])})-(\d+)",
+        name,
+    )
+    if not match:
+        return None
+
+    p = specs.predictions
+    objects = specs.objects
+    kind = match[1]
+    k = int(match[2])
+
+    if not 1 <= k <= len(p.sphere):
+        raise EntryError(
+            f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be"
+            " taken"
+        )
+
+    if kind == "orbit":
+        return orbit(p.sphere, specs.starts, k)
+    if kind == "random-fixed":
+        return ranked(rng.random((len(objects), len(p.sphere))), k)
+    if kind.startswith("true-"):
+        return ranked(true_measure(p, kind.removeprefix(TRUE)).astype(np.float64), k)[
+            objects
+        ]
+
+    if kind in ("high-entropy", "low-entropy"):
+        values = p.depth_entropy.astype(np.float64)
+    else:
+        values = log_softmax(p.logits.astype(np.float64), axis=2)[
+            np.arange(len(p)),
+            :,
+            p.labels,
+        ]
+    return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]

@@ -1,0 +1,749 @@
+"""Gymnasium environments to train or evaluate a policy; see docs/environments.md.
+
+Importing this module registers them:
+
+- ``nextview/Recognise-v0``: replays a file of predictions, thousands of episodes in one batch,
+  without rendering.
+- ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
+- ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.checks import number, one_line, whole
+from nextview.data.folders import list_dataset
+from nextview.data.samples import SAMPLE_MESHES, sample_mesh
+from nextview.errors import DatasetError, SessionError, UsageError
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import EpisodeState
+from nextview.policies.gain import (
+    INPUTS,
+    VISIBILITY,
+    CellFrame,
+    features,
+    maps_of,
+    mirrored_features,
+    ordered,
+    origin,
+)
+from nextview.policies.learned_tables import cells_from
+from nextview.recognition.belief import Calibration, FixedLength, Stopping
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.inference import Models, NetworkRecogniser, open_maps
+from nextview.recognition.map_names import in_order
+from nextview.recognition.model_card import find_models
+from nextview.session.episode import Episodes
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.types import Float, Float32, Index, Mask
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.errors import PredictionsError
+from nextview_lab.extras import extras
+from nextview_lab.training.rollout import OBJECTIVES, value_of
+
+with extras():
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+
+log = logging.getLogger(__name__)
+PredictionsSource = str | Path | Predictions
+CAMERAS = 16  # meshes that are cached
+_HERE = "nextview_lab.benchmark.environments"
+gymnasium.register(
+    "nextview/Recognise-v0",
+    f"{_HERE}:RecogniseEnv",
+    vector_entry_point=f"{_HERE}:RecogniseVectorEnv",
+)
+gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
+gymnasium.register(
+    "nextview/RecogniseThings-v0",
+    "nextview_lab.benchmark.thing_environment:RecogniseThingsEnv",
+)
+# objects for training or for evaluation; None for all
+EnvironmentSplit = Literal["train", "test"] | None
+Info = dict[str, Any]
+# bound of the observation space for map outputs, far above those of the networks of this project
+MAP_LIMIT = 100.0
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Observations and rewards of the agent, and the end of an episode.
+
+    Attributes:
+        inputs: of an observation: "belief", "view" (the belief from the last view alone), "place"
+            (the ring and the visited views), "azimuth_bin", and predicted maps by name ("lem",
+            "view_area-sphere").
+        frame: origin of azimuths: the "camera", or the "object" in its estimated orientation.
+        objective: "right" answer, "belief" in the true class, or its "log-belief"; the reward is
+            its change by a view.
+        max_views: largest number of views, at least 2; the first view is not chosen by the agent.
+        threshold: belief that ends an episode after the second view or later; None takes all views.
+        view_price: subtracted from the reward for each view.
+        travel_price: subtracted from the reward for each grid cell of travel.
+    """
+
+    inputs: tuple[str, ...] = ("belief", "view", "place")
+    frame: CellFrame = "camera"
+    objective: str = "right"
+    max_views: int = 5
+    threshold: float | None = None
+    view_price: float = 0.0
+    travel_price: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.inputs or VISIBILITY in self.inputs:
+            raise UsageError(
+                f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
+            )
+        for value, known in (
+            (self.frame, get_args(CellFrame)),
+            (self.objective, OBJECTIVES),
+        ):
+            if value not in known:
+                raise UsageError(f"{value!r} is none of {', '.join(known)}")
+        number(self.view_price, "the view_price", 0)
+        number(self.travel_price, "the travel_price", 0)
+        # raises an error for an invalid threshold
+        Stopping(0.5 if self.threshold is None else self.threshold)
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Maps among the inputs."""
+        return maps_of(self.inputs)
+
+    def stopping(self, calibration: Calibration) -> Stopping:
+        """Return the stopping rule, with the decay of the threshold from the calibration."""
+        if self.threshold is None:
+            return FixedLength(max_views=self.max_views)
+        return AfterAction(self.threshold, self.max_views, calibration.correlation)
+
+
+@dataclass(frozen=True)
+class AfterAction(Stopping):
+    """Stopping rule that never ends an episode at the first view."""
+
+    def threshold_at(self, n_views: Index | int) -> Float:
+        """Return the threshold, see ``Stopping``; infinity for one view."""
+        return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
+
+
+def rows(values: Any, n: int, below: int, what: str) -> Index:
+    """Check integers chosen by an agent or a user.
+
+    Args:
+        values: the numbers; one number for one row.
+        n: expected number of them.
+        below: upper limit, exclusive; the lower limit is 0.
+        what: name of the numbers in the error message.
+
+    Returns:
+        The numbers, (n,) int64.
+
+    Raises:
+        UsageError: they are not n such numbers.
+    """
+    array = np.atleast_1d(np.asarray(values))
+    if (
+        array.shape != (n,)
+        or array.dtype.kind not in "iu"
+        or not ((array >= 0) & (array < below)).all()
+    ):
+        many = "a whole number" if n == 1 else f"{n} whole numbers"
+        raise UsageError(
+            f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}"
+        )
+    return array.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class EnvironmentTask:
+    """N objects, their views, and the rules.
+
+    Attributes:
+        labels: true class of each object, (N,).
+        classes: names of the classes.
+        sphere: of the views.
+        calibration: from summed evidence to the belief.
+        observe: from objects, (A,), and views, (A,), to the evidence of each view.
+        rules: of an episode.
+        balanced: whether all classes are drawn equally often.
+    """
+
+    labels: Index
+    classes: tuple[str, ...]
+    sphere: ViewSphere
+    calibration: Calibration
+    observe: Callable[[Index, Index], Evidence] = field(repr=False)
+    rules: Rules = Rules()
+    balanced: bool = False
+
+    def __post_init__(self) -> None:
+        whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
+
+    def begin(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        options: Info | None = None,
+    ) -> "Cohort":
+        """Begin episodes.
+
+        Args:
+            n: number of episodes.
+            rng: source of all random numbers.
+            options: of ``reset``: "object" and "start" of each episode; random by default.
+
+        Returns:
+            The episodes.
+
+        Raises:
+            UsageError: an option is not valid.
+        """
+        weight = 1 / np.bincount(self.labels)[self.labels]
+        chance = weight / weight.sum() if self.balanced else None
+        objects = rng.choice(len(self.labels), n, p=chance)
+        starts = rng.integers(len(self.sphere), size=n)
+        given = {"object": objects, "start": starts} | (options or {})
+        below = {"object": len(self.labels), "start": len(self.sphere)}
+        return Cohort(
+            self,
+            *(rows(given[name], n, most, name) for name, most in below.items()),
+        )
+
+    @property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Space of ``policies.gain.features``, (D,) float32; all but the maps are in 0 to 1."""
+        c = len(self.classes)
+        rules = self.rules
+        widths = {
+            name: len(mirrored_features(self.sphere, c, (name,), rules.frame))
+            for name in ordered(rules.inputs)
+        }
+        high = np.concatenate(
+            [
+                np.full(wide, MAP_LIMIT if name in rules.maps else 1.0)
+                for name, wide in widths.items()
+            ]
+        )
+
+        return gymnasium.spaces.Box(
+            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
+            high.astype(np.float32),
+        )
+
+    @property
+    def action_space(self) -> gymnasium.spaces.Discrete:
+        """Ring and azimuth steps ahead, as ``ring * azimuths + steps``; V actions."""
+        return gymnasium.spaces.Discrete(len(self.sphere))
+
+
+def replayed(
+    predictions: PredictionsSource,
+    split: EnvironmentSplit = "train",
+    balanced: bool = False,
+    rules: Rules = Rules(),
+) -> EnvironmentTask:
+    """Create the task of recognising the objects of predictions.
+
+    Train on objects that the recogniser was not trained on (``nextview-lab predict --held-out``).
+    Predictions without splits, such as those of taught things, are all used for "train".
+
+    Args:
+        predictions: the predictions, or their path.
+        split: "train" (each shape once), "test", or None for all objects.
+        balanced: whether all classes are drawn equally often.
+        rules: of the episodes.
+
+    Returns:
+        The task.
+
+    Raises:
+        PredictionsError: there are no objects of the split, or a map or the azimuth bins are
+            missing.
+    """
+    p = (
+        predictions
+        if isinstance(predictions, Predictions)
+        else Predictions.load(Path(predictions))
+    )
+    if split == "train" and not p.splits.any():
+        log.warning(
+            "the predictions name no splits, as those of taught things: all %d objects are taken",
+            len(p),
+        )
+        split = None
+
+    p = p if split is None else p.of_split(split)
+    p = p.deduplicate() if split == "train" else p
+
+    for name in rules.maps:
+        if name not in p.maps:
+            known = ", ".join((*INPUTS, *in_order(p.maps)))
+            raise PredictionsError(
+                f"these predictions hold no map {name!r}; inputs are some of {known}"
+            )
+
+    if (
+        "azimuth_bin" in rules.inputs or rules.frame == "object"
+    ) and p.azimuth_bins is None:
+        raise PredictionsError(
+            "these predictions hold no azimuth bins, which the inputs or the frame need"
+        )
+
+    p = replace(p, maps={name: p.maps[name] for name in rules.maps})
+    return EnvironmentTask(
+        p.labels,
+        p.classes,
+        p.sphere,
+        p.calibration,
+        p.evidence,
+        rules,
+        balanced,
+    )
+
+
+@dataclass
+class Asked:
+    """The policy of a cohort: takes the free view nearest to the agent's action.
+
+    Attributes:
+        sphere: of the views.
+        views: requested views, one per episode.
+        needs: required inputs, see ``Policy.needs``.
+    """
+
+    sphere: ViewSphere
+    views: Index
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
+        """Return the free view nearest to the requested one.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
+        return np.where(
+            state.free,
+            self.sphere.travel[self.views[state.episodes]],
+            np.inf,
+        ).argmin(1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Outcomes of the actions in A episodes.
+
+    Attributes:
+        observation: (A, D) float32.
+        change: of the objective, (A,).
+        price: of the view and the travel to it, (A,).
+        ended: whether each episode has ended, (A,) bool.
+        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer", its
+            "confidence", "prediction_target" and "action_mask", the actions that lead to an
+            unvisited view, (A, V) int8.
+    """
+
+    observation: Float32
+    change: Float
+    price: Float
+    ended: Mask
+    info: dict[str, NDArray[Any]]
+
+
+class Cohort:
+    """B episodes that run side by side, all with the same number of views.
+
+    ``first`` is the outcome before any action.
+    """
+
+    def __init__(self, task: EnvironmentTask, objects: Index, starts: Index) -> None:
+        self.task = task
+        self.objects = objects
+        self._asked = Asked(task.sphere, np.array(starts))
+        # not used for any draw
+        rng = np.random.default_rng(0)
+        stopping = task.rules.stopping(task.calibration)
+        self.episodes = Episodes(
+            task.sphere,
+            self._asked,
+            starts,
+            stopping,
+            rng,
+            task.calibration,
+        )
+        self._visited = np.zeros((len(objects), len(task.sphere)), bool)
+        self._value = np.zeros(len(objects))
+        self._travel = np.zeros(len(objects))
+        self.first = self._look(np.zeros(len(objects)))
+
+    def step(self, actions: Index) -> Seen:
+        """Continue all running episodes; visited views are replaced by the nearest free ones."""
+        sphere = self.task.sphere
+        running = self.episodes.running
+        rules = self.task.rules
+        # ``current`` is the next view
+        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]
+        self._asked.views[running] = self._reached[np.arange(len(running)), actions]
+        self.episodes.keep_choice(self.episodes.next_choice())
+        way = sphere.travel[before, self.episodes.current[running]]
+        self._travel[running] += way
+        return self._look(rules.view_price + rules.travel_price * way)
+
+    def _look(self, price: Float) -> Seen:
+        task = self.task
+        running = self.episodes.running
+        k = len(self.episodes.steps) + 1
+        sphere = task.sphere
+        calibration = task.calibration
+        classes = len(task.classes)
+        objects = self.objects[running]
+        views = self.episodes.current[running]
+
+        step = self.episodes.update(task.observe(objects, views))
+        n_seen = np.maximum(step.seen, 1)
+        self._visited[running, views] = True
+        visited = self._visited[running]
+        labels = task.labels[objects]
+
+        azimuth_bins = calibration.azimuth_bins(
+            step.total,
+            n_seen,
+            classes,
+            sphere.azimuth[views],
+        )
+        state = EpisodeState(
+            views,
+            visited,
+            step.belief,
+            step.evidence,
+            k,
+            running,
+            azimuth_bins,
+        )
+        value = value_of(
+            calibration.log_belief(step.total, n_seen, classes),
+            labels,
+            task.rules.objective,
+        )
+
+        change = value - self._value[running] if k > 1 else np.zeros(len(running))
+        self._value[running] = value
+        reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
+        self._reached = reached[~step.stopped]
+
+        info = {
+            "object": objects,
+            "view": views,
+            "n_views": np.full(len(running), k),
+            "travel": self._travel[running],
+            "answer": step.belief.argmax(1),
+            "confidence": step.belief.max(1),
+            "prediction_target": labels,
+            "action_mask": (~np.take_along_axis(visited, reached, 1)).astype(np.int8),
+        }
+        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(
+            np.float32
+        )
+        return Seen(seen, change, price, step.stopped, info)
+
+
+class TaskEnv(gymnasium.Env[Any, Any]):
+    """A task as an environment with one episode at a time."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(self, task: EnvironmentTask) -> None:
+        self.task = task
+        self.observation_space = task.observation_space
+        self.action_space = task.action_space
+        self._cohort: Cohort | None = None
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: Info | None = None,
+    ) -> tuple[Any, Info]:
+        """Begin an episode; see Gymnasium.
+
+        Args:
+            seed: of the random numbers; None to continue their sequence.
+            options: "object" and "start"; random by default.
+
+        Returns:
+            The first observation and its info.
+        """
+        super().reset(seed=seed)
+        self._cohort = self.task.begin(1, self.np_random, options)
+        return self.observed(self._cohort.first), info_of(self._cohort.first)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        seen = self.go(action)
+        return (
+            self.observed(seen),
+            float((seen.change - seen.price)[0]),
+            bool(seen.ended[0]),
+            False,
+            info_of(seen),
+        )
+
+    def go(self, action: Any) -> Seen:
+        """Return the outcome of an action."""
+        if self._cohort is None or len(self._cohort.episodes.running) == 0:
+            raise SessionError("no episode is under way; call reset")
+        return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
+
+    def observed(self, seen: Seen) -> Any:
+        """Return the observation of the single episode."""
+        return seen.observation[0]
+
+
+def info_of(seen: Seen) -> Info:
+    """Return the info of a single episode."""
+    return {name: values[0] for name, values in seen.info.items()}
+
+
+class RecogniseEnv(TaskEnv):
+    """Recognise an object from few views that are looked up in predictions; see ``replayed``.
+
+    ``rules`` are the arguments of ``Rules``.
+    """
+
+    def __init__(
+        self,
+        predictions: PredictionsSource,
+        split: EnvironmentSplit = "train",
+        balanced: bool = False,
+        **rules: Any,
+    ) -> None:
+        super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
+
+
+class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
+    """Many episodes of a task at once, grouped in cohorts by number of views."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
+
+    def __init__(self, task: EnvironmentTask, num_envs: int) -> None:
+        self.task = task
+        self.num_envs = whole(num_envs, "the number of environments", 1)
+        self.single_observation_space = task.observation_space
+        self.single_action_space = task.action_space
+        self.observation_space = batch_space(task.observation_space, num_envs)
+        self.action_space = batch_space(task.action_space, num_envs)
+        self._cohorts: list[tuple[Cohort, Index]] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: Info | None = None,
+    ) -> tuple[Float32, Info]:
+        """Begin an episode in every environment; see Gymnasium.
+
+        Args:
+            seed: of the random numbers; None to continue their sequence.
+            options: "object" and "start" of each episode; random by default.
+
+        Returns:
+            The first observations, (E, D) float32, and their infos.
+        """
+        super().reset(seed=seed)
+        cohort = self.task.begin(self.num_envs, self.np_random, options)
+        self._cohorts = [(cohort, np.arange(self.num_envs))]
+        return cohort.first.observation, cohort.first.info
+
+    def step(self, actions: Any) -> tuple[Float32, NDArray, Mask, Mask, Info]:
+        seen, info = self.go(actions)
+        return (
+            seen.observation,
+            seen.change - seen.price,
+            seen.ended,
+            np.zeros(self.num_envs, bool),
+            info,
+        )
+
+    def go(self, actions: Any) -> tuple[Seen, Info]:
+        """Return the next observation of each episode; ended episodes are replaced by new ones."""
+        if not self._cohorts:
+            raise SessionError("no episode is under way; call reset")
+
+        actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
+        wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
+        parts = [
+            cohort.step(actions[where])
+            for (cohort, _), where in zip(self._cohorts, wheres, strict=True)
+        ]
+
+        order = np.argsort(np.concatenate(wheres))
+        names = ("observation", "change", "price", "ended")
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in names
+        }
+        info = {
+            name: np.concatenate([part.info[name] for part in parts])[order]
+            for name in parts[0].info
+        }
+
+        seen = Seen(**joined, info=info)
+        self._cohorts = [
+            (cohort, members)
+            for cohort, members in self._cohorts
+            if len(cohort.episodes.running)
+        ]
+
+        over = np.flatnonzero(seen.ended)
+        if len(over) == 0:
+            return seen, info
+        last = seen.observation.copy()
+        now = {name: values.copy() for name, values in info.items()}
+
+        fresh = self.task.begin(len(over), self.np_random)
+        self._cohorts.append((fresh, over))
+        seen.observation[over] = fresh.first.observation
+        for name, values in fresh.first.info.items():
+            now[name][over] = values
+
+        return seen, now | {
+            "final_obs": last,
+            "_final_obs": seen.ended,
+            "final_info": info,
+            "_final_info": seen.ended,
+        }
+
+
+class RecogniseVectorEnv(TaskVectorEnv):
+    """Vector version of ``RecogniseEnv`` with ``num_envs`` episodes side by side."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        predictions: PredictionsSource,
+        split: EnvironmentSplit = "train",
+        balanced: bool = False,
+        **rules: Any,
+    ) -> None:
+        super().__init__(
+            replayed(predictions, split, balanced, Rules(**rules)),
+            num_envs,
+        )
+
+
+class RecogniseMeshEnv(TaskEnv):
+    """Recognise an object from few rendered views of its mesh.
+
+    Args:
+        meshes: folder CLASS/train|test/MESH or CLASS/MESH; by default the samples.
+        split: "train" or "test"; None for folders without splits, such as the samples.
+        models: name of bundled models, or a folder.
+        viewpoints: layout of ``ViewSphere.named``.
+        depth: return observations {"state": (D,), "depth": (size, size) float32, object radii, 0
+            for the background}.
+        size: side of the images, pixels, a multiple of the input size of the networks, which is 112
+            for the bundled ones.
+        balanced: draw all classes equally often.
+        rules: arguments of ``Rules``.
+
+    Raises:
+        DatasetError: there are no such meshes, or the recogniser does not know a class.
+    """
+
+    def __init__(
+        self,
+        meshes: str | Path | None = None,
+        split: EnvironmentSplit = "train",
+        models: str | Path = "modelnet10",
+        viewpoints: str = "40",
+        depth: bool = False,
+        size: int = 224,
+        balanced: bool = False,
+        **rules: Any,
+    ) -> None:
+        whole(size, "the side of an image", 1)
+        given = Rules(**rules)
+        found = find_models(models)
+        sphere = ViewSphere.named(viewpoints)
+
+        self._models = Models(
+            NetworkRecogniser(found.recogniser),
+            open_maps(found.maps, given.maps),
+        )
+        classes = self._models.classes
+        calibration = self._models.recogniser.calibration
+
+        objects: list[tuple[str, Callable[[], Mesh]]] = [
+            (name, partial(sample_mesh, name)) for name in SAMPLE_MESHES
+        ]
+        if meshes is not None:
+            entries = [
+                e for e in list_dataset(Path(meshes)) if split in (None, e.split)
+            ]
+            objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
+
+        if not objects:
+            raise DatasetError(
+                f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that"
+                " there are"
+            )
+        for label, _ in objects:
+            if label not in classes:
+                raise DatasetError(
+                    f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}"
+                )
+
+        labels = np.array([classes.index(label) for label, _ in objects])
+        self._camera = lru_cache(CAMERAS)(
+            lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
+        )
+        super().__init__(
+            EnvironmentTask(
+                labels,
+                classes,
+                sphere,
+                calibration,
+                self._rendered,
+                given,
+                balanced,
+            )
+        )
+
+        self._depth = depth
+        if depth:
+            image = gymnasium.spaces.Box(
+                0,
+                np.float32(sphere.distance + 1),
+                (size, size),
+            )
+            self.observation_space = gymnasium.spaces.Dict(
+                {"state": self.task.observation_space, "depth": image}
+            )
+
+    def _rendered(self, objects: Index, views: Index) -> Evidence:
+        poses = self.task.sphere.poses
+        seen = [
+            self._camera(int(k)).observe(poses[v])
+            for k, v in zip(objects, views, strict=True)
+        ]
+        self._last = seen[-1]
+        return self._models.evidence(seen)
+
+    def observed(self, seen: Seen) -> Any:
+        """Return the state, with the depth image if requested."""
+        state = super().observed(seen)
+        return {"state": state, "depth": self._last.depth} if self._depth else state

@@ -1,0 +1,219 @@
+"""Write a folder of results: tables as CSV, Markdown and LaTeX, figures, and settings."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nextview.files import new_folder
+from nextview.session.style import to_png
+from nextview_lab.benchmark.comparison import Tables, too_few, values_of
+from nextview_lab.benchmark.figures import differences, views_curve
+from nextview_lab.extras import extras
+
+with extras():
+    import pandas as pd
+
+RECORD = "benchmark.json"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table that compares policies.
+
+    Attributes:
+        heading: of the column.
+        measures: in a cell, separated by commas.
+        views: number of views; 0 for whole episodes.
+        digits: after the decimal point.
+        short: heading in narrow tables; "" if it is not part of them.
+    """
+
+    heading: str
+    measures: tuple[str, ...]
+    views: int = 0
+    digits: int = 3
+    short: str = ""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A table that compares policies.
+
+    Attributes:
+        title: of the table.
+        name: of the set of objects.
+        columns: after the column of policy names.
+        about: a line below the title.
+    """
+
+    title: str
+    name: str
+    columns: tuple[Column, ...]
+    about: str = ""
+
+    def narrow(self) -> list[Column]:
+        """Return the columns of the narrow tables."""
+        return [column for column in self.columns if column.short]
+
+
+@dataclass(frozen=True)
+class ComparedTables(Tables):
+    """Tables of a benchmark with their layout.
+
+    Attributes:
+        boards: the tables that compare policies.
+        chosen: a sentence on how the reference was selected; "" if it was named.
+    """
+
+    boards: tuple[Board, ...]
+    chosen: str
+
+    def sentences(self) -> list[str]:
+        """Return the conclusions: the selection of the reference, and sets that are too small."""
+        few = [f"{name}: {sentence}" for name, sentence in too_few(self.tests).items()]
+        return [*filter(None, [self.chosen]), *few]
+
+
+def write_results(
+    out: Path,
+    tables: Tables,
+    made: Mapping[str, Any],
+    more: Callable[[Path], None],
+    overwrite: bool = True,
+    withdraw: bool = False,
+) -> None:
+    """Write tables and settings to a folder.
+
+    Args:
+        out: the folder.
+        tables: the results.
+        made: settings, as JSON-compatible values.
+        more: writes further files.
+        overwrite: whether to replace earlier results.
+        withdraw: see ``files.new_folder``.
+    """
+    with new_folder(out, overwrite, last=RECORD, withdraw=withdraw) as part:
+        for name, table in tables.frames().items():
+            table.to_csv(part / f"{name}.csv", index=False)
+        more(part)
+        (part / RECORD).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+
+
+def board_rows(
+    tables: Tables,
+    board: Board,
+    columns: Sequence[Column],
+    marked: Iterable[tuple[str, str, int]] = (),
+) -> Iterator[list[str]]:
+    """Iterate over the rows of a board as text: the policy, then a cell for each column.
+
+    Args:
+        tables: of the benchmark.
+        board: the table.
+        columns: of the table.
+        marked: policy, measure and views of the numbers marked with a star.
+
+    Yields:
+        The cells of a policy.
+    """
+    values = values_of(tables, board.name)
+    stars = set(marked)
+
+    def shown(policy: str, measure: str, column: Column) -> str:
+        value = values[policy, measure, column.views][0]
+        star = "*" * ((policy, measure, column.views) in stars)
+        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
+
+    for policy in tables.policies():
+        yield [
+            policy,
+            *(", ".join(shown(policy, m, c) for m in c.measures) for c in columns),
+        ]
+
+
+def markdown(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Format a table as Markdown.
+
+    Args:
+        head: headings.
+        rows: cells.
+    """
+    head = list(head)
+    lines = [head, *rows]
+    text = [f"| {' | '.join(map(str, line))} |" for line in lines]
+    return "\n".join([text[0], "|---" * len(head) + "|", *text[1:]]) + "\n"
+
+
+def compared_markdown(tables: ComparedTables) -> str:
+    """Format the boards, followed by all tests, as Markdown."""
+    parts = []
+    for board in tables.boards:
+        head = ["policy", *(column.heading for column in board.columns)]
+        rows = board_rows(tables, board, board.columns)
+        about = [f"{board.about}\n"] if board.about else []
+        parts += [f"### {board.title}\n", *about, markdown(head, rows)]
+    few = tables.sentences()
+    chosen = [few.pop(0) + "\n"] if tables.chosen else []
+    parts += [*chosen, f"### Differences to {tables.reference}\n", _tests(tables)]
+    return "\n".join([*parts, *(f"{sentence}\n" for sentence in few)])
+
+
+def _tests(tables: Tables) -> str:
+    """Format all tests as Markdown."""
+    head = ["set", "policy", "measure", f"difference to {tables.reference}"]
+    rows = []
+    row: Any  # a named tuple
+    for row in tables.tests.itertuples():
+        measure = f"{row.measure} after {row.views}" if row.views else row.measure
+        p = "-" if np.isnan(row.p_holm) else f"{row.p_holm:.4f}"
+        between = f"{row.low:+.3f} to {row.high:+.3f}"
+        rows.append(
+            [row.set, row.policy, measure, f"{row.difference:+.3f}", between, p]
+        )
+    return markdown([*head, "95 % interval", "p (Holm)"], rows)
+
+
+def write_compared(
+    out: Path,
+    tables: ComparedTables,
+    made: Mapping[str, Any],
+    measure: str,
+    what: str,
+) -> None:
+    """Write tables and figures to a folder, replacing earlier ones.
+
+    Args:
+        out: the folder.
+        tables: the results.
+        made: settings, as JSON-compatible values.
+        measure: the share shown in the figures, after numbers of views.
+        what: description of that share.
+    """
+
+    def more(part: Path) -> None:
+        (part / "tables.md").write_text(compared_markdown(tables), encoding="utf-8")
+        (part / "table.tex").write_text(latex(tables), encoding="utf-8")
+        to_png(views_curve(tables, measure, what), part / "accuracy.png")
+        tests = tables.tests[tables.tests["measure"] == measure]
+        if len(tests):
+            k = tests["views"].min()
+            drawn = differences(tables, tests[tests["views"] == k], f"{what} after {k}")
+            to_png(drawn, part / "differences.png")
+
+    write_results(out, tables, made, more)
+
+
+def latex(tables: ComparedTables) -> str:
+    """Format the narrow boards as LaTeX tables, which need the package booktabs."""
+    parts = []
+    for board in tables.boards:
+        columns = board.narrow()
+        head = ["policy", *(column.short for column in columns)]
+        rows = pd.DataFrame(board_rows(tables, board, columns), columns=head)
+        rows["policy"] = [policy.rpartition(":")[2] for policy in rows["policy"]]
+        parts.append(f"% {board.title}\n{rows.to_latex(index=False, escape=True)}")
+    return "\n".join(parts)

@@ -1,0 +1,337 @@
+"""Run policies in one episode of the benchmark of things.
+
+Workers import this module, so it imports neither pandas nor matplotlib.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import msgspec
+import numpy as np
+
+from nextview.checks import number, whole
+from nextview.errors import DatasetError, PolicyError, UsageError, option
+from nextview.geometry.mesh import UNITS, Mesh, load_mesh
+from nextview.policies.base import Policy
+from nextview.recognition.model_card import find_models
+from nextview.simulation.sensor import sensor_named
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.surface import Surface
+from nextview.things.taught import TaughtThings
+from nextview_lab.benchmark.jobs import Job
+from nextview_lab.benchmark.own_things import OwnThings, own_things
+from nextview_lab.benchmark.thing_episodes import (
+    EPISODE_SPHERE,
+    Occlusion,
+    Setting,
+    ThingEpisode,
+)
+from nextview_lab.benchmark.thing_policies import (
+    BEST_BLIND,
+    CEILINGS,
+    THING_POLICIES,
+    policies_of,
+)
+
+SCAN_APART = 0.2  # radii, largest distance between a scan and the taught surface
+
+
+class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Results of one policy in one episode.
+
+    Attributes:
+        views: in order.
+        right: whether the thing is named correctly after each view.
+        confidence: belief in the answer after each view.
+        p_value: share of known things that are explained as badly after each view; None if it was
+            not fitted.
+        decision: CPU time of each choice, seconds.
+        verification: CPU time of each verification, seconds.
+        pose_error: mean distance of the surface (ADD-S), millimetres, after each view; None if the
+            thing is not named correctly.
+    """
+
+    views: list[int]
+    right: list[bool]
+    confidence: list[float]
+    p_value: list[float | None]
+    decision: list[float]
+    verification: list[float]
+    pose_error: list[float | None]
+
+
+class EpisodeRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Results of all policies in one episode: one run each, several for "random".
+
+    Attributes:
+        thing: its name.
+        draw: number of the draw.
+        runs: by policy.
+    """
+
+    thing: str
+    draw: int
+    runs: dict[str, list[ThingRun]]
+
+
+def run(
+    episode: ThingEpisode,
+    policy: Policy,
+    count: int,
+    rng: np.random.Generator,
+) -> ThingRun:
+    """Take some views with a policy.
+
+    Args:
+        episode: the thing.
+        policy: chooses all views but the first.
+        count: number of views.
+        rng: for random policies.
+
+    Returns:
+        The results after each view.
+    """
+    views = [episode.start]
+    made: dict[str, list[Any]] = {
+        name: [] for name in ThingRun.__struct_fields__ if name != "views"
+    }
+
+    while True:
+        found, seconds = episode.verified(views)
+        made["right"].append(episode.named_right(views))
+        made["confidence"].append(float(found.belief.max()))
+        made["p_value"].append(episode.p_value(views))
+        made["verification"].append(seconds)
+        made["pose_error"].append(episode.pose_error(views))
+        if len(views) == count:
+            return ThingRun(views=views, **made)
+
+        begun = time.process_time()
+        # the CPU time of a choice includes the prediction of views
+        state = episode.state(views, policy.needs)
+        view = int(policy.next_views(state, rng)[0])
+        made["decision"].append(time.process_time() - begun)
+        if not state.free[0, view]:
+            raise PolicyError(f"a policy chose the view {view}, which was taken before")
+        views.append(view)
+
+
+def policies_in(runs: Sequence[EpisodeRuns]) -> tuple[str, ...]:
+    """Return the policies that were run in all episodes, those of the package first."""
+    there = set.intersection(*(set(each.runs) for each in runs))
+    own = sorted(there - set(THING_POLICIES))
+    return (*(name for name in THING_POLICIES if name in there), *own)
+
+
+@dataclass(frozen=True)
+class ThingSettings:
+    """Conditions, policies and statistics.
+
+    Attributes:
+        models: name or folder of the memory that was taught the scans; by default they are taught
+            first, into OUT/memory.
+        sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md).
+        occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave half and a
+            third of them visible.
+        draws: episodes per thing, each with another rotation and first view.
+        views: numbers of views after which the policies are compared; the largest is the length of
+            the episodes.
+        policies: names, or MODULE:CLASS for your own; by default all that the recogniser supports.
+            Only missing results are computed; your own policies always run again.
+        reference: policy with which the others are compared; it is always included. "best-blind" is
+            the rule that ignores the images (random, spread, furthest, fixed or ring) and is best
+            after the first view in other episodes of the same things.
+        choose_seed: seed of these other episodes.
+        recogniser: MODULE:NAME of your own recogniser, which replaces the memory; its classes are
+            the things, and nothing is taught. Policies that need the hypotheses of a memory are not
+            included.
+        threshold: belief from which an answer counts as confident, unless the thing is explained
+            worse than nine in ten known ones; a session would continue in that case, too.
+        repeats: runs of the policy random in each episode.
+        unit: unit of length of the scan files.
+        families: count things whose names are equal up to the first _, such as variants of one
+            scan, as one in intervals and p-values.
+        samples: number of bootstrap samples.
+        seed: seed of rotations, boxes, first views, noise and random policies.
+    """
+
+    models: str | None = None
+    sensor: str = "wrist"
+    occlusion: Occlusion = "none"
+    draws: int = 1
+    views: tuple[int, ...] = (1, 2, 3, 5)
+    policies: tuple[str, ...] = ()
+    reference: str = "random"
+    choose_seed: int = 1
+    recogniser: str | None = None
+    threshold: float = 0.97
+    repeats: int = 2
+    unit: str = "m"
+    families: bool = False
+    samples: int = 10_000
+    seed: int = 0
+
+    def check(self) -> None:
+        """Check the settings before any work is done.
+
+        Raises:
+            UsageError: a number, a unit or a sensor is invalid.
+        """
+        for value, what in ((self.draws, "draws"), (self.repeats, "repeats")):
+            whole(value, f"the number of {what}", 1)
+        whole(self.samples, "the samples of the bootstrap", 100)
+
+        if not self.views or list(self.views) != sorted(set(self.views)):
+            raise UsageError("the numbers of views ascend, as in --views 1 2 3 5")
+        whole(self.views[0], "a number of views", 1, len(EPISODE_SPHERE))
+        whole(self.views[-1], "a number of views", 2, len(EPISODE_SPHERE))
+
+        if number(self.threshold, "the threshold", 0) >= 1:
+            raise UsageError(f"a threshold is below 1, not {self.threshold}")
+        if self.unit not in UNITS:
+            raise UsageError(f"the unit is {', '.join(UNITS)}, not {self.unit}")
+
+        if self.reference == BEST_BLIND and self.choose_seed == self.seed:
+            raise UsageError(
+                "the best blind rule is chosen in other episodes than it is compared in: give"
+                f" --choose-seed another value than --seed, {self.seed}"
+            )
+        if self.recogniser is not None and self.models is not None:
+            raise UsageError("a recogniser of your own takes no --models")
+        sensor_named(self.sensor)
+
+
+@dataclass(frozen=True)
+class ThingJob(Job):
+    """One episode, and the policies to run in it.
+
+    Attributes:
+        models: name or folder of the memory.
+        scan: file of the thing.
+        thing: number of the thing.
+        draw: number of the draw.
+    """
+
+    models: str
+    scan: Path
+    thing: int
+    draw: int
+
+
+@lru_cache(maxsize=1)
+def opened(models: str) -> TaughtThings:
+    """Open the things with known geometry of a memory.
+
+    Raises:
+        UsageError: there are none.
+    """
+    recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
+    things = TaughtThings.of(recogniser)
+    if things is None:
+        raise UsageError(
+            f"{models}: knows the geometry of no thing; teach it with --unit"
+        )
+    return things
+
+
+def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
+    """Open the things of your own recogniser, or else of a memory.
+
+    Args:
+        models: folder or name of the memory.
+        recogniser: MODULE:NAME of your own; None for the memory.
+    """
+    return opened(models) if recogniser is None else own_things(recogniser)
+
+
+def work(job: ThingJob) -> None:
+    """Run the policies of a job, and write the results."""
+    how: ThingSettings = job.settings
+    things = things_of(job.models, how.recogniser)
+    chosen = policies_of(job.policies, things)
+    episode = ThingEpisode(
+        things,
+        partial(scan_of, things, job.thing, job.scan, how.unit),
+        job.thing,
+        job.draw,
+        Setting(how.sensor, how.occlusion, how.seed),
+        job.out / "episodes" / job.name,
+    )
+    before = job.earlier(EpisodeRuns)
+    runs: dict[str, list[ThingRun]] = {} if before is None else before.runs
+    # The upper bound comes first, as it verifies views that the others use.
+    for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
+        runs[name] = replayed(episode, name, chosen[name], job)
+    episode.save()
+    job.write(EpisodeRuns(things.names[job.thing], job.draw, runs))
+
+
+def scan_of(
+    things: TaughtThings | OwnThings,
+    thing: int,
+    file: Path,
+    unit: str,
+) -> Mesh:
+    """Load the scan of a thing, and check that it is the taught one.
+
+    Args:
+        things: known things.
+        thing: its number among them.
+        file: the scan.
+        unit: of its lengths.
+
+    Raises:
+        DatasetError: its position or size differs from the taught surface, so that the poses would
+            not be comparable.
+    """
+    mesh = load_mesh(file, unit=unit)
+    if isinstance(things, OwnThings):
+        return mesh
+    surface = things.verifier.caster.surfaces[thing]
+    if _apart(mesh, surface) <= SCAN_APART:
+        return mesh
+
+    for other in UNITS:
+        if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
+            raise DatasetError(
+                f"{file}: is not in {unit}, by what was taught of it; give"
+                f" {option('unit', other)}"
+            )
+    raise DatasetError(
+        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
+        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught"
+    )
+
+
+def _apart(mesh: Mesh, surface: Surface) -> float:
+    """Return the distance between the corners of two bounding boxes, radii of the surface."""
+    ours = mesh.vertices * mesh.radius + mesh.centre
+    boxes = [np.stack([one.min(0), one.max(0)]) for one in (ours, surface.vertices)]
+    return float(np.abs(boxes[0] - boxes[1]).max() / surface.radius)
+
+
+def replayed(
+    episode: ThingEpisode,
+    name: str,
+    make: Callable[[ThingEpisode], Policy],
+    job: ThingJob,
+) -> list[ThingRun]:
+    """Return the runs of one policy in one episode.
+
+    Args:
+        episode: with cached views and verifications.
+        name: of the policy.
+        make: creates the policy for an episode.
+        job: first views and rules of all episodes.
+    """
+    rng = np.random.default_rng(
+        (job.settings.seed, job.thing, job.draw, crc32(name.encode()))
+    )
+    times = job.settings.repeats if name == "random" else 1
+    views = job.settings.views[-1]
+    return [run(episode, make(episode), views, rng) for _ in range(times)]

@@ -1,0 +1,275 @@
+"""The benchmark of next views of taught things: from scans to a folder of results, resumable.
+
+In addition to the files described in ``jobs``, a folder of results contains ``episodes`` with the
+cached views and verifications, one folder per episode.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from nextview.data import pool
+from nextview.data.progress import TrackProgress, silently
+from nextview.errors import DatasetError, ResultsError
+from nextview.files import command, only_one, read_record, write_record
+from nextview.geometry.mesh import load_mesh
+from nextview.teaching.learn import learn_things
+from nextview.teaching.thing_sources import find_things
+from nextview.teaching.thing_views import TeachingOptions
+from nextview.things.surface import Surface
+from nextview.things.taught import TaughtThings
+from nextview_lab.benchmark.confusable import Alikeness, how_alike
+from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
+from nextview_lab.benchmark.own_things import OwnThings
+from nextview_lab.benchmark.results import write_compared
+from nextview_lab.benchmark.thing_policies import (
+    BEST_BLIND,
+    BLIND_RULES,
+    OF_MEMORIES,
+    THING_POLICIES,
+    policies_of,
+)
+from nextview_lab.benchmark.thing_runs import (
+    EpisodeRuns,
+    ThingJob,
+    ThingSettings,
+    things_of,
+    work,
+)
+from nextview_lab.benchmark.thing_tables import ThingTables, summarise_things
+
+ALIKE_FILE = "alike.json"  # similarity of the things in the memory
+CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is selected
+MEMORY = "memory"  # folder of the taught memory, if no models are given
+
+
+def benchmark_things(
+    scans: Path,
+    out: Path,
+    settings: ThingSettings = ThingSettings(),
+    workers: int | None = None,
+    track: TrackProgress = silently,
+) -> ThingTables:
+    """Compare next-view policies on taught things, from scans to tables.
+
+    The scans are taught first, unless --models names a memory that contains them. Each thing is
+    shown at its true size through a simulated sensor, and all policies continue from the same first
+    view. Each view is rendered once and each set of views is verified once. Both are stored in OUT:
+    an interrupted run resumes, and a further policy is replayed in seconds.
+
+    A policy of your own, MODULE:CLASS, is created with the viewpoints. With needs = ("outlook",) it
+    receives the leading hypotheses (things in poses), their beliefs and their surfaces.
+
+    Args:
+        scans: folder of the scans.
+        out: folder of the results; an existing one is continued.
+        workers: number of processes; by default one per core; 0 uses this process.
+        track: callable that shows progress.
+
+    Raises:
+        UsageError: settings are invalid.
+        DatasetError: there is no scan of a thing.
+        ResultsError: OUT contains the results of other settings.
+    """
+    settings.check()
+    asked = settings
+    scans = Path(scans)
+    out = Path(out)
+    check_place(out, MEMORY)
+    pool.count(workers)
+    found = {thing.name: thing.path for thing in find_things(scans, out).things}
+    with only_one(out):
+        models = _taught(scans, out, settings, workers, track)
+        things = things_of(models, settings.recogniser)
+        if not set(things.names) & set(found):
+            knows = settings.recogniser or models
+            raise DatasetError(f"{scans}: holds no scan of anything that {knows} knows")
+        settings = replace(settings, policies=_allowed(settings, things))
+        policies_of(settings.policies, things)  # raises an error for an invalid name
+
+        chosen = ""
+        if settings.reference == BEST_BLIND:
+            others = replace(
+                settings,
+                policies=BLIND_RULES,
+                seed=settings.choose_seed,
+            )
+            jobs = _jobs(models, found, out / CHOOSING, others, things)
+            rule, chosen = best_blind(
+                _replayed(jobs, others, things, workers, track),
+                settings,
+            )
+            named = dict.fromkeys([rule, *settings.policies])
+            settings = replace(settings, reference=rule, policies=tuple(named))
+
+        jobs = _jobs(models, found, out, settings, things)
+        runs = _replayed(jobs, settings, things, workers, track)
+        names = {job.scan.stem for job in jobs}
+        alike = _alike(out, _surfaces(things, found, settings)).of(names)
+        tables = summarise_things(runs, alike, settings, chosen)
+        made = asdict(asked) | {
+            "policies": settings.policies,
+            "compared_with": settings.reference,
+            "chosen": chosen,
+            "command": command(),
+            "scans": str(scans),
+        }
+        write_compared(out, tables, made, "accuracy", "named right")
+    return tables
+
+
+def _allowed(
+    settings: ThingSettings,
+    things: TaughtThings | OwnThings,
+) -> tuple[str, ...]:
+    """Return the included policies: the reference, and the requested ones."""
+    own = isinstance(things, OwnThings)
+    all_of_them = [name for name in THING_POLICIES if not (own and name in OF_MEMORIES)]
+    first = [] if settings.reference == BEST_BLIND else [settings.reference]
+    return tuple(dict.fromkeys([*first, *(settings.policies or all_of_them)]))
+
+
+def _replayed(
+    jobs: list[ThingJob],
+    settings: ThingSettings,
+    things: TaughtThings | OwnThings,
+    workers: int | None,
+    track: TrackProgress,
+) -> list[EpisodeRuns]:
+    """Return the runs of all episodes; missing ones are computed."""
+    made = {
+        "memory_sha256": ""
+        if isinstance(things, OwnThings)
+        else things.recogniser.card.sha256,
+        "recogniser": settings.recogniser or "",
+        "sensor": settings.sensor,
+        "occlusion": settings.occlusion,
+        "views": settings.views[-1],
+        "repeats": settings.repeats,
+        "seed": settings.seed,
+    }
+    check_same(jobs[0].out, made)
+    anew = settings.recogniser is not None
+    return run_jobs(work, jobs, EpisodeRuns, workers, track, anew)
+
+
+def best_blind(
+    runs: Sequence[EpisodeRuns],
+    settings: ThingSettings,
+) -> tuple[str, str]:
+    """Return the blind rule that names most things correctly after the first view.
+
+    Args:
+        runs: of other episodes than those of the comparison.
+        settings: with the numbers of views.
+
+    Returns:
+        The rule, with ties in the order of BLIND_RULES, and a sentence about it.
+    """
+    later = [k - 1 for k in settings.views if k > 1]
+    shares = {
+        rule: float(
+            np.mean([np.array(one.right)[later] for e in runs for one in e.runs[rule]])
+        )
+        for rule in BLIND_RULES
+    }
+    best = max(BLIND_RULES, key=lambda rule: shares[rule])
+    told = ", ".join(f"{rule} {share:.3f}" for rule, share in shares.items())
+    after = ", ".join(str(k + 1) for k in later)
+    return best, (
+        f"The best blind rule is {best}: in other episodes, of seed {settings.choose_seed}, these"
+        f" shares are named right (mean after {after} views): {told}."
+    )
+
+
+def _surfaces(
+    things: TaughtThings | OwnThings,
+    scans: dict[str, Path],
+    settings: ThingSettings,
+) -> list[Surface]:
+    """Return the surfaces of all taught things, or else of the scans."""
+    if isinstance(things, TaughtThings):
+        return list(things.verifier.caster.surfaces)
+    return [
+        Surface.from_mesh(load_mesh(scans[name], unit=settings.unit), name)
+        for name in things.names
+        if name in scans
+    ]
+
+
+def _taught(
+    scans: Path,
+    out: Path,
+    settings: ThingSettings,
+    workers: int | None,
+    track: TrackProgress,
+) -> str:
+    """Return the memory of the scans, taught if it does not exist; "" if none is needed."""
+    if settings.recogniser is not None:
+        return ""
+    if settings.models is not None:
+        return settings.models
+    memory = out / MEMORY
+    if not memory.exists():
+        how = TeachingOptions(unit=settings.unit, sensor=settings.sensor)  # type: ignore[arg-type]
+        learn_things(scans, memory, how, workers=workers, track=track)
+    return str(memory)
+
+
+class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Similarity of the things in a memory, see ``Alikeness``.
+
+    Attributes:
+        nearest: name of the most similar other thing.
+        distance: of the two surfaces; None for infinity.
+    """
+
+    nearest: tuple[str, ...]
+    distance: tuple[float | None, ...]
+
+
+def _alike(out: Path, surfaces: Sequence[Surface]) -> Alikeness:
+    """Return the similarity of the things, which takes seconds and is cached in the folder."""
+    file = out / ALIKE_FILE
+    if not file.exists():
+        found = how_alike(surfaces)
+        distance = [
+            apart if apart < np.inf else None for apart in found.distance.tolist()
+        ]
+        write_record(file, _Alike(found.nearest, tuple(distance)))
+        return found
+
+    kept = read_record(file, _Alike, "how alike things are", ResultsError)
+    distances = np.array(
+        [np.inf if apart is None else apart for apart in kept.distance]
+    )
+    names = tuple(surface.name for surface in surfaces)
+    return Alikeness(names, kept.nearest, distances)
+
+
+def _jobs(
+    models: str,
+    scans: dict[str, Path],
+    out: Path,
+    settings: ThingSettings,
+    things: TaughtThings | OwnThings,
+) -> list[ThingJob]:
+    """Return all episodes of a run."""
+    return [
+        ThingJob(
+            settings,
+            out,
+            f"{thing:04d}_{draw:02d}",
+            settings.policies,
+            models,
+            scans[name],
+            thing,
+            draw,
+        )
+        for draw in range(settings.draws)
+        for thing, name in enumerate(things.names)
+        if name in scans
+    ]

@@ -1,0 +1,1 @@
+"""Stores of rendered views, their measures and predictions."""

@@ -1,0 +1,359 @@
+"""Replay predictions: the states of a policy's episodes, and the value of each next view."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from nextview.policies.base import EpisodeState, Policy
+from nextview.policies.baselines import Random
+from nextview.policies.gain import Gain
+from nextview.recognition.belief import FixedLength, of_true_class
+from nextview.session.episode import run_episodes
+from nextview.types import Float, Index
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.scene_views import SceneSight, scenes_of, sight_of
+from nextview_lab.errors import PredictionsError
+from nextview_lab.training.card_fits import calibration_of
+from nextview_lab.training.fitting_set import for_fitting
+
+# belief in the truth, its logarithm, or whether the answer is right
+OBJECTIVES = ("belief", "log-belief", "right")
+
+
+@dataclass(frozen=True)
+class ReplayTable:
+    """Outputs of held-out models for N objects, calibrated, and their scenes.
+
+    Attributes:
+        data: the predictions.
+        scenes: scenes around the objects; None if they stand alone.
+    """
+
+    data: Predictions
+    scenes: SceneSight | None = None
+
+    @classmethod
+    def select(
+        cls,
+        predictions: Predictions,
+        kept: NDArray,
+        rng: Generator,
+        sensed: Sequence[Predictions] = (),
+        scenes: SceneSight | None = None,
+    ) -> "ReplayTable":
+        """Select some of the objects of predictions.
+
+        If their recogniser has no calibration, it is fitted here.
+
+        Args:
+            predictions: of the objects.
+            kept: indices of the objects.
+            rng: source of all random numbers.
+            sensed: predictions of the same objects through sensors.
+            scenes: scenes of the objects; None for those of the predictions.
+
+        Returns:
+            The table.
+
+        Raises:
+            PredictionsError: no object is left.
+        """
+        if len(kept) == 0:
+            raise PredictionsError("no object is left to learn from")
+        parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
+        data = Predictions.joined(parts)
+        scenes = scenes or scenes_of(predictions)
+        data = replace(data, calibration=calibration_of(data, rng))
+        return cls(
+            data,
+            None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))),
+        )
+
+
+@dataclass(frozen=True)
+class DecisionState:
+    """N episodes, one for each object, when the next view is chosen.
+
+    Attributes:
+        state: input of the policy.
+        total: sum of the log-evidence so far, (N, D).
+        travel: so far, grid cells, (N,).
+        seen: number of views with a visible object, (N,).
+    """
+
+    state: EpisodeState
+    total: Float
+    travel: Float
+    seen: Float
+
+
+def rollout(
+    table: ReplayTable,
+    policy: Policy,
+    n_views: int,
+    rng: Generator,
+    visibility: bool = False,
+) -> Iterator[DecisionState]:
+    """Follow a policy once over every object from a random first view.
+
+    Args:
+        table: the N objects.
+        policy: the policy.
+        n_views: views of each episode.
+        rng: source of all random numbers.
+        visibility: whether the policy needs the expected visibility.
+
+    Yields:
+        The state of all episodes after each view.
+    """
+    data = table.data
+    sphere = table.data.sphere
+    everything = np.arange(len(table.data))
+
+    starts = rng.integers(len(sphere), size=len(data))
+    if table.scenes is not None:
+        starts = np.where(
+            table.scenes.reachable,
+            rng.random(table.scenes.reachable.shape),
+            -1,
+        ).argmax(1)
+
+    constrain, visible = sight_of(table.scenes, everything)
+    length = FixedLength(max_views=n_views)
+    run = run_episodes(
+        data.evidence,
+        sphere,
+        policy,
+        starts,
+        length,
+        rng,
+        data.calibration,
+        constrain,
+        visible,
+    )
+
+    visited = np.zeros((len(data), len(sphere)), bool)
+    travel = np.zeros(len(data))
+    for k, step in enumerate(run.steps, 1):
+        visited[step.episodes, step.views] = True
+        azimuth = sphere.azimuth[step.views]
+        seen = np.maximum(step.seen, 1)
+        azimuth_bins = data.calibration.azimuth_bins(
+            step.total,
+            seen,
+            len(data.classes),
+            azimuth,
+        )
+        state = EpisodeState(
+            step.views,
+            visited.copy(),
+            step.belief,
+            step.evidence,
+            k,
+            step.episodes,
+            azimuth_bins,
+        )
+        state = constrain(
+            replace(state, visibility=visible(state) if visibility else None)
+        )
+        yield DecisionState(state, step.total, travel, step.seen)
+
+        if k < len(run.steps):
+            travel = travel + sphere.travel[step.views, step.next_views]
+
+
+def value_after(
+    table: ReplayTable,
+    total: Float,
+    n_views: NDArray | int,
+    kind: str,
+) -> Float:
+    """Return the value of sums of log-evidence.
+
+    Args:
+        table: the N objects.
+        total: sums of the log-evidence of each object, (N, ..., D).
+        n_views: number of views in the sums, (N, ...).
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, ...) float64.
+    """
+    return value_of(
+        table.data.calibration.log_belief(total, n_views, len(table.data.classes)),
+        table.data.labels,
+        kind,
+    )
+
+
+def value_of(logs: Float, labels: Index, kind: str) -> Float:
+    """Return the value of log-beliefs.
+
+    Args:
+        logs: log-beliefs up to a constant, (N, ..., C).
+        labels: true classes, (N,) int64.
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, ...) float64.
+    """
+    if kind == "right":
+        return np.equal(logs.argmax(-1).T, labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, labels)
+    return of_truth if kind == "log-belief" else np.exp(of_truth)
+
+
+def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
+    """Return the value of taking each view next.
+
+    Args:
+        table: the N objects.
+        moment: the state of the episodes.
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, V) float64.
+    """
+    # a view without a visible object has no weight in the sum
+    counts = table.data.seen.astype(np.float64)
+    n_views = np.maximum(moment.seen[:, None] + counts, 1)
+    return value_after(
+        table,
+        moment.total[:, None] + counts[..., None] * table.data.log_evidence,
+        n_views,
+        kind,
+    )
+
+
+class Value(NamedTuple):
+    """Mean objective and travel after 2, 3, ... views; classes have equal weight.
+
+    Attributes:
+        mean: objective, averaged over classes, (views - 1,).
+        travel: grid cells, (views - 1,).
+    """
+
+    mean: Float
+    travel: Float
+
+
+def judge(
+    table: ReplayTable,
+    policy: Policy,
+    n_views: int,
+    kind: str,
+    rng: Generator,
+    rounds: int = 8,
+) -> Value:
+    """Follow a policy several times over every object and return its value.
+
+    Args:
+        table: the objects.
+        policy: the policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        rng: source of all random numbers.
+        rounds: episodes with each object.
+
+    Returns:
+        Mean value and travel after 2, 3, ... views.
+    """
+    weights = table.data.weights / len(table.data) / rounds
+    reached = np.zeros((2, n_views - 1))
+    for _ in range(rounds):
+        for moment in rollout(table, policy, n_views, rng):
+            k = moment.state.step
+            if k > 1:
+                value = value_after(
+                    table,
+                    moment.total,
+                    np.maximum(moment.seen, 1),
+                    kind,
+                )
+                reached[:, k - 2] += weights @ value, weights @ moment.travel
+    return Value(*reached)
+
+
+# tables, each with a policy to follow over its objects
+Judged = Sequence[tuple[ReplayTable, Policy]]
+TRAVEL_WEIGHTS = (
+    0.0,
+    0.0005,
+    0.001,
+    0.002,
+    0.003,
+    0.005,
+    0.007,
+    0.01,
+    0.012,
+    0.015,
+    0.02,
+    0.03,
+    0.05,
+    0.1,
+)
+"""Weights of a grid cell of travel, in the unit of the objective."""
+
+
+def judge_all(
+    judged: Judged,
+    n_views: int,
+    kind: str,
+    seed: int | list[int],
+    rounds: int = 8,
+) -> Value:
+    """Return the mean value over the objects of several tables; see ``judge``.
+
+    Args:
+        judged: tables, each with its own policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        seed: of the random numbers.
+        rounds: episodes with each object.
+
+    Returns:
+        Mean value and travel after 2, 3, ... views.
+    """
+    values = [
+        judge(*pair, n_views, kind, np.random.default_rng(seed), rounds)
+        for pair in judged
+    ]
+    return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
+
+
+def fit_travel_weight(
+    judged: Sequence[tuple[ReplayTable, Gain]],
+    n_views: int,
+    kind: str,
+    seed: int,
+) -> float:
+    """Choose the lowest travel weight at which policies travel no farther than a random walk.
+
+    The random walk stays in the local window. The choice is among TRAVEL_WEIGHTS.
+
+    Args:
+        judged: tables, each with its own policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        seed: of the random numbers.
+
+    Returns:
+        The weight, value per grid cell; the largest one if all travel farther.
+    """
+    limit = judge_all(
+        [(table, Random(table.data.sphere)) for table, _ in judged],
+        n_views,
+        kind,
+        seed,
+    ).travel
+    for weight in TRAVEL_WEIGHTS:
+        paying = [
+            (table, replace(policy, travel_weight=weight)) for table, policy in judged
+        ]
+        if (judge_all(paying, n_views, kind, seed).travel <= limit).all():
+            return weight
+    return TRAVEL_WEIGHTS[-1]

@@ -1,0 +1,1 @@
+"""Drawn worlds: scenes, rooms, tables and the cameras in them."""
