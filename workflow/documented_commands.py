@@ -710,7 +710,7 @@ def run_page(
     if page in PREPARED:
         environments.run_or_end(PREPARED[page], folder)
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
-    needs_of_python: frozenset[str] = frozenset()
+    needs_of_python = needs_of(BEFORE.get(page, ""))
     printed: list[tuple[Step, list[str]]] = []
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
