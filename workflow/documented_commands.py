@@ -593,7 +593,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
 # pages of which each Python block runs by itself
 ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
 # pages whose Python blocks do again what their commands did: in a folder of its own
-BESIDE = ("docs/your_objects.md",)
+BESIDE = ("docs/your_objects.md", "docs/your_table.md")
 STORES = (  # made once, for all pages
     "nextview-lab render data/ModelNet10 views.zarr --workers 1",
     "nextview-lab predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
