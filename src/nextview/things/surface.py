@@ -291,6 +291,30 @@ class SurfaceCaster:
         depth = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
         return depth.reshape(directions.shape[:2]).astype(np.float32)
 
+    def from_all_sides(
+        self, thing: int, origins: Float32, directions: Float32
+    ) -> tuple[Float32, Float32]:
+        """Cast P rays from each of N origins at one surface, in one call.
+
+        Args:
+            thing: number of the surface.
+            origins: origins in the frame of the surface, (N, 3) float32, metres.
+            directions: directions of the rays, of any length, (N, P, 3) float32.
+
+        Returns:
+            As ``cast``: distances, (N, P) float32, and unit normals, (N, P, 3) float32.
+        """
+        rays = np.ascontiguousarray(directions.reshape(-1, 3))
+        starts = np.ascontiguousarray(np.repeat(origins, directions.shape[1], 0))
+        hits = self._scene(thing).run(starts, rays, output=1)
+        met = hits["primID"] >= 0
+        depth = np.where(met, hits["tfar"], MISSED).astype(np.float32)
+        across = np.where(met[:, None], hits["Ng"], 0)
+        length = np.sqrt(np.einsum("ni,ni->n", across, across)) + 1e-30
+        across *= (-np.sign(np.einsum("ni,ni->n", across, rays)) / length)[:, None]
+        shape = directions.shape
+        return depth.reshape(shape[:2]), across.reshape(shape).astype(np.float32)
+
     def cast(
         self,
         things: NDArray[np.integer],
@@ -309,23 +333,13 @@ class SurfaceCaster:
             and the unit normal towards the origin, (H, P, 3) float32, in the frame of the surface,
             zero for a miss.
         """
-        directions = np.ascontiguousarray(directions, np.float32)
-        starts = np.repeat(
-            np.asarray(origins, np.float32)[:, None],
-            directions.shape[1],
-            1,
-        )
+        things = np.asarray(things)
         depth = np.empty(directions.shape[:2], np.float32)
-        across = np.zeros(directions.shape, np.float32)
-        for row, thing in enumerate(np.asarray(things).tolist()):
-            hits = self._scene(thing).run(starts[row], directions[row], output=1)
-            depth[row] = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
-            across[row] = hits["Ng"]
-
-        met = np.isfinite(depth)
-        own = across[met]
-        towards = -np.sign(np.einsum("ni,ni->n", own, directions[met]))
-        scale = towards / (np.sqrt(np.einsum("ni,ni->n", own, own)) + 1e-30)
-        normals = np.zeros(directions.shape, np.float32)
-        normals[met] = own * scale[:, None]
+        normals = np.empty(directions.shape, np.float32)
+        starts = np.asarray(origins, np.float32)
+        for thing in np.unique(things).tolist():
+            rows = np.flatnonzero(things == thing)
+            depth[rows], normals[rows] = self.from_all_sides(
+                thing, starts[rows], np.asarray(directions[rows], np.float32)
+            )
         return depth, normals

@@ -23,19 +23,17 @@ from scipy import ndimage
 from nextview.cores import cores
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
-from nextview.things.depth_view import NOT_MEASURED, THING, MetricImage
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
 TEMPLATE_DIRECTIONS = 162  # viewing directions of the templates, some 15 degrees apart
-TURNS = 24  # rotations of the view in the image plane, 15 degrees apart
-TEMPLATE_SIDE = 16  # rows and columns of a template
+TURNS = 12  # rotations of the view in the image plane, 30 degrees apart
+TEMPLATE_SIDE = 12  # rows and columns of a template
 TEMPLATE_REACH = 2.2  # half width of a template, root mean squares of the outline
 RENDERING_PIXELS = 28  # rows and columns of a rendering
+POINTS = 128  # points that are kept of what a direction sees
 TEMPLATE_DISTANCE = 5.0  # distance of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # most proposed orientations of one thing
-THINGS_PROPOSED = 40  # proposed things, the likeliest by their outlines
-HIDDEN_PROPOSED = 100  # the same where every view shows only a part of the outline
 FEWEST_OUTLINE_PIXELS = 12  # fewest pixels of an outline that can be matched
 NO_FIT = 12.0  # cost of a template of another size
 # largest depth difference to the median of an outline, root mean squares of the outline
@@ -50,7 +48,7 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 # range of the template's log-size relative to the visible outline
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
-SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
+SHIFTS = (0.75, 1.5)  # step and range of the shifts of an occluded outline, sizes
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
@@ -89,24 +87,23 @@ class SeenPictures:
 
 @dataclass(frozen=True, eq=False)
 class OrientedProposals:
-    """M hypotheses of things in any orientation.
+    """M hypotheses of things in any orientation, the likeliest first.
 
     Attributes:
         things: thing of each, (M,) int64.
-        ranks: number of better orientations of the same thing in the same view, (M,) int64.
-        rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
-        centres: centres of the surfaces in the object frame, (M, 3) float64, metres.
-        log_belief: log-belief in each thing by outline and relative depth, up to a constant, (T,)
-            float64.
-        hidden: whether every view shows only a part of the outline, which then says little.
+        ranks: number of better orientations of the same thing, (M,) int64.
+        rotations: from the axes of the scan files to the world, (M, 3, 3) float64.
+        centres: centres of the surfaces in the world, (M, 3) float64, metres.
+        costs: of outline and relative depth, (M,) float32.
+        of_things: least cost of each thing, (T,) float64.
     """
 
     things: Index
     ranks: Index
     rotations: Float
     centres: Float
-    log_belief: Float
-    hidden: bool
+    costs: Float32
+    of_things: Float
 
 
 class ViewTemplates:
@@ -120,6 +117,11 @@ class ViewTemplates:
             in the camera axes, (N, 3) float64, metres.
         sizes: root mean square of the outline, metres, (N,) float64.
         pictures: the templates.
+        directions: from a thing to its cameras, unit vectors, (D, 3) float64.
+        points: points that each direction sees of each thing, relative to its centre, (T, D,
+            POINTS, 3) float32, metres.
+        normals: their unit normals, (T, D, POINTS, 3) float32.
+        fill: share of the picture that shows the thing, (T, D) float32.
     """
 
     def __init__(self, caster: SurfaceCaster, threads: int = 1) -> None:
@@ -129,7 +131,8 @@ class ViewTemplates:
             caster: surfaces of the things.
             threads: number of threads; 0 for one on each core.
         """
-        looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
+        self.directions = spread_directions(TEMPLATE_DIRECTIONS)
+        looks = looking_from(self.directions)
         with ThreadPoolExecutor(threads or cores()) as pool:
             render = partial(_rendered, caster, looks=looks)
             each = list(pool.map(render, range(len(caster.surfaces))))
@@ -141,63 +144,33 @@ class ViewTemplates:
             np.concatenate([one.pictures.outline for one in each]),
             np.concatenate([one.pictures.depth for one in each]),
         )
+        self.points = np.stack([one.points for one in each])
+        self.normals = np.stack([one.normals for one in each])
+        self.fill = np.stack([one.fill for one in each])
 
-    def propose(
-        self, images: Sequence[MetricImage], among: Mask | None = None
-    ) -> OrientedProposals:
-        """Propose orientations of the likeliest things, given some views.
-
-        Each view proposes orientations of the things that match all views.
+    def propose(self, view: "SeenOutline", among: Mask) -> OrientedProposals:
+        """Propose orientations of the things that an outline may show.
 
         Args:
-            images: views of one thing.
-            among: things that it may be, (T,) bool; None for all.
+            view: the outline.
+            among: things that it may be, (T,) bool.
 
         Returns:
-            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none if too little is
-            visible.
+            Up to MOST_ORIENTATIONS of each thing, the likeliest first.
         """
-        known = int(self.things.max()) + 1
-        views = [one for one in map(SeenOutline.of, images) if one is not None]
-        if not views:
-            nothing = np.zeros(0, np.int64)
-            nowhere = np.zeros((0, 3))
-            return OrientedProposals(
-                nothing, nothing, np.zeros((0, 3, 3)), nowhere, np.zeros(known), False
-            )
+        known = len(among)
+        fit = self._fit(view)
+        of_things = np.full(known, NO_FIT)
+        np.minimum.at(of_things, self.things, fit.cost)
 
-        fits = [self._fit(view) for view in views]
-        of_things = np.full((len(views), known), NO_FIT)
-        for row, fit in enumerate(fits):
-            np.minimum.at(of_things[row], self.things, fit.cost)
-        together = of_things.sum(0)
-        hidden = all(view.hidden for view in views)
-        most = HIDDEN_PROPOSED if hidden else THINGS_PROPOSED
-        if among is not None:
-            together = np.where(among, together, np.inf)
-        likely = np.zeros(known, bool)
-        likely[np.argsort(together, kind="stable")[:most]] = True
-        likely &= np.isfinite(together)
-
-        of_one = max(1, MOST_ORIENTATIONS // len(views))
-        proposed = []
-        for fit, view in zip(fits, views, strict=True):
-            order = np.argsort(fit.cost, kind="stable")
-            order = order[likely[self.things[order]] & (fit.cost[order] < NO_FIT)]
-            rank = rank_within(self.things[order])
-            order = order[rank < of_one]
-            proposed.append(
-                (
-                    self.things[order],
-                    rank[rank < of_one],
-                    *self._poses(fit, view, order),
-                )
-            )
-        things, ranks, rotations, centres = (
-            np.concatenate(parts) for parts in zip(*proposed, strict=True)
-        )
+        order = np.argsort(fit.cost, kind="stable")
+        order = order[among[self.things[order]] & (fit.cost[order] < NO_FIT)]
+        rank = rank_within(self.things[order])
+        order = order[rank < MOST_ORIENTATIONS]
+        rank = rank[rank < MOST_ORIENTATIONS]
+        rotations, centres = self._poses(fit, view, order)
         return OrientedProposals(
-            things, ranks, rotations, centres, -together / len(views), hidden
+            self.things[order], rank, rotations, centres, fit.cost[order], of_things
         )
 
     def _fit(self, view: "SeenOutline") -> "TemplateFit":
@@ -352,6 +325,9 @@ class _Rendered:
     offsets: Float
     sizes: Float
     pictures: Pictures
+    points: Float32
+    normals: Float32
+    fill: Float32
 
 
 def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
@@ -367,12 +343,15 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     rays = np.stack([*camera.slopes(row, column), np.ones(len(row))], -1)
 
     origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
-    depth = caster.depths(
-        thing,
-        origins.astype(np.float32),
-        (rays @ looks).astype(np.float32),
-    )
+    towards = (rays @ looks).astype(np.float32)
+    depth, across = caster.from_all_sides(thing, origins.astype(np.float32), towards)
     shown = np.isfinite(depth)
+    picked = _picked(shown)
+    each = np.arange(len(looks))[:, None]
+    points = origins[:, None] + towards[each, picked] * depth[each, picked][..., None]
+    points = np.where(shown.any(1)[:, None, None], points - caster.centres[thing], 0)
+    normals = across[each, picked]
+    fill = shown.mean(1).astype(np.float32)
     kept = shown.sum(1) >= FEWEST_OUTLINE_PIXELS
     looks = looks[kept]
     depth = depth[kept]
@@ -413,7 +392,21 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
             outline.astype(np.float32),
             behind.clip(-FARTHEST_BEHIND, FARTHEST_BEHIND).astype(np.float32),
         ),
+        points.astype(np.float32),
+        normals,
+        fill,
     )
+
+
+def _picked(shown: Mask) -> Index:
+    """Pixels of each picture, (D, P), that show the thing, in random order, (D, POINTS).
+
+    Pixels are repeated where there are fewer; any pixel where there is none.
+    """
+    chance = np.random.default_rng(0).random(shown.shape)
+    order = np.argsort(np.where(shown, chance, 2), axis=1)
+    count = np.maximum(shown.sum(1), 1)[:, None]
+    return np.take_along_axis(order, np.arange(POINTS)[None] % count, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,29 +437,40 @@ class SeenOutline:
     shifts: Float
 
     @classmethod
-    def of(cls, image: MetricImage) -> "SeenOutline | None":
+    def of(
+        cls,
+        depth: Float32,
+        shown: Mask,
+        unclear: Mask,
+        hiding: Mask,
+        camera: PinholeCamera,
+        pose: Float,
+    ) -> "SeenOutline | None":
         """Outline of a thing in an image.
 
         Args:
-            image: a view of the thing.
+            depth: of all pixels, (H, W) float32, metres; 0 where nothing was measured.
+            shown: pixels of the thing, (H, W) bool.
+            unclear: other pixels that may show it, (H, W) bool.
+            hiding: pixels of what may hide it, (H, W) bool.
+            camera: camera of the image.
+            pose: camera-to-world, (4, 4).
 
         Returns:
             The outline; None if too little is visible.
         """
-        shown = without_specks(image.kind == THING)
+        shown = without_specks(shown & (depth > 0))
         if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
             return None
-        known = ~image.hiding & (image.kind != NOT_MEASURED)
-        known &= shown | (image.kind != THING)
-        camera = PinholeCamera.of(image.intrinsics, image.depth.shape)
-        found = cls.of_depth(image.depth, shown, known, camera, image.pose)
+        known = (depth > 0) & ~unclear & ~hiding
+        found = cls.of_depth(depth, shown, known | shown, camera, pose)
 
         around = ndimage.binary_dilation(shown, iterations=2) & ~shown
-        hiding = around & image.hiding
-        if np.count_nonzero(hiding) < HIDDEN_SHARE * np.count_nonzero(around):
+        covered = around & hiding
+        if np.count_nonzero(covered) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
 
-        rows, columns = np.nonzero(hiding)
+        rows, columns = np.nonzero(covered)
         towards = np.array([columns.mean(), rows.mean()]) - found.centre
         step, reach = SHIFTS
         lines = np.arange(-reach, reach + step / 2, step)

@@ -1,0 +1,229 @@
+"""A frame with what is in it: what may be one thing, what carries things, what is behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nextview.segmentation.instances import Instances
+from nextview.sensing.facets import Noise, noise_of
+from nextview.sensing.frame import Frame, within
+from nextview.types import Float, Float32, Index, Mask
+
+GRID_COLUMNS = 320  # columns of the grid on which hypotheses are scored, about
+# standard deviation of a measured depth, relative, at least: real depth is bent
+LEAST_ERROR = 0.0025
+FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
+NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of one thing
+FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
+MOST_PARTED = 0.9  # share of an instance above which a piece is the instance
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Pixels that may be one thing.
+
+    Attributes:
+        mask: its pixels, (H, W) bool.
+        unclear: pixels that may belong to it, too, (H, W) bool; None for none.
+    """
+
+    mask: Mask
+    unclear: Mask | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Every so many pixels of a view.
+
+    Attributes:
+        depth: (h, w) float32, metres; 0 where nothing was measured.
+        x: slope x/z of each column, (w,) float64.
+        y: slope y/z of each row, (h,) float64.
+        sigma: standard deviation of the depth, (h, w) float32, metres.
+        piece: number of the piece that each pixel belongs to, (h, w); 0 for none.
+        sizes: number of pixels of each piece, (pieces + 1,).
+        surface: pixels of what carries things, (h, w) bool.
+        pitch: angle between neighbouring pixels, radians.
+    """
+
+    depth: Float32
+    x: Float
+    y: Float
+    sigma: Float32
+    piece: NDArray[np.int32]
+    sizes: Index
+    surface: Mask
+    pitch: float
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame with what is in it.
+
+    Attributes:
+        frame: the frame.
+        camera: camera-to-world as it is believed, (4, 4) float64: the pose of the frame, without
+            its error.
+        noise: of the depth.
+        labels: number of the thing that each pixel shows, (H, W) int32; 0 for none.
+        pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
+        surface: pixels of what carries things, (H, W) bool.
+        background: pixels of walls and the like, (H, W) bool.
+        inside: pixels that are to be explained, (H, W) bool.
+    """
+
+    frame: Frame
+    camera: Float
+    noise: Noise
+    labels: NDArray[np.int32]
+    pieces: NDArray[np.int32]
+    surface: Mask
+    background: Mask
+    inside: Mask
+    _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, frame: Frame, instances: Instances, inside: Mask) -> View:
+        """Return the view of a frame.
+
+        Args:
+            frame: of a depth camera.
+            instances: what its segmentation says.
+            inside: pixels that are to be explained, (H, W) bool.
+        """
+        labels = np.zeros(frame.shape, np.int32)
+        for number, mask in enumerate(instances.masks, 1):
+            labels[mask & inside] = number
+        given = labels if instances.pieces is None else instances.pieces
+        pieces = np.where(inside, given, 0).astype(np.int32)
+        return cls(
+            frame,
+            frame.camera_to_world,
+            noise_of(frame),
+            labels,
+            pieces,
+            instances.surface,
+            instances.background,
+            inside,
+        )
+
+    def seen_from(self, camera: Float) -> View:
+        """Return the view from another pose of its camera, camera-to-world, (4, 4)."""
+        return replace(self, camera=camera)
+
+    @property
+    def depth(self) -> Float32:
+        """Depth of the frame, (H, W) float32, metres; 0 where nothing was measured."""
+        return self.frame.depth
+
+    @property
+    def stride(self) -> int:
+        """Pixels of the frame from one pixel of the grid to the next."""
+        return max(1, round(self.frame.shape[1] / GRID_COLUMNS))
+
+    def grid(self, coarser: int = 1) -> Grid:
+        """Return the grid of pixels on which hypotheses are scored.
+
+        Args:
+            coarser: factor of the distance between pixels.
+        """
+        if coarser not in self._grids:
+            self._grids[coarser] = self._sampled(self.stride * coarser)
+        return self._grids[coarser]
+
+    def _sampled(self, stride: int) -> Grid:
+        """Take every pixel at such a distance."""
+        depth = self.depth[::stride, ::stride]
+        x, y = self.frame.rays
+        piece = self.pieces[::stride, ::stride]
+        noise = self.noise.at(np.maximum(depth, 0.1)) * depth**2
+        return Grid(
+            depth,
+            x[::stride].astype(np.float64),
+            y[::stride].astype(np.float64),
+            np.hypot(noise, LEAST_ERROR * depth).astype(np.float32),
+            piece,
+            np.bincount(piece.ravel()),
+            self.surface[::stride, ::stride],
+            stride / float(self.frame.intrinsics[0, 0]),
+        )
+
+    def hiding(self, mask: Mask, margin: float) -> Mask:
+        """Return what is in front of a segment beside it, and the shadow of that, (H, W) bool.
+
+        Args:
+            mask: pixels of the segment, (H, W) bool.
+            margin: around the segment, its sizes.
+        """
+        rows, columns = within(mask)
+        size = max(rows.stop - rows.start, columns.stop - columns.start)
+        part = within(mask, round(margin * size))
+        depth = self.depth[part]
+        own = mask[part]
+        nearest = ndimage.distance_transform_edt(
+            ~own, return_distances=False, return_indices=True
+        )
+        beside = depth[tuple(nearest)]
+        sigma = np.hypot(self.noise.at(beside) * beside**2, LEAST_ERROR * beside)
+        hiding = ~own & (depth > 0) & (depth < beside - 4 * sigma)
+        hiding &= ~self.surface[part]
+        if hiding.any():
+            measured = ndimage.distance_transform_edt(
+                (depth == 0) | own, return_distances=False, return_indices=True
+            )
+            hiding |= (depth == 0) & hiding[tuple(measured)]
+        every = np.zeros(mask.shape, bool)
+        every[part] = hiding
+        return every
+
+    @cached_property
+    def fewest(self) -> int:
+        """Pixels of the smallest segment that is searched for things."""
+        return FEWEST_PIXELS * self.stride**2 // 2
+
+    def instances(self) -> Iterator[Segment]:
+        """Return what is likely to be one thing each."""
+        for mask in _parts(self.labels, self.fewest):
+            yield Segment(mask)
+
+    def fragments(self) -> Iterator[Segment]:
+        """Return the pieces of instances: a thing that was joined to its neighbour is one."""
+        for mask in _parts(self.pieces, 2 * self.fewest):
+            owner = int(np.bincount(self.labels[mask]).argmax())
+            whole = self.labels == owner if owner else mask
+            if np.count_nonzero(mask) <= MOST_PARTED * np.count_nonzero(whole) or not owner:
+                yield Segment(mask, whole & ~mask)
+
+    def unions(self) -> Iterator[Segment]:
+        """Return pairs of neighbouring instances: a thing that was cut in two is one."""
+        depth = self.depth
+        count: dict[tuple[int, int], int] = {}
+        for gap in (self.stride, 2 * self.stride + 1):
+            for one, two in (
+                (np.s_[:, :-gap], np.s_[:, gap:]),
+                (np.s_[:-gap], np.s_[gap:]),
+            ):
+                first, second = self.labels[one], self.labels[two]
+                beside = (first != second) & (first > 0) & (second > 0)
+                beside &= np.abs(depth[one] - depth[two]) < NEIGHBOURS_APART
+                low = np.minimum(first[beside], second[beside])
+                high = np.maximum(first[beside], second[beside])
+                for pair in zip(low.tolist(), high.tolist(), strict=True):
+                    count[pair] = count.get(pair, 0) + 1
+        for (low, high), touching in sorted(count.items(), key=lambda one: -one[1]):
+            if touching >= FEWEST_NEIGHBOURS:
+                yield Segment((self.labels == low) | (self.labels == high))
+
+
+def _parts(labels: NDArray[np.int32], fewest: int) -> Iterator[Mask]:
+    """Return the pixels of each label with at least so many, (H, W) bool."""
+    counts = np.bincount(labels.ravel())
+    for number in np.flatnonzero(counts >= fewest):
+        if number:
+            yield labels == number

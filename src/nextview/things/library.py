@@ -1,0 +1,112 @@
+"""Taught things as the explanation of a picture needs them: surfaces, templates, visible points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.view_templates import ViewTemplates, templates_of
+from nextview.types import Float, Float32, Index
+
+
+class Library:
+    """Surfaces of taught things, ready to be searched for.
+
+    Attributes:
+        names: of the things, in their order.
+        caster: casts rays at their surfaces.
+        templates: their depth images from all directions.
+        centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
+        radii: radius of each, (T,) float64, metres.
+    """
+
+    def __init__(self, surfaces: Sequence[Surface], threads: int = 1) -> None:
+        """Render the templates.
+
+        Args:
+            surfaces: of the things, with their names.
+            threads: number of threads; 0 for one on each core.
+        """
+        self.names = tuple(surface.name for surface in surfaces)
+        self.caster = SurfaceCaster(surfaces)
+        self.templates: ViewTemplates = templates_of(self.caster, threads)
+        self.centres = self.caster.centres.astype(np.float64)
+        self.radii = self.caster.radii.astype(np.float64)
+
+    def __len__(self) -> int:
+        """Number of things."""
+        return len(self.names)
+
+    def seen_from(
+        self, things: Index, towards: Float, count: int
+    ) -> tuple[Float32, Float32, Float32]:
+        """Return points of things that cameras in some directions see.
+
+        Args:
+            things: number of each thing, (M,) int64.
+            towards: direction from its centre to the camera, in the axes of its scan, (M, 3).
+            count: number of points, at most POINTS.
+
+        Returns:
+            The points relative to the centre of each thing, (M, count, 3) float32, metres; their
+            unit normals, (M, count, 3) float32; and the area of the outline over that of a square
+            around the sphere of the thing, (M,) float32.
+        """
+        nearest = (towards @ self.templates.directions.T).argmax(1)
+        points = self.templates.points[things, nearest, :count]
+        normals = self.templates.normals[things, nearest, :count]
+        return points, normals, self.templates.fill[things, nearest]
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """M hypotheses, each that a thing lies in a pose.
+
+    Attributes:
+        things: number of the thing, (M,) int64.
+        rotations: from the axes of its scan file to the world, (M, 3, 3) float64.
+        centres: centre of its bounding box in the world, (M, 3) float64, metres.
+        sizes: factors along the axes of its scan by which it is larger, (M, 3) float64; 1 for the
+            taught thing itself.
+    """
+
+    things: Index
+    rotations: Float
+    centres: Float
+    sizes: Float
+
+    @classmethod
+    def of(cls, things: Index, rotations: Float, centres: Float) -> Hypotheses:
+        """Return hypotheses of the things in the sizes that were taught."""
+        return cls(things, rotations, centres, np.ones((len(things), 3)))
+
+    @classmethod
+    def joined(cls, several: Sequence[Hypotheses]) -> Hypotheses:
+        """Return all of several sets of hypotheses."""
+        return cls(
+            np.concatenate([one.things for one in several]),
+            np.concatenate([one.rotations for one in several]),
+            np.concatenate([one.centres for one in several]),
+            np.concatenate([one.sizes for one in several]),
+        )
+
+    def __len__(self) -> int:
+        """Number of hypotheses."""
+        return len(self.things)
+
+    def __getitem__(self, rows: Index | slice) -> Hypotheses:
+        """Return some of them, by indices, mask or slice."""
+        return Hypotheses(
+            self.things[rows], self.rotations[rows], self.centres[rows], self.sizes[rows]
+        )
+
+    def pose(self, row: int, library: Library) -> Float:
+        """Return the pose of the scan of one, scan-to-world, (4, 4) float64, metres."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotations[row]
+        own = library.centres[self.things[row]]
+        pose[:3, 3] = self.centres[row] - self.rotations[row] @ own
+        return pose

@@ -1,0 +1,138 @@
+"""Propose things and poses where a view shows something that is not explained.
+
+Templates give orientations of things whose outline and relief fit a segment. They are registered,
+and those that match best are kept for the score. Few points each are enough to reject most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.segmentation.view import Segment, View
+from nextview.things.library import Hypotheses, Library
+from nextview.things.register import Outline, Projected, register
+from nextview.things.score import score
+from nextview.things.view_templates import SeenOutline, rank_within
+from nextview.types import Float, Index, Mask
+
+LIKELY_THINGS = 20  # things of which all orientations are tried
+ORIENTATIONS = 5  # of every other thing
+ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+MATCHED = 80  # hypotheses that are registered more closely, at most
+MATCHED_OF_ONE = 6  # the same of one thing
+SCORED = 24  # hypotheses that are rendered, at most
+SCORED_OF_ONE = 3
+KEPT = 8  # hypotheses of one segment that are kept, at most
+KEPT_OF_ONE = 2
+COARSER = 2  # grid on which they are rendered to choose among them
+HIDING_MARGIN = 1.0  # sizes of the segment, within which something may hide a part of it
+
+
+def propose(
+    library: Library,
+    view: View,
+    segments: Iterable[Segment],
+    among: Mask,
+) -> Hypotheses | None:
+    """Propose what segments of a view may show.
+
+    Args:
+        library: the things.
+        view: the view.
+        segments: of the view.
+        among: things that they may be, (T,) bool.
+
+    Returns:
+        Some hypotheses for each segment; None for none.
+    """
+    found = []
+    for segment in segments:
+        one = _of_segment(library, view, segment, among)
+        if one is not None:
+            found.append(one)
+    return Hypotheses.joined(found) if found else None
+
+
+def _of_segment(
+    library: Library, view: View, segment: Segment, among: Mask
+) -> Hypotheses | None:
+    """Propose what one segment may show."""
+    mask = segment.mask
+    none = np.zeros(mask.shape, bool)
+    unclear = none if segment.unclear is None else segment.unclear
+    hiding = view.hiding(mask, HIDING_MARGIN) & ~unclear
+    camera = PinholeCamera.of(view.frame.intrinsics, mask.shape)
+    seen = SeenOutline.of(view.depth, mask, unclear, hiding, camera, view.camera)
+    if seen is None:
+        return None
+    given = library.templates.propose(seen, among)
+    if not len(given.things):
+        return None
+    likely = np.argsort(given.of_things)[:LIKELY_THINGS]
+    few = ORIENTATIONS_HIDDEN if seen.hidden else ORIENTATIONS
+    some = (given.ranks < few) | np.isin(given.things, likely)
+    found = Hypotheses.of(
+        given.things[some], given.rotations[some], given.centres[some]
+    )
+    outline = Outline.of(mask)
+    found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
+    match = matched(library, view, found, mask, 64)
+    found = found[best(found.things, match, MATCHED, MATCHED_OF_ONE)]
+    found = register(library, [view], found, (0.1, 0.06, 0.04), 96, outline)
+    match = matched(library, view, found, mask, 96)
+    found = found[best(found.things, match, SCORED, SCORED_OF_ONE)]
+    found = register(library, [view], found, (0.03, 0.02), 128, outline)
+    totals = np.array(
+        [
+            -np.inf if one is None else one.total
+            for one in score(library, view, found, COARSER)
+        ]
+    )
+    return found[best(found.things, totals, KEPT, KEPT_OF_ONE)]
+
+
+def best(things: Index, values: Float, most: int, of_one: int) -> Index:
+    """Return the rows with the highest values, at most some of one thing, (N,) int64.
+
+    Args:
+        things: thing of each row, (M,).
+        values: of each row, (M,).
+        most: number of rows.
+        of_one: number of rows of one thing.
+    """
+    order = np.argsort(-values, kind="stable")
+    return order[rank_within(things[order]) < of_one][:most]
+
+
+def matched(
+    library: Library, view: View, some: Hypotheses, mask: Mask, count: int
+) -> Float:
+    """Return how much of hypotheses and of a segment match, without rendering, (M,) float64.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses.
+        mask: pixels of the segment, (H, W) bool.
+        count: number of points of each hypothesis.
+    """
+    seen = Projected.of(library, view, some, count)
+    sigma = np.hypot(0.003, view.noise.at(seen.depth) * seen.depth**2)
+    off = seen.depth - seen.points[..., 2]
+    measured = seen.inside & (seen.depth > 0)
+    own = mask[seen.row, seen.column]
+    match = measured & (np.abs(off) < 3 * sigma)
+    margin = np.maximum(3 * sigma, 0.006)
+    through = measured & (off >= margin)
+    front = measured & (off <= -margin)
+    visible = np.maximum((seen.inside & ~(front & ~own)).sum(1), 1)
+    share = ((match & own).sum(1) - 2 * through.sum(1) - (front & own).sum(1)) / visible
+
+    # number of pixels that the hypothesis would show, and how much of the segment it covers
+    side = 2 * np.sqrt(25 / 24) * library.radii[some.things]
+    side *= view.frame.pinhole.fx / np.maximum(seen.middle[:, 2], 0.05)
+    covered = seen.fill * side**2 * (match & own).mean(1) / max(1, np.count_nonzero(mask))
+    return np.where(share > 0, share * np.minimum(1, covered), share)

@@ -1,0 +1,292 @@
+"""Register hypotheses to depth images, many at once and without rendering.
+
+Points that a camera would see of a thing in its pose are projected into the image, and moved
+towards the planes at what is measured there (point to plane, with projective data association:
+Blais and Levine, "Registering multiview range data to create 3D computer objects", 1995). Where
+the image shows through a point, the point is pulled back into the outline of its segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nextview.segmentation.view import View
+from nextview.sensing.frame import within
+from nextview.things.library import Hypotheses, Library
+from nextview.types import Float, Float32, Mask
+
+LARGEST_TURN = 0.3  # radians in one step
+LARGEST_SHIFT = 0.25  # radii of the thing in one step
+LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a thing
+DAMPING = 0.01  # weight of the present pose, points
+OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matches
+# errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
+CAMERA_TURN, CAMERA_SHIFT = 0.006, 0.004
+MATCHING_ERROR = 0.002  # metres, of a point on the right surface
+ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Where the nearest pixel of a segment is.
+
+    Attributes:
+        row: of the nearest pixel, (H, W) int32.
+        column: of the nearest pixel, (H, W) int32.
+        distance: to it, (H, W) float32, pixels; 0 inside of the segment.
+    """
+
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    distance: Float32
+
+    @classmethod
+    def of(cls, mask: Mask) -> Outline:
+        """Return the outline of a segment, (H, W) bool."""
+        distance, (row, column) = ndimage.distance_transform_edt(
+            ~mask, return_indices=True
+        )
+        return cls(row, column, distance.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Points of hypotheses in an image.
+
+    Attributes:
+        points: in the axes of the camera, (M, N, 3) float32, metres.
+        normals: in the axes of the camera, (M, N, 3) float32.
+        middle: centre of each hypothesis in the axes of the camera, (M, 3) float32, metres.
+        inside: points within the image, (M, N) bool.
+        row: of each point, (M, N) int32; 0 outside of the image.
+        column: of each point, (M, N) int32; 0 outside of the image.
+        depth: that is measured there, (M, N) float32, metres; 0 for none.
+        fill: share of a square around each thing that shows it, (M,) float32.
+    """
+
+    points: Float32
+    normals: Float32
+    middle: Float32
+    inside: Mask
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    depth: Float32
+    fill: Float32
+
+    @classmethod
+    def of(cls, library: Library, view: View, some: Hypotheses, count: int) -> Projected:
+        """Project points of hypotheses.
+
+        Args:
+            library: the things.
+            view: the image.
+            some: M hypotheses.
+            count: number N of points of each.
+        """
+        axes = view.camera[:3, :3]
+        place = view.camera[:3, 3]
+        towards = np.einsum("mji,mj->mi", some.rotations, place - some.centres)
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        own, across, fill = library.seen_from(some.things, towards, count)
+        turn = (axes.T @ some.rotations).astype(np.float32).swapaxes(1, 2)
+        middle = ((some.centres - place) @ axes).astype(np.float32)
+        points = own @ turn + middle[:, None]
+
+        camera = view.frame.pinhole
+        ahead = np.maximum(points[..., 2], 0.02)
+        column = np.floor(camera.fx * points[..., 0] / ahead + camera.cx)
+        row = np.floor(camera.fy * points[..., 1] / ahead + camera.cy)
+        height, width = view.frame.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside &= points[..., 2] > 0.02
+        column = np.where(inside, column, 0).astype(np.int32)
+        row = np.where(inside, row, 0).astype(np.int32)
+        return cls(
+            points,
+            across @ turn,
+            middle,
+            inside,
+            row,
+            column,
+            view.depth[row, column],
+            fill,
+        )
+
+    def measured(self, view: View) -> Float32:
+        """Return the measured point at each point, (M, N, 3) float32, axes of the camera."""
+        x, y = view.frame.rays
+        slopes = np.stack([x[self.column], y[self.row], np.ones_like(self.depth)], -1)
+        return slopes * self.depth[..., None]
+
+
+def register(
+    library: Library,
+    views: Sequence[View],
+    some: Hypotheses,
+    reaches: Sequence[float],
+    count: int,
+    outline: Outline | None = None,
+) -> Hypotheses:
+    """Move hypotheses to where they fit best, from where they are.
+
+    Args:
+        library: the things.
+        views: in which they are seen.
+        some: M hypotheses.
+        reaches: for each step, how far from a thing what is measured belongs to it, radii.
+        count: number of points of each in a view.
+        outline: of the segment that they explain, in the one view; None for none.
+
+    Returns:
+        The hypotheses in their new poses.
+    """
+    for reach in reaches:
+        some = _step(library, views, some, reach, count, outline)
+    return some
+
+
+def camera_error(library: Library, view: View, some: Hypotheses, count: int = 96) -> View:
+    """Correct the pose of a camera by things that are known to stand where they are.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: hypotheses that hold.
+        count: number of points of each.
+
+    Returns:
+        The view with another ``camera``.
+    """
+    told = np.r_[np.full(3, CAMERA_TURN**-2.0), np.full(3, CAMERA_SHIFT**-2.0)]
+    moved = np.zeros(6)
+    for reach in (0.15, 0.1, 0.06, 0.04, 0.03):
+        left, right = normal_equations(library, view, some, reach, count)
+        # a motion of each thing about its centre, as one of the world about the camera
+        arm = some.centres - view.camera[:3, 3]
+        about = np.tile(np.eye(6), (len(some), 1, 1))
+        about[:, 3:, :3] = -skew(arm)
+        left = np.einsum("mji,mjk,mkl->il", about, left, about)
+        right = np.einsum("mji,mj->i", about, right)
+        weight = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
+        # the things would have to move by this; so the camera moves the other way
+        step = np.linalg.solve(
+            weight * left + np.diag(told), weight * right + told * moved
+        )
+        moved = moved - step
+        camera = view.camera.copy()
+        camera[:3, :3] = turned(-step[None, :3])[0] @ camera[:3, :3]
+        camera[:3, 3] -= step[3:]
+        view = view.seen_from(camera)
+    return view
+
+
+def _step(
+    library: Library,
+    views: Sequence[View],
+    some: Hypotheses,
+    reach: float,
+    count: int,
+    outline: Outline | None,
+) -> Hypotheses:
+    """Take one Gauss-Newton step."""
+    left = np.zeros((len(some), 6, 6))
+    right = np.zeros((len(some), 6))
+    for view in views:
+        of_view = normal_equations(library, view, some, reach, count, outline)
+        left += of_view[0]
+        right += of_view[1]
+    radius = library.radii[some.things][:, None]
+    stays = np.concatenate([np.tile(radius**2, 3), np.ones((len(some), 3))], 1)
+    left[:, range(6), range(6)] += stays * DAMPING * count * len(views)
+    step = np.linalg.solve(left, right[..., None])[..., 0]
+    turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    shift = np.linalg.norm(step[:, 3:], axis=1, keepdims=True)
+    step[:, :3] *= np.minimum(1, LARGEST_TURN / np.maximum(turn, 1e-9))
+    step[:, 3:] *= np.minimum(1, LARGEST_SHIFT * radius / np.maximum(shift, 1e-9))
+    return Hypotheses(
+        some.things,
+        turned(step[:, :3]) @ some.rotations,
+        some.centres + step[:, 3:],
+        some.sizes,
+    )
+
+
+def normal_equations(
+    library: Library,
+    view: View,
+    some: Hypotheses,
+    reach: float,
+    count: int,
+    outline: Outline | None = None,
+) -> tuple[Float, Float]:
+    """Return the normal equations of one view for a small motion of each hypothesis.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses.
+        reach: how far from a thing what is measured belongs to it, radii.
+        count: number of points of each.
+        outline: of the segment that they explain; None for none.
+
+    Returns:
+        Left side, (M, 6, 6), and right side, (M, 6), float64: rotation about the centre and shift,
+        world axes, radians and metres.
+    """
+    seen = Projected.of(library, view, some, count)
+    radius = library.radii[some.things]
+    near = np.maximum(reach * radius, LEAST_REACH)[:, None].astype(np.float32)
+    gap = seen.measured(view) - seen.points
+    off = np.einsum("mni,mni->mn", seen.normals, gap)
+    used = seen.inside & (seen.depth > 0) & (np.abs(gap[..., 2]) < 4 * near)
+    used &= ~view.surface[seen.row, seen.column]
+    weight = np.where(used, 1 / (1 + (off / near) ** 2), 0)
+
+    arm = seen.points - seen.middle[:, None]
+    slope = np.concatenate([np.cross(arm, seen.normals), seen.normals], -1)
+    weighted = slope * weight[..., None]
+    left = weighted.swapaxes(1, 2) @ slope
+    right = np.einsum("mni,mn->mi", weighted, off)
+
+    if outline is not None:
+        away = outline.distance[seen.row, seen.column]
+        through = seen.inside & (seen.depth > seen.points[..., 2] + near) & (away > 0)
+        down = outline.row[seen.row, seen.column] - seen.row
+        aside = outline.column[seen.row, seen.column] - seen.column
+        far = np.maximum(away, 1e-6)
+        towards = np.stack([aside / far, down / far, np.zeros_like(far)], -1)
+        focal = view.frame.pinhole.fx
+        off = np.minimum(far * seen.points[..., 2] / focal, 2 * near)
+        weight = np.where(through, OUTLINE_WEIGHT, 0)
+        slope = np.concatenate([np.cross(arm, towards), towards], -1)
+        weighted = slope * weight[..., None]
+        left = left + weighted.swapaxes(1, 2) @ slope
+        right = right + np.einsum("mni,mn->mi", weighted, off)
+
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = view.camera[:3, :3]
+    return turn @ left.astype(np.float64) @ turn.T, right.astype(np.float64) @ turn.T
+
+
+def skew(vectors: Float) -> Float:
+    """Return the matrices of the cross products with vectors, (..., 3) to (..., 3, 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    none = np.zeros_like(x)
+    rows = [[none, -z, y], [z, none, -x], [-y, x, none]]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def turned(vectors: Float) -> Float:
+    """Return the rotations by rotation vectors, (M, 3) to (M, 3, 3), radians."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = skew(vectors)
+    small = angle < 1e-6
+    safe = np.where(small, 1, angle)
+    once = np.where(small, 1, np.sin(safe) / safe)
+    twice = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
+    return np.eye(3) + once * cross + twice * cross @ cross
