@@ -161,11 +161,13 @@ class View:
             mask: pixels of the segment, (H, W) bool.
             margin: around the segment, its sizes.
         """
+        step = self.stride
         rows, columns = within(mask)
         size = max(rows.stop - rows.start, columns.stop - columns.start)
-        part = within(mask, round(margin * size))
+        rows, columns = within(mask, round(margin * size))
+        part = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
         depth = self.depth[part]
-        own = mask[part]
+        own = mask[part] & (depth > 0)
         nearest = ndimage.distance_transform_edt(
             ~own, return_distances=False, return_indices=True
         )
@@ -179,8 +181,9 @@ class View:
             )
             hiding |= (depth == 0) & hiding[tuple(measured)]
         every = np.zeros(mask.shape, bool)
-        every[part] = hiding
-        return every
+        large = np.repeat(np.repeat(hiding, step, 0), step, 1)
+        every[rows, columns] = large[: rows.stop - rows.start, : columns.stop - columns.start]
+        return every & ~mask
 
     @cached_property
     def fewest(self) -> int:

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.segmentation.view import View
-from nextview.sensing.frame import within
 from nextview.things.library import Hypotheses, Library
-from nextview.types import Float, Float32, Mask
+from nextview.types import Float, Float32, Index, Mask
 
 LARGEST_TURN = 0.3  # radians in one step
 LARGEST_SHIFT = 0.25  # radii of the thing in one step
 LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a thing
 DAMPING = 0.01  # weight of the present pose, points
+OUTLINE_STEP = 4  # pixels, to which the outline of a segment is told
 OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matches
 # errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
 CAMERA_TURN, CAMERA_SHIFT = 0.006, 0.004
@@ -36,9 +36,9 @@ class Outline:
     """Where the nearest pixel of a segment is.
 
     Attributes:
-        row: of the nearest pixel, (H, W) int32.
-        column: of the nearest pixel, (H, W) int32.
-        distance: to it, (H, W) float32, pixels; 0 inside of the segment.
+        row: of the nearest pixel of each block of pixels, (h, w) int32.
+        column: of the nearest pixel, (h, w) int32.
+        distance: to it, (h, w) float32, pixels; 0 inside of the segment.
     """
 
     row: NDArray[np.int32]
@@ -47,11 +47,25 @@ class Outline:
 
     @classmethod
     def of(cls, mask: Mask) -> Outline:
-        """Return the outline of a segment, (H, W) bool."""
+        """Return the outline of a segment, (H, W) bool, to a few pixels."""
+        height, width = mask.shape
+        blocks = np.pad(mask, ((0, -height % OUTLINE_STEP), (0, -width % OUTLINE_STEP)))
+        rows, columns = (side // OUTLINE_STEP for side in blocks.shape)
+        small = blocks.reshape(rows, OUTLINE_STEP, columns, OUTLINE_STEP).any((1, 3))
         distance, (row, column) = ndimage.distance_transform_edt(
-            ~mask, return_indices=True
+            ~small, return_indices=True
         )
-        return cls(row, column, distance.astype(np.float32))
+        middle = OUTLINE_STEP // 2
+        return cls(
+            row * OUTLINE_STEP + middle,
+            column * OUTLINE_STEP + middle,
+            (distance * OUTLINE_STEP).astype(np.float32),
+        )
+
+    def at(self, row: Index, column: Index) -> tuple[Index, Index, Float32]:
+        """Return the way down and aside to the segment, and its length, pixels, of pixels."""
+        at = row // OUTLINE_STEP, column // OUTLINE_STEP
+        return self.row[at] - row, self.column[at] - column, self.distance[at]
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,22 +262,20 @@ def normal_equations(
     weight = np.where(used, 1 / (1 + (off / near) ** 2), 0)
 
     arm = seen.points - seen.middle[:, None]
-    slope = np.concatenate([np.cross(arm, seen.normals), seen.normals], -1)
+    slope = np.concatenate([cross(arm, seen.normals), seen.normals], -1)
     weighted = slope * weight[..., None]
     left = weighted.swapaxes(1, 2) @ slope
     right = np.einsum("mni,mn->mi", weighted, off)
 
     if outline is not None:
-        away = outline.distance[seen.row, seen.column]
+        down, aside, away = outline.at(seen.row, seen.column)
         through = seen.inside & (seen.depth > seen.points[..., 2] + near) & (away > 0)
-        down = outline.row[seen.row, seen.column] - seen.row
-        aside = outline.column[seen.row, seen.column] - seen.column
-        far = np.maximum(away, 1e-6)
+        far = np.hypot(down, aside).astype(np.float32) + np.float32(1e-6)
         towards = np.stack([aside / far, down / far, np.zeros_like(far)], -1)
         focal = view.frame.pinhole.fx
         off = np.minimum(far * seen.points[..., 2] / focal, 2 * near)
         weight = np.where(through, OUTLINE_WEIGHT, 0)
-        slope = np.concatenate([np.cross(arm, towards), towards], -1)
+        slope = np.concatenate([cross(arm, towards), towards], -1)
         weighted = slope * weight[..., None]
         left = left + weighted.swapaxes(1, 2) @ slope
         right = right + np.einsum("mni,mn->mi", weighted, off)
@@ -271,6 +283,13 @@ def normal_equations(
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = view.camera[:3, :3]
     return turn @ left.astype(np.float64) @ turn.T, right.astype(np.float64) @ turn.T
+
+
+def cross(one: Float32, other: Float32) -> Float32:
+    """Return the cross products of vectors, (..., 3)."""
+    x, y, z = one[..., 0], one[..., 1], one[..., 2]
+    u, v, w = other[..., 0], other[..., 1], other[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 def skew(vectors: Float) -> Float:

@@ -23,6 +23,7 @@ from scipy import ndimage
 from nextview.cores import cores
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
+from nextview.sensing.frame import within
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
@@ -201,18 +202,15 @@ class ViewTemplates:
             pixels = size * view.focal / view.middle
             templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
 
-            for shift in view.shifts:
-                seen = view.pictures(size, shift * pixels, grid)
-                costs, behind = mismatch(seen, templates)
-
-                turn = costs.argmin(0)
-                cost = costs[turn, np.arange(len(rows))]
-                better = cost < fit.cost[rows]
-                some = rows[better]
-                fit.cost[some] = cost[better]
-                fit.turn[some] = turns[turn[better]]
-                fit.shift[some] = shift * pixels
-                fit.behind[some] = size * behind[turn[better], np.flatnonzero(better)]
+            seen = view.pictures(size, view.shifts * pixels, grid)
+            costs, behind = mismatch(seen, templates)
+            which = costs.argmin(0)
+            cost = costs[which, np.arange(len(rows))]
+            shift, turn = np.divmod(which, TURNS)
+            fit.cost[rows] = np.minimum(cost, NO_FIT)
+            fit.turn[rows] = turns[turn]
+            fit.shift[rows] = view.shifts[shift] * pixels
+            fit.behind[rows] = size * behind[which, np.arange(len(rows))]
         return fit
 
     def _poses(
@@ -222,7 +220,7 @@ class ViewTemplates:
         x, y = view.camera.slopes(*(view.centre + fit.shift[rows])[:, ::-1].T)
         ahead = np.stack([x, y, np.ones(len(rows))], -1)
         lengths = np.linalg.norm(ahead, axis=1, keepdims=True)
-        axes = np.array([_from_z_to(one) for one in ahead / lengths]).reshape(-1, 3, 3)
+        axes = _from_z_to(ahead / lengths)
         looks = view.pose[:3, :3] @ axes @ rotation_z(fit.turn[rows])
         middles = ahead * (view.middle + fit.behind[rows])[:, None]
         centres = middles @ view.pose[:3, :3].T + view.pose[:3, 3]
@@ -371,9 +369,7 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     x, y = camera.slopes(centre[:, 1], centre[:, 0])
     ahead = np.stack([x, y, np.ones(len(x))], -1)
     towards = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-    turns = np.array([_from_z_to(direction).T for direction in towards]).reshape(
-        -1, 3, 3
-    )
+    turns = _from_z_to(towards).swapaxes(1, 2)
     offsets = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle[:, None] * ahead
 
     # contents of the cells
@@ -524,24 +520,21 @@ class SeenOutline:
         x, y = self.camera.slopes(*self.centre[::-1])
         return np.array([x, y, 1.0])
 
-    @property
-    def axes(self) -> Float:
-        """Axes of a camera that looks at the centre of the outline, as columns, (3, 3)."""
-        return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
-
-    def pictures(self, size: float, shift: Float, grid: Float32) -> SeenPictures:
+    def pictures(self, size: float, shifts: Float, grid: Float32) -> SeenPictures:
         """Sample outline and depth on the grid of templates of one size.
 
         Args:
             size: root mean square of their outlines, metres.
-            shift: shift of the grid from the centre of the outline, pixels, (2,).
+            shifts: of the grid from the centre of the outline, pixels, (S, 2).
             grid: rotated cells of the grid, see ``turned_grid``, (A, C, 2).
 
         Returns:
-            A pictures.
+            S * A pictures.
         """
         pixels = size * self.focal / self.middle
-        turned = grid * np.float32(pixels) + (self.centre + shift).astype(np.float32)
+        centres = (self.centre + shifts).astype(np.float32)
+        turned = grid * np.float32(pixels) + centres[:, None, None]
+        turned = turned.reshape(-1, *grid.shape[1:])
         column, row = np.rint(turned).astype(np.int32).transpose(2, 0, 1)
         height, width = self.shown.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
@@ -584,19 +577,30 @@ def without_specks(shown: Mask) -> Mask:
     Returns:
         Pixels of its larger parts, (H, W).
     """
-    parts, count = ndimage.label(shown, np.ones((3, 3), int))
+    part = within(shown)
+    parts, count = ndimage.label(shown[part], np.ones((3, 3), int))
     if count < 2:
         return shown
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return (sizes >= SPECK * sizes.max())[parts]
+    kept = np.zeros_like(shown)
+    kept[part] = (sizes >= SPECK * sizes.max())[parts]
+    return kept
 
 
-def _from_z_to(direction: Float) -> Float:
-    """The smallest rotation that maps z to a unit vector, (3, 3)."""
-    axis = np.array([-direction[1], direction[0], 0.0])  # z x direction
-    skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + direction[2])
+def _from_z_to(directions: Float) -> Float:
+    """The smallest rotations that map z to unit vectors, (N, 3) to (N, 3, 3)."""
+    x, y, z = directions.T
+    none = np.zeros_like(x)
+    skew = np.stack(
+        [
+            np.stack([none, none, x], -1),
+            np.stack([none, none, y], -1),
+            np.stack([-x, -y, none], -1),
+        ],
+        1,
+    )
+    return np.eye(3) + skew + skew @ skew / (1 + z)[:, None, None]
 
 
 def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
@@ -610,14 +614,17 @@ def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
         Costs, (A, N) float32, 0 for a perfect match; and mean depth of the view behind the
         template, sizes, (A, N) float32.
     """
-    both = seen.outline @ known.outline.T
-    one = max(seen.area, 1.0) + seen.known @ known.outline.T - both
+    some = len(seen.outline)
+    of_view = np.concatenate([seen.outline, seen.known, seen.depth, seen.depth**2])
+    both, told, depths, squares = np.split(of_view @ known.outline.T, 4)
+    across = np.concatenate([seen.outline, seen.depth]) @ known.depth.T
+    one = max(seen.area, 1.0) + told - both
     overlap = both / np.maximum(one, both + 1e-6)
 
     # Variance of the depth difference in the intersection.
     count = np.maximum(both, 1)
-    mean = (seen.depth @ known.outline.T - seen.outline @ known.depth.T) / count
-    squares = (seen.depth**2) @ known.outline.T + seen.outline @ (known.depth**2).T
-    squares = (squares - 2 * seen.depth @ known.depth.T) / count - mean**2
+    mean = (depths - across[:some]) / count
+    squares = squares + seen.outline @ (known.depth**2).T - 2 * across[some:]
+    squares = squares / count - mean**2
     costs = OUTLINE_WEIGHT * (1 - overlap) + DEPTH_WEIGHT * np.sqrt(squares.clip(0))
     return costs, mean
