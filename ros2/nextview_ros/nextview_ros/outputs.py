@@ -12,6 +12,7 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from tf2_msgs.msg import TFMessage
 
 import nextview
+from nextview.recognition.poses import PoseCandidate
 from nextview.scene.body import Tracked
 from nextview.scene.objects import SceneObject
 from nextview.types import Float
@@ -95,7 +96,7 @@ def object_message(thing: SceneObject, header: Any) -> ObjectMessage:
         settled=thing.settled,
         pose=pose_stamped(thing.pose, header),
         place=_point(thing.place),
-        doubt=thing.result.doubt,
+        doubt=thing.doubt,
     )
     if thing.pose_uncertainty is not None:
         message.pose_degrees = thing.pose_uncertainty.degrees
@@ -186,7 +187,8 @@ def scene_detections(objects: Sequence[SceneObject], header: Any) -> Any:
     """
     detections = []
     for thing in objects:
-        detection = detection_of(thing.result, header, str(thing.number))
+        detection = Detection3D(header=header, id=str(thing.number))
+        _fill_poses(detection, thing.candidates)
         if thing.pose is None:
             low, high = thing.seen_points.min(0), thing.seen_points.max(0)
             _fill_box(detection.bbox, np.eye(4), low, high)
@@ -248,17 +250,7 @@ def detection_of(result: nextview.Recognition, header: Any, number: str = "") ->
     if result.answer is None:
         pass  # nothing that is known explains it
     elif result.pose_candidates:
-        detection.results = [
-            _hypothesis(
-                one.thing,
-                one.probability,
-                one.pose,
-                one.degrees,
-                one.millimetres,
-            )
-            for one in result.pose_candidates
-            if one.probability >= LEAST_SCORE
-        ]
+        _fill_poses(detection, result.pose_candidates)
     else:
         scores = sorted(result.beliefs.items(), key=lambda pair: -pair[1])
         detection.results = [
@@ -267,14 +259,28 @@ def detection_of(result: nextview.Recognition, header: Any, number: str = "") ->
             if score >= LEAST_SCORE
         ]
 
-    posed = result.pose_candidates[0] if result.pose is not None else None
-    if posed is not None and posed.vertices is not None:
-        low, high = posed.vertices.min(0), posed.vertices.max(0)
-        _fill_box(detection.bbox, posed.pose, low, high)
-    else:
+    if result.pose is None or result.pose_candidates[0].vertices is None:
         radius = np.full(3, result.radius or 0.0)
         _fill_box(detection.bbox, result.poses_in.from_object, -radius, radius)
     return detection
+
+
+def _fill_poses(detection: Any, every: Sequence[PoseCandidate]) -> None:
+    """Fill in the hypotheses of an object, and the box of the scan in its likeliest pose."""
+    detection.results = [
+        _hypothesis(
+            one.thing,
+            one.probability,
+            one.pose,
+            one.degrees,
+            one.millimetres,
+        )
+        for one in every
+        if one.probability >= LEAST_SCORE
+    ]
+    if every and every[0].vertices is not None:
+        low, high = every[0].vertices.min(0), every[0].vertices.max(0)
+        _fill_box(detection.bbox, every[0].pose, low, high)
 
 
 def _hypothesis(

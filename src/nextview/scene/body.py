@@ -100,8 +100,7 @@ class Body:
         """
         if not one.confident or one.pose is None:
             return None
-        label = one.result.classes.index(one.name)
-        posed = next(each for each in one.candidates if each.label == label)
+        posed = one.candidates[0]
         pose = posed.pose if motion is None else motion @ posed.pose
         return cls._placed(one.number, posed, pose, model)
 

@@ -36,6 +36,7 @@ from nextview.things.registration import (
 )
 from nextview.types import Float, Float32, Index, Mask
 
+SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves
 TRACKED_SIDE = 44  # rows and columns of pixels around a thing
 FEWEST_LINES = 8  # rows or columns of the image in which a thing is registered
 AROUND_OUTLINE = 0.15  # margin around the outline, relative to its size, at least

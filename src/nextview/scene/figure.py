@@ -254,7 +254,7 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
     """Draw the x, y and z axes of a scan's frame at its centre in red, green and blue."""
     pose = thing.pose
     assert pose is not None
-    radius = thing.result.radius or 0.05
+    radius = float(np.linalg.norm(thing.size)) / 2
     ends = np.stack(
         [thing.place, *(thing.place + AXIS_LENGTH * radius * pose[:3, :3].T)]
     )

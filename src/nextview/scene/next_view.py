@@ -17,7 +17,8 @@ from scipy import ndimage
 
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
-from nextview.recognition.protocol import LooksAhead
+from nextview.scene.objects import SceneObject
+from nextview.scene.world import World, points_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
@@ -25,7 +26,15 @@ from nextview.session.limits import Limits
 from nextview.session.reach import Reach
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
-from nextview.session.tracks import Track
+from nextview.things.expected_images import (
+    OBSTACLE_REACH,
+    SUPPORT_NEAR,
+    ExpectedSensor,
+    SeenSurroundings,
+)
+from nextview.things.expected_views import expected_views
+from nextview.things.leading import MOST_LEADING, Hypotheses
+from nextview.things.unseen_space import MeasuredDepth
 from nextview.types import Float, Index, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table
@@ -39,6 +48,7 @@ UNKNOWN_WORTH = (
     1.0  # nats, information of a view of an unknown object from the far side
 )
 SURE_WORTH = 0.1  # the same for a settled object, which may be two or hide another one
+OBSTACLE_EVERY = 5  # pixels of the grid from one measured obstacle to the next
 SOME_POINTS = 60  # sampled points of an object for the occlusion test
 
 
@@ -65,17 +75,15 @@ class TableGround:
     floor: float
 
     @classmethod
-    def of(cls, tops: Sequence[TableTop], tracks: Sequence[Track]) -> TableGround:
+    def of(cls, tops: Sequence[TableTop], objects: Sequence[SceneObject]) -> TableGround:
         """Lay a grid over the visible part of the plane.
 
         Args:
             tops: support surfaces of the frames, at least one.
-            tracks: the objects, at least one.
+            objects: at least one.
         """
         axes = upright_axes(tops[0].up)
-        corners = np.concatenate(
-            [sighting.hull for track in tracks for sighting in track.thing.sightings]
-        )
+        corners = np.concatenate([one.seen_points for one in objects])
         flat = corners @ axes.T
         plane = tops[0].plane
         floor = float(np.median(flat[:, 2] - plane.height(corners)))
@@ -276,8 +284,8 @@ def candidates(
 
 
 def object_value(
-    system: System,
-    track: Track,
+    world: World,
+    one: SceneObject,
     tops: Sequence[TableTop],
     ground: TableGround,
     views: Candidates,
@@ -288,24 +296,24 @@ def object_value(
     distance from the views of the object, times the share of the object that it shows.
 
     Args:
-        system: with the taught things.
-        track: the object, already judged.
+        world: what explains the frames.
+        one: the object.
         tops: support surfaces of the frames.
         ground: with everything that may occlude the object.
         views: the candidates; values of views that are not free have no meaning.
     """
-    told = None if track.settled else _information(system, track, views)
-    if told is None:
-        told = _from_another_side(track, tops, views)
-        points = outline_of(track)
-        for row in np.flatnonzero(views.free):
-            told[row] *= ground.past_others(views.poses[row, :3, 3], points).mean()
+    if not one.settled and one.candidates:
+        return _information(world, one, tops, views)
+    told = _from_another_side(one, tops, views)
+    points = outline_of(one)
+    for row in np.flatnonzero(views.free):
+        told[row] *= ground.past_others(views.poses[row, :3, 3], points).mean()
     return told
 
 
-def outline_of(track: Track) -> Float:
-    """Sample the convex hulls of an object in all frames, (N, 3), world, metres."""
-    points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
+def outline_of(one: SceneObject) -> Float:
+    """Sample the measured points of an object in all frames, (N, 3), world, metres."""
+    points = one.seen_points
     return points[:: max(1, len(points) // SOME_POINTS)]
 
 
@@ -349,42 +357,82 @@ def _turned(towards: Float, earlier: Sequence[Float]) -> Float:
     return np.min([angle_between(towards, before) for before in earlier], axis=0)
 
 
-def _information(system: System, track: Track, views: Candidates) -> Float | None:
-    """Return the expected information of each view about a recognised object, nats, (V,).
+def _information(
+    world: World,
+    one: SceneObject,
+    tops: Sequence[TableTop],
+    views: Candidates,
+) -> Float:
+    """Return the expected information of each view about a named object, nats, (V,).
 
-    Occluders in front of the object are taken into account. Returns None if no hypothesis can be
-    rendered.
+    Occluders in front of the object are taken into account.
     """
-    recogniser = system.models.recogniser
-    result = track.result
-    assert result is not None
-    joint = result.views[-1].joint
-    if not isinstance(recogniser, LooksAhead) or joint is None or result.unknown:
-        return None
-    outlook = recogniser.outlook(
-        [one for one in track.thing.observations if one.seen],
-        joint,
+    # a frame with its origin in the object, z against gravity
+    axes = upright_axes(tops[0].up)
+    to_object = np.eye(4)
+    to_object[:3, :3] = axes
+    to_object[:3, 3] = -axes @ one.place
+    caster = world.library.caster
+    number = {name: row for row, name in enumerate(world.library.names)}
+    kept = one.candidates[:MOST_LEADING]
+    belief = np.array(
+        [each.probability * one.beliefs.get(each.thing, 0.0) for each in kept]
     )
-    if outlook is None:
-        return None
+    leading = Hypotheses(
+        np.array([number[each.thing] for each in kept]),
+        np.stack([to_object @ each.pose for each in kept]),
+        belief / max(belief.sum(), 1e-12),
+    )
+    cameras = to_object @ views.poses
+    grid = world.views[-1].grid()
+    depth = grid.depth[grid.depth > 0]
+    sensor = ExpectedSensor(
+        float(1 / tops[-1].frame.intrinsics[0, 0]),
+        float(np.median(tops[-1].noise.at(depth))),
+    )
+    around = _surroundings(world, one, tops, to_object)
+    return expected_views(
+        caster, leading, cameras, sensor, around, len(one.pixels)
+    ).information("thing")
 
-    cameras = track.thing.object_frame.pose_in_metres(views.poses)
-    return outlook.expect(cameras).information("thing")
+
+def _surroundings(
+    world: World, one: SceneObject, tops: Sequence[TableTop], to_object: Float
+) -> SeenSurroundings:
+    """Return what was measured around an object, in a frame with its origin in the object."""
+    points = [np.zeros((0, 3))]
+    for view, owner in zip(world.views, world.owners, strict=True):
+        others = np.flatnonzero((owner != one.number) & (view.grid().depth.ravel() > 0))
+        points.append(points_of(view, others[::OBSTACLE_EVERY]))
+    beside = np.concatenate(points) @ to_object[:3, :3].T + to_object[:3, 3]
+    own = one.seen_points @ to_object[:3, :3].T + to_object[:3, 3]
+    floor = float(own[:, 2].min())
+    away = np.linalg.norm(beside[:, :2], axis=1)
+    on_support = np.abs(beside[:, 2] - floor) < SUPPORT_NEAR
+    reach = float(np.quantile(away[on_support], 0.95)) if on_support.any() else 0.0
+    near = np.linalg.norm(beside, axis=1) < OBSTACLE_REACH * float(
+        np.linalg.norm(own, axis=1).max()
+    )
+    seen = [
+        MeasuredDepth(
+            view.depth, to_object @ view.camera, view.frame.intrinsics.astype(np.float64)
+        )
+        for view in world.views
+    ]
+    obstacles = beside[near & (beside[:, 2] > floor + SUPPORT_NEAR)]
+    return SeenSurroundings(obstacles, floor, reach, tuple(seen))
 
 
 def _from_another_side(
-    track: Track,
+    one: SceneObject,
     tops: Sequence[TableTop],
     views: Candidates,
 ) -> Float:
     """Return the value of each view by its distance from the views of one object, nats, (V,)."""
-    centre = track.thing.object_frame.centre
-    places = [tops[number].frame.camera_to_world[:3, 3] for number in track.pixels]
-    earlier = [_towards(place - centre) for place in places]
-    towards = _towards(views.poses[:, :3, 3] - centre)
-
-    known = track.result is not None and not track.result.unknown
-    worth = SURE_WORTH if known else UNKNOWN_WORTH
+    places = [tops[number].frame.camera_to_world[:3, 3] for number in one.pixels]
+    earlier = [_towards(place - one.place) for place in places]
+    towards = _towards(views.poses[:, :3, 3] - one.place)
+    worth = SURE_WORTH if one.candidates else UNKNOWN_WORTH
     return worth * _turned(towards, earlier) / np.pi
 
 

@@ -1,20 +1,47 @@
-"""One object of a scene, as part of the public interface."""
+"""The objects of a scene, as part of the public interface."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, softmax
 
-from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words
+from nextview.geometry.axes import upright_axes
+from nextview.recognition.poses import (
+    PoseCandidate,
+    PoseUncertainty,
+    distinct,
+    place_in_words,
+    uncertainty_of,
+)
+from nextview.scene.world import STRANGER_GAIN, Thing, World, points_of
 from nextview.sensing.view_warning import ViewWarning
-from nextview.session.result import Recognition
-from nextview.session.tracks import Track
-from nextview.types import Float, Mask
+from nextview.things.register import (
+    ALIKE_POINTS,
+    CAMERA_SHIFT,
+    MATCHING_ERROR,
+    normal_equations,
+)
+from nextview.things.rivals import other_size
+from nextview.things.score import PIXEL_GAIN
+from nextview.types import Float, Index, Mask
+
+if TYPE_CHECKING:
+    from nextview.scene.state import SceneState
 
 UNKNOWN_NAME = "unknown"
+PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats count once
+# log-odds that a name is right: of what it explains, of what it could explain, of the lead over
+# other names, and of what the same shape in another size explains better
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD, OF_SIZE = -6.0, 8.0, 0.6, 20.0, -30.0
+CONFIDENT = 0.97  # belief from which on a name is confident
+SETTLED_VIEWS = 2  # views after which an unknown object is settled
+TOUCHING = 0.015  # metres of depth between two objects that touch
+LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +59,14 @@ class SceneObject:
             pose, in the camera frame.
         size: extents of the visible part, (3,), metres: two sides and the height.
         pixels: mask in each frame that shows the object, (H, W) bool, by frame number.
-        seen_points: vertices of the convex hull of each view of the object, (N, 3), metres.
+        seen_points: measured points of the object, (N, 3), metres, at most SEEN_POINTS a frame.
         touches: numbers of the objects that it touches in the image and in depth.
-        result: full recognition result.
+        beliefs: belief in each name that was compared, the likeliest first; the rest of 1 is the
+            belief that the object was not taught.
+        candidates: things and poses that the object may be, the likeliest first.
+        doubt: why the name is not confident, in words; "" if it is, or if there is none.
+        ruled_out: names that it cannot have, with the reasons, see ``scene.rule.SceneRule``.
+        warnings: likely problems with this object; usually empty.
     """
 
     number: int
@@ -47,65 +79,32 @@ class SceneObject:
     pixels: dict[int, Mask] = field(repr=False)
     seen_points: Float = field(repr=False)
     touches: tuple[int, ...]
-    result: Recognition = field(repr=False)
-
-    @classmethod
-    def of(cls, track: Track, touching: Collection[tuple[int, int]]) -> SceneObject:
-        """Create the public view of a tracked object.
-
-        Args:
-            track: the object, already judged.
-            touching: numbers of all pairs of objects that touch.
-        """
-        result = track.result
-        assert result is not None
-        frame = track.thing.object_frame
-        sightings = track.thing.sightings
-        seen = np.concatenate([one.hull for one in sightings])
-        pair = [other for other in touching if track.number in other]
-        others = sorted({number for both in pair for number in both} - {track.number})
-
-        return cls(
-            number=track.number,
-            name=result.answer or UNKNOWN_NAME,
-            confidence=result.confidence,
-            confident=track.confident,
-            settled=track.settled,
-            place=frame.centre if result.place is None else result.place,
-            size=np.ptp(seen @ frame.axes.T, axis=0),
-            pixels=track.pixels,
-            seen_points=seen,
-            touches=tuple(others),
-            result=result,
-        )
+    beliefs: dict[str, float] = field(repr=False)
+    candidates: tuple[PoseCandidate, ...] = field(repr=False)
+    doubt: str = ""
+    ruled_out: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[ViewWarning, ...] = ()
 
     @property
     def pose(self) -> Float | None:
-        """Pose of the scan in the world, scan-to-world, (4, 4), metres; None for an unknown object.
-
-        See ``Recognition.pose``.
-        """
-        return self.result.pose
+        """Pose of the scan in the world, scan-to-world, (4, 4), metres; None for an unknown object."""
+        return self.candidates[0].pose if self.candidates else None
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
         """Uncertainty of ``pose``; None without a pose."""
-        return self.result.pose_uncertainty
-
-    @property
-    def candidates(self) -> tuple[PoseCandidate, ...]:
-        """Candidate things and poses of the object, the likeliest first."""
-        return self.result.pose_candidates
+        same = [one for one in self.candidates if one.thing == self.name]
+        return uncertainty_of(same, 1000 * CAMERA_SHIFT) if same else None
 
     @property
     def symmetry(self) -> Any:
         """Rotations after which the thing looks the same; None if they are not known."""
-        return self.result.symmetry
+        return self.candidates[0].symmetry if self.candidates else None
 
     @property
-    def warnings(self) -> tuple[ViewWarning, ...]:
-        """Likely problems with this object; usually empty."""
-        return tuple(warning for view in self.result.views for warning in view.warnings)
+    def most_like(self) -> str | None:
+        """The likeliest name, also of an unknown object; None if no thing resembles it."""
+        return next(iter(self.beliefs), None)
 
     def __repr__(self) -> str:
         """One line: ``3: mug, belief 0.998, confident, at [0.412, -0.103, 0.050] m``."""
@@ -117,3 +116,237 @@ class SceneObject:
         return (
             f"{self.number}: {self.name}, belief {self.confidence:.3f}, {sure}, {where}"
         )
+
+
+SEEN_POINTS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """What is believed of a named thing of a world.
+
+    Attributes:
+        rows: hypotheses of its place, the likeliest first, (N,) int64.
+        probabilities: of each, (N,) float64; the rest of 1 is that of a stranger.
+        right: probability that the likeliest name is right.
+        lead: over the likeliest other name, nats.
+        share: of what the likeliest hypothesis could explain.
+        larger: how much better the same shape in another size explains the views, a share.
+    """
+
+    rows: Index
+    probabilities: Float
+    right: float
+    lead: float
+    share: float
+    larger: float
+
+    def beliefs(self, world: World) -> dict[str, float]:
+        """Return the belief in each name, the likeliest first."""
+        found: dict[str, float] = {}
+        for row, probability in zip(self.rows, self.probabilities, strict=True):
+            name = world.library.names[int(world.hypotheses.things[row])]
+            found[name] = found.get(name, 0.0) + float(probability)
+        return found
+
+
+def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | None:
+    """Return what is believed of a thing with a hypothesis; None if every name is ruled out.
+
+    Args:
+        world: the world.
+        thing: one of its things.
+        ruled_out: names that it cannot have.
+    """
+    rows = world.rivals(thing.row)
+    totals = world.totals[rows]
+    of_row = totals[rows == thing.row]
+    names = np.array(world.library.names)[world.hypotheses.things[rows]]
+    kept = (totals > 0) & (totals <= of_row) & ~np.isin(names, list(ruled_out))
+    rows, totals = rows[kept], totals[kept]
+    if not len(rows):
+        return None
+    order = np.argsort(-totals, kind="stable")
+    rows, totals = rows[order], totals[order]
+
+    seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
+    every = np.append(totals, STRANGER_GAIN * seen) / PIXELS_ALIKE
+    probabilities = softmax(every)[:-1]
+    others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
+    lead = float(totals[0] - totals[others].max(initial=0.0))
+    share = float(totals[0]) / max(1.0, PIXEL_GAIN * seen)
+    odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(totals[0], 1.0))
+    odds += OF_LEAD * lead / max(totals[0], 1.0)
+    larger = 0.0
+    if expit(odds) > CONFIDENT:
+        larger = other_size(world.library, world.views, world.hypotheses[rows[:1]])[0]
+        odds += OF_SIZE * larger
+    return Named(rows, probabilities, float(expit(odds)), lead, share, larger)
+
+
+def objects_of(state: SceneState) -> tuple[SceneObject, ...]:
+    """Return the objects of a scene, in the order in which they were found.
+
+    Args:
+        state: of the scene, with the objects before the last frame.
+    """
+    world = state.world
+    pairs = touching(world)
+    known = {one.number: one for one in state.objects}
+    found = []
+    for thing in sorted(world.things, key=lambda one: one.number):
+        ruled_out = state.ruled_out.get(thing.number, {})
+        found.append(_object(state, thing, pairs, ruled_out, known.get(thing.number)))
+    return tuple(found)
+
+
+def _object(
+    state: SceneState,
+    thing: Thing,
+    pairs: set[tuple[int, int]],
+    ruled_out: Mapping[str, str],
+    before: SceneObject | None,
+) -> SceneObject:
+    """Return the public view of one thing."""
+    world = state.world
+    points = seen_points(world, thing.number)
+    axes = upright_axes(state.tops[0].up)
+    flat = points @ axes.T
+    middle = axes.T @ ((flat.min(0) + flat.max(0)) / 2)
+    beside = [pair for pair in pairs if thing.number in pair]
+    others = sorted({number for both in beside for number in both} - {thing.number})
+    pixels = masks_of(world, thing.number)
+    one = SceneObject(
+        thing.number,
+        UNKNOWN_NAME,
+        0.0,
+        False,
+        len(pixels) >= SETTLED_VIEWS,
+        middle,
+        np.ptp(flat, axis=0),
+        pixels,
+        points,
+        tuple(others),
+        {},
+        (),
+        ruled_out=tuple(ruled_out.items()),
+    )
+    if thing.row < 0:
+        return one
+    found = named(world, thing, ruled_out)
+    if found is None:
+        return one
+    candidates = pose_candidates(world, found)
+    sure = found.right >= CONFIDENT
+    return replace(
+        one,
+        name=candidates[0].thing,
+        confidence=found.right,
+        confident=sure,
+        settled=sure,
+        place=candidates[0].place,
+        beliefs=found.beliefs(world),
+        candidates=candidates,
+        doubt="" if sure else why_in_doubt(world, thing, found),
+    )
+
+
+def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
+    """Return the main reason why a name is not confident, in words."""
+    things = world.hypotheses.things[found.rows]
+    terms = {
+        f"it explains its pixels by {100 * found.share:.0f} %, as well as it could be": (
+            OF_SHARE * (found.share - 0.7)
+        ),
+        "few pixels show it": OF_GAIN * (np.log(max(thing.gain, 1.0)) - np.log(1000)),
+        "the same shape in another size explains the views better": (
+            OF_SIZE * found.larger
+        ),
+    }
+    rival = things[things != things[0]]
+    if len(rival):
+        name = world.library.names[int(rival[0])]
+        terms[f"{name} explains the views nearly as well"] = OF_LEAD * (
+            found.lead / max(thing.gain, 1.0) - 0.2
+        )
+    return min(terms, key=lambda one: terms[one])
+
+
+def pose_candidates(world: World, found: Named) -> tuple[PoseCandidate, ...]:
+    """Return the distinct poses of the hypotheses of a place, the likeliest first."""
+    rows = found.rows
+    some = world.hypotheses[rows]
+    left = np.zeros((len(rows), 6, 6))
+    for view in world.views:
+        left += normal_equations(world.library, view, some, 0.03, 96)[0]
+    radius = world.library.radii[some.things]
+    left *= 1 / MATCHING_ERROR**2 / ALIKE_POINTS
+    # a pose is known to its thing's own size, at least
+    left[:, range(3), range(3)] += 1.0
+    left[:, range(3, 6), range(3, 6)] += 1 / radius[:, None] ** 2
+    variances = np.diagonal(np.linalg.inv(left), axis1=1, axis2=2)
+    degrees = np.degrees(np.sqrt(variances[:, :3].sum(1)))
+    millimetres = 1000 * np.sqrt(variances[:, 3:].sum(1))
+    shares = found.probabilities / found.probabilities.sum()
+    every = []
+    for k, row in enumerate(rows):
+        thing = int(some.things[k])
+        surface = world.library.caster.surfaces[thing]
+        every.append(
+            PoseCandidate(
+                thing=surface.name,
+                label=thing,
+                pose=world.hypotheses.pose(int(row), world.library),
+                probability=float(shares[k]),
+                degrees=float(degrees[k]),
+                millimetres=float(millimetres[k]),
+                centre=surface.centroid,
+                vertices=surface.vertices,
+                faces=surface.faces,
+                symmetry=world.library.symmetries.get(surface.name),
+            )
+        )
+    return tuple(
+        every[k] for k in distinct(every) if k == 0 or shares[k] > LEAST_LISTED
+    )
+
+
+def masks_of(world: World, number: int) -> dict[int, Mask]:
+    """Return the pixels of a thing in each view that shows it, (H, W) bool, by view."""
+    found = {}
+    for k, (view, owner) in enumerate(zip(world.views, world.owners, strict=True)):
+        cells = (owner == number).reshape(view.grid().depth.shape)
+        if cells.any():
+            stride = view.stride
+            large = np.repeat(np.repeat(cells, stride, 0), stride, 1)
+            mask = large[: view.depth.shape[0], : view.depth.shape[1]]
+            found[k] = mask & (view.depth > 0)
+    return found
+
+
+def seen_points(world: World, number: int) -> Float:
+    """Return measured points of a thing in all views, (N, 3), metres."""
+    found = [np.zeros((0, 3))]
+    for view, owner in zip(world.views, world.owners, strict=True):
+        cells = np.flatnonzero(owner == number)
+        found.append(points_of(view, cells[:: max(1, len(cells) // SEEN_POINTS)]))
+    return np.concatenate(found)
+
+
+def touching(world: World) -> set[tuple[int, int]]:
+    """Return the pairs of things that touch in some view, the smaller number first."""
+    found = set()
+    for view, owner in zip(world.views, world.owners, strict=True):
+        depth = view.grid().depth
+        number: NDArray[np.int32] = owner.reshape(depth.shape)
+        for gap in (1, 2, 3):
+            for one, two in (
+                (np.s_[:, :-gap], np.s_[:, gap:]),
+                (np.s_[:-gap], np.s_[gap:]),
+            ):
+                beside = (number[one] != number[two]) & (number[one] > 0)
+                beside &= (number[two] > 0) & (np.abs(depth[one] - depth[two]) < TOUCHING)
+                low = np.minimum(number[one][beside], number[two][beside])
+                high = np.maximum(number[one][beside], number[two][beside])
+                found |= set(zip(low.tolist(), high.tolist(), strict=True))
+    return found

@@ -13,7 +13,7 @@ from nextview.scene.next_view import (
     outline_of,
 )
 from nextview.scene.unexplained import UnexplainedPatch
-from nextview.session.tracks import ENOUGH_VIEWS, Track
+from nextview.scene.objects import SceneObject
 from nextview.types import Float
 
 
@@ -42,7 +42,7 @@ class OpenPoint:
 
 
 def open_points(
-    tracks: Sequence[Track],
+    objects: Sequence[SceneObject],
     patches: Sequence[UnexplainedPatch],
     ground: TableGround | None,
     ground_seen: bool,
@@ -51,18 +51,18 @@ def open_points(
     """List what is not settled: objects, unexplained points, hidden ground.
 
     Args:
-        tracks: the objects.
+        objects: that were found.
         patches: parts of images that are neither ground nor an object.
         ground: top view of the table; None without an object.
         ground_seen: whether enough of the ground is visible to rule out further objects.
         cameras: positions of the views that are left, (K, 3), world.
     """
     found = []
-    for track in sorted(tracks, key=lambda track: track.number):
-        if not track.settled:
-            place = track.thing.object_frame.centre
-            shown = _in_sight(ground, outline_of(track), cameras)
-            found.append(OpenPoint(track.number, place, _why(track), shown))
+    for one in objects:
+        if not one.settled:
+            shown = _in_sight(ground, outline_of(one), cameras)
+            why = one.doubt or "no taught thing fits it; it is seen in one view only"
+            found.append(OpenPoint(one.number, one.place, why, shown))
     for patch in patches:
         area = 1e4 * patch.area
         why = f"{area:.0f} square centimetres in view are neither ground nor an object"
@@ -89,17 +89,3 @@ def _in_sight(ground: TableGround | None, points: Float, cameras: Float) -> bool
     if ground is None:
         return len(cameras) > 0
     return any(ground.past_others(camera, points).any() for camera in cameras)
-
-
-def _why(track: Track) -> str:
-    """Reason why an object is not settled."""
-    result = track.result
-    if result is None:
-        return "it was not compared with the things"
-    if result.answer is not None:
-        return result.doubt
-    if track.lately_named:
-        return "it had a name before the last frame that shows it"
-    if len(track.frames) < ENOUGH_VIEWS:
-        return "no taught thing fits it; it is seen in one view only"
-    return "its name is not confident"

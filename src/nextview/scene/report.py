@@ -55,9 +55,9 @@ def doubts_of(scene: Scene) -> list[str]:
     for thing in scene.objects:
         if thing.confident or thing.name == UNKNOWN_NAME:
             continue
-        beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
+        beliefs = sorted(thing.beliefs.items(), key=lambda pair: -pair[1])
         rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
-        why = thing.result.doubt
+        why = thing.doubt
         said.append(f"{thing.number} is not confident: {', '.join(rest)} ({why})")
     return said
 
@@ -96,7 +96,7 @@ def scene_as_json(
     for thing in scene.objects:
         likely = {
             name: belief
-            for name, belief in thing.result.beliefs.items()
+            for name, belief in thing.beliefs.items()
             if belief >= LEAST_LISTED
         }
         one: dict[str, Any] = {
@@ -104,16 +104,17 @@ def scene_as_json(
             "name": thing.name,
             "confidence": thing.confidence,
             "confident": thing.confident,
-            "doubt": thing.result.doubt,
-            "most_like": thing.result.most_like,
-            "novelty": thing.result.novelty,
+            "doubt": thing.doubt,
+            "most_like": thing.most_like,
             "beliefs": likely,
             "place": thing.place,
             "size": thing.size,
             "touches": thing.touches,
             "warnings": sorted({warning.name for warning in thing.warnings}),
         }
-        one |= pose_as_json(thing.result)
+        one |= pose_as_json(
+            thing.pose, thing.pose_uncertainty, thing.candidates, thing.symmetry
+        )
         one["frames"] = {
             names[number]: {"pixels": int(mask.sum()), "box": _box_of(mask)}
             for number, mask in thing.pixels.items()

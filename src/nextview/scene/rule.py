@@ -35,7 +35,7 @@ def ruled_out_by(
     with plugin_errors(lambda said: UsageError(f"the rule of the scene raised {said}")):
         said = rule(objects)
 
-    known = {one.number: dict(one.result.ruled_out) for one in objects}
+    known = {one.number: dict(one.ruled_out) for one in objects}
     if not isinstance(said, Mapping) or not set(said) <= set(known):
         raise UsageError(
             "the rule of a scene returns names by the number of an object, not"

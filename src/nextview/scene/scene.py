@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.checks import did_you_mean, one_line
-from nextview.errors import ObservationError, SessionError, UsageError
+from nextview.errors import ModelError, ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
-from nextview.scene.changes import Change, changes, wrong_pose
+from nextview.scene.changes import changes
 from nextview.scene.grasps import (
     GRASP_CLEARANCE,
     MOST_UNSEEN,
@@ -26,38 +26,31 @@ from nextview.scene.grasps import (
     within_reach,
 )
 from nextview.scene.next_view import Candidates, candidates
-from nextview.scene.objects import SceneObject
+from nextview.scene.objects import SceneObject, objects_of
 from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.rule import SceneRule, ruled_out_by
-from nextview.scene.state import MOST_VERIFIED, SceneState
+from nextview.scene.state import SceneState
 from nextview.scene.view_policies import (
     INFORMATION_POLICY,
     NamedPolicy,
     SceneChoice,
     ScenePolicy,
 )
-from nextview.segmentation.instances import Segmenter, instances_of
+from nextview.scene.world import Thing, World
+from nextview.segmentation.instances import Instances, Segmenter, instances_of
+from nextview.segmentation.view import View
 from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
-from nextview.sensing.masks import inside_box, touching
+from nextview.sensing.masks import inside_box
 from nextview.sensing.mistakes import focal_that_levels
 from nextview.sensing.object_frame import Box
 from nextview.sensing.plausibility import check_sizes
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.session.following import SAME_OBJECT_SHARE, assign
-from nextview.session.judging import Judge, one_blas_thread
+from nextview.session.judging import one_blas_thread
 from nextview.session.limits import Limits, checked_limits
-from nextview.session.parting import (
-    GOOD_FIT,
-    Bench,
-    merged,
-    new_tracks,
-    part,
-    taken_over,
-)
 from nextview.session.reach import (
     Reach,
     Reachable,
@@ -66,17 +59,16 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
-from nextview.session.tracks import Track, judged, render_track
-from nextview.types import Float, Mask
+from nextview.things.library import Library
+from nextview.things.recogniser import VerifiedRecogniser
+from nextview.types import Float
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-ENOUGH_FRAMES = 2  # frames after which a settled object is not judged again
 NOT_WHERE_THEY_WERE = (
     "this frame does not fit the others and is left out: most objects are not where they"
     " were"
@@ -205,9 +197,9 @@ class Scene:
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
 
-        self._judge = _judge_of(self.system)
-        self._widest = self._judge.widest
-        self._state = SceneState(region=region)
+        library = _library_of(self.system)
+        self._widest = 2 * float(library.radii.max())
+        self._state = SceneState(World(library), region)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the lock, so that a scene can be copied and pickled."""
@@ -264,7 +256,7 @@ class Scene:
                 state = self._state
                 left = views.poses[views.free]
                 self._open = open_points(
-                    state.tracks,
+                    state.objects,
                     state.unexplained,
                     state.ground,
                     state.ground_seen,
@@ -458,15 +450,15 @@ class Scene:
             return Look(False, warnings=(REPEATED,))
 
         before = self._state
-        top = self._top_of(frame, before.tops)
+        top, view = self._seen(frame, before.tops)
         shown = top.plane if top.shows_ground else None
         top = replace(top, warnings=(*top.warnings, *known.check(frame, shown)))
-        state, look = self._after(before, top)
+        state, look = self._after(before, top, view)
         self._state = state
         self._changed()
-        smallest = self._judge.narrowest
-        if look.taken and smallest is not None:
+        if look.taken:
             sizes = [one.size for one in self.objects]
+            smallest = 2 * float(state.world.library.radii.min())
             small = check_sizes(frame, sizes, smallest)
             look = replace(look, warnings=(*look.warnings, *small))
         return look
@@ -562,7 +554,7 @@ class Scene:
             0.0 if box is None else box.radius,
         )
 
-    def _top_of(self, frame: Frame, before: Sequence[TableTop]) -> TableTop:
+    def _seen(self, frame: Frame, before: Sequence[TableTop]) -> tuple[TableTop, View]:
         """Segment a frame, and find its surfaces and its ground.
 
         Raises:
@@ -587,32 +579,33 @@ class Scene:
         warnings = tuple(check_mistakes(seen, self._known_frames))
         ground = None if earlier is None else earlier.plane
         top = TableTop.of(seen, self.up, ground, inside, self._widest)
-        return replace(top, warnings=warnings)
+        view = View.of(frame, _carried(instances, top), inside)
+        return replace(top, warnings=warnings), view
 
-    def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
+    def _after(
+        self, before: SceneState, top: TableTop, view: View
+    ) -> tuple[SceneState, Look]:
         """Return the scene after a frame; a frame that does not fit is left out.
 
         Raises:
             ObservationError: neither the ground nor any known object is visible.
         """
-        found, camera = changes(
-            before.tracks,
-            top,
-            top.seen.segments(),
-            before.tops,
-            before.cameras,
-        )
         # the pose of a camera that has not moved is as right as before
         stands = self._known_frames.stands(top.frame)
-        if not stands and wrong_pose(found, camera):
+        told = changes(before.world, view, stands)
+        if told.wrong_pose and not stands:
             return before, Look(False, warnings=(self._why_wrong(top),))
-        seen_again = any(one.confirms for one in found)
-        if before.tops and not (top.shows_ground or seen_again):
+        if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
 
-        state, look = self._taken(before, top, found)
-        state = self._ruled(replace(state, cameras=(*before.cameras, camera)))
-        if look.moved and not (seen_again or stands):
+        world = told.world.with_view(told.view, top.seen.segments())
+        world = world.searched(np.ones(len(world.library), bool)).numbered()
+        gone = {one.number: one for one in told.gone}
+        world, moved = _found_again(world, before.world, gone)
+        state = replace(before, world=world, tops=(*before.tops, top))
+        state = self._ruled(replace(state, objects=objects_of(state)))
+        look = _look(before, state, (*told.moved, *moved), gone)
+        if look.moved and not (told.stand or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
 
@@ -625,236 +618,98 @@ class Scene:
                 return ViewWarning("intrinsics", message)
         return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {WRONG_POSE}")
 
-    def _taken(
-        self,
-        before: SceneState,
-        top: TableTop,
-        found: Sequence[Change],
-    ) -> tuple[SceneState, Look]:
-        """Return the scene after a frame that fits."""
-        number = len(before.tops)
-        bench = Bench(top, number, self._judged)
-        pairs = list(zip(before.tracks, found, strict=True))
-        there = [track for track, one in pairs if not one.contradicts]
-        lost = [(track, one) for track, one in pairs if one.contradicts]
-
-        own, new = assign(top.seen.segments(), there, top)
-        hidden = [track for row, track in enumerate(there) if row not in own]
-        seen = {row: self._explained(there[row], own[row], top, number) for row in own}
-        shown = [track for track in seen.values() if track is not None]
-        doubtful = {row: own[row] for row, track in seen.items() if track is None}
-        verified = _most_pixels([*doubtful.values(), *new])
-        for (row, mask), chosen in zip(doubtful.items(), verified, strict=False):
-            track = there[row]
-            if not chosen:
-                hidden.append(replace(track, again=(*track.again, (number, mask))))
-                continue
-            try:
-                shown.append(track.with_mask(number, mask, top))
-            except ObservationError:  # too little of it is visible
-                hidden.append(track)
-        of_new = verified[len(doubtful) :]
-        shown += new_tracks(list(compress(new, of_new)), bench)
-
-        known = {track.number: track for track in there}
-        shown = part(self._judged_if_new(shown), bench, known)
-        tops = (*before.tops, top)
-        benches = [Bench(one, k, self._judged) for k, one in enumerate(tops)]
-        every = merged(taken_over([*hidden, *shown], benches), benches)
-        state = replace(before, tops=tops, left_unknown=of_new.count(False))
-        return _numbered(state, [_with_past(one, known, number) for one in every], lost)
-
     def _ruled(self, state: SceneState) -> SceneState:
         """Return a scene without the names that the rule rules out."""
         if self.rule is None:
             return state
-        earlier = {track.number: track.result for track in state.tracks}
-        tracks = {track.number: track.with_all_names for track in state.tracks}
+        state = replace(state, ruled_out={})
+        state = replace(state, objects=objects_of(state))
         while True:
-            state = replace(state, tracks=tuple(tracks.values()))
             new = ruled_out_by(self.rule, state.objects)
             if not new:
                 return state
-            for which, names in new.items():
-                tracks[which] = self._without(tracks[which], names, earlier[which])
-
-    def _without(
-        self,
-        track: Track,
-        names: Mapping[str, str],
-        earlier: Recognition | None,
-    ) -> Track:
-        """Return an object that has none of some names.
-
-        Args:
-            track: the object.
-            names: further names that it cannot have, with the reasons.
-            earlier: its result in the last frame, which is taken again if it still holds.
-        """
-        assert track.result is not None
-        of_all_names = track.result.of_all_names or track.result
-        ruled_out = (*track.result.ruled_out, *names.items())
-        if (
-            earlier is None
-            or earlier.of_all_names is not of_all_names
-            or earlier.ruled_out != ruled_out
-        ):
-            system = self.system.without(*dict(ruled_out))
-            earlier = _judge_of(system)([track.thing])[0]
-        result = replace(earlier, ruled_out=ruled_out, of_all_names=of_all_names)
-        return replace(track, result=result)
-
-    def _explained(
-        self,
-        track: Track,
-        mask: Mask,
-        top: TableTop,
-        number: int,
-    ) -> Track | None:
-        """Add a mask to a settled object that already explains it; otherwise return None.
-
-        A settled object that is visible at its known place is not judged again.
-        """
-        if track.settled and len(track.frames) >= ENOUGH_FRAMES:
-            rendered = render_track(track, top, number, track.posed)
-            if rendered is not None:
-                explained, every = rendered.fit(mask)
-                if explained >= GOOD_FIT * every:
-                    return replace(track, again=(*track.again, (number, mask)))
-        return None
-
-    def _judged_if_new(self, tracks: Sequence[Track]) -> list[Track]:
-        """Judge the objects that have no result yet; the others are unchanged."""
-        asked = iter(self._judged([track for track in tracks if track.result is None]))
-        return [next(asked) if track.result is None else track for track in tracks]
-
-    def _judged(self, tracks: Sequence[Track]) -> list[Track]:
-        """Judge all objects."""
-        return judged(tracks, self._judge)
+            ruled_out = {
+                number: {**state.ruled_out.get(number, {}), **new.get(number, {})}
+                for number in {*state.ruled_out, *new}
+            }
+            state = replace(state, ruled_out=ruled_out)
+            state = replace(state, objects=objects_of(state))
 
 
-def _judge_of(system: System) -> Judge:
-    """Return what recognises objects by a system."""
-    return Judge(system.models, system.sphere, system.stopping, system.unknown)
+def _library_of(system: System) -> Library:
+    """Return the things of known geometry of a system.
 
-
-def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
-    """Return which masks, (H, W) bool, are among the largest, which are verified in a frame."""
-    order = sorted(range(len(masks)), key=lambda row: -np.count_nonzero(masks[row]))
-    largest = set(order[:MOST_VERIFIED])
-    return [row in largest for row in range(len(masks))]
-
-
-def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
-    """Record in an object whether it had a name before a frame that shows it."""
-    if track.number not in known or track.mask_in(number) is None:
-        return track
-    before = known[track.number].result
-    named = before is not None and before.answer is not None
-    return replace(track, lately_named=named)
-
-
-def _numbered(
-    state: SceneState,
-    tracks: Sequence[Track],
-    lost: Sequence[tuple[Track, Change]],
-) -> tuple[SceneState, Look]:
-    """Number new objects; a lost object that reappears elsewhere keeps its number.
-
-    Args:
-        state: with the last frame, and the objects before it.
-        tracks: the objects.
-        lost: objects that are no longer at their known place, and what the frame says of them.
+    Raises:
+        ModelError: it has none.
     """
-    found_again = _found_again(tracks, lost, state.tops[-1])
-    number = state.next_number
-    appeared = []
-    moved = []
-    kept = []
-    joined = []
-    for row, track in enumerate(tracks):
-        if track.number < 0:
-            old = found_again.get(row)
-            if old is not None:
-                track = replace(track, number=old.number)
-                moved.append(Move(old.number, _pose_of(old), _pose_of(track)))
-            else:
-                track = replace(track, number=number)
-                appeared.append(number)
-                number += 1
-        joined += [(ended, track.number) for ended in track.absorbed]
-        kept.append(replace(track, absorbed=()))
+    recogniser = system.models.recogniser
+    if not isinstance(recogniser, VerifiedRecogniser):
+        raise ModelError(
+            f"{recogniser.name}: a scene needs things of known geometry, and these models have"
+            " none; a session recognises one object by its class"
+        )
+    things = recogniser.things
+    symmetries = dict(zip(things.names, things.symmetries, strict=True))
+    return Library(things.verifier.caster.surfaces, symmetries)
 
-    left = {track.number for track, _ in lost}
-    gone = tuple(sorted(left - {move.number for move in moved}))
-    changed = {*left, *(ended for ended, _ in joined)}
-    touching = {pair for pair in state.touching if not set(pair) & changed}
-    touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
-    after = replace(
-        state,
-        tracks=tuple(kept),
-        touching=frozenset(touching),
-        next_number=number,
-    )
-    look = Look(True, tuple(appeared), tuple(moved), gone, tuple(joined))
-    warnings = (*state.tops[-1].warnings, *after.remarks)
-    return after, replace(look, warnings=warnings)
+
+def _carried(instances: Instances, top: TableTop) -> Instances:
+    """Return the instances that stand on something, and the pieces of these."""
+    kept = [
+        mask
+        for mask, carrier in zip(top.seen.masks, top.seen.carriers, strict=True)
+        if carrier is not None
+    ]
+    return replace(instances, masks=tuple(kept))
 
 
 def _found_again(
-    tracks: Sequence[Track],
-    lost: Sequence[tuple[Track, Change]],
-    top: TableTop,
-) -> dict[int, Track]:
-    """Find lost objects among the new ones, by row: by place, and otherwise by name."""
-    new = {row: track for row, track in enumerate(tracks) if track.number < 0}
-    found: dict[int, Track] = {}
-    for old, change in lost:
-        if not change.found:
+    world: World, before: World, gone: dict[int, Thing]
+) -> tuple[World, list[int]]:
+    """Return the world with the old numbers of things that are new in another place, and these.
+
+    Args:
+        world: after a frame.
+        before: before it.
+        gone: things that are not where they were, by their numbers; those that are found again are
+            removed.
+    """
+    moved = []
+    renamed = {}
+    for one in world.things:
+        if one.number < before.next_number or one.row < 0:
             continue
-        rendered = render_track(old, top, -1, change.there)
-        if rendered is None:
-            continue
-        # what was seen of an object without a name may be a small part of it
-        shown = np.count_nonzero(np.isfinite(rendered.depth) & ~rendered.hidden)
-        for row in new.keys() - found.keys():
-            mask = new[row].thing.sightings[-1].mask
-            explained, _ = rendered.fit(mask)
-            of_both = min(shown, np.count_nonzero(mask))
-            if explained and explained >= SAME_OBJECT_SHARE * of_both:
-                found[row] = old
+        thing = world.hypotheses.things[one.row]
+        for number, old in list(gone.items()):
+            if old.row >= 0 and before.hypotheses.things[old.row] == thing:
+                del gone[number]
+                renamed[one.number] = number
+                moved.append(number)
                 break
-
-    for old, _ in lost:
-        name = None if old.result is None else old.result.answer
-        if name is None or old in found.values():
-            continue
-        for row in new.keys() - found.keys():
-            result = new[row].result
-            if result is not None and result.answer == name:
-                found[row] = old
-                break
-    return found
+    return world.with_numbers(renamed), moved
 
 
-def _pose_of(track: Track) -> Float | None:
-    """Return the pose of an object, (4, 4); None for an unknown object."""
-    return None if track.result is None else track.result.pose
-
-
-def _touching(
-    tracks: Sequence[Track],
-    top: TableTop,
-    number: int,
-) -> set[tuple[int, int]]:
-    """Return the pairs of objects that touch in a frame, the smaller number first."""
-    masks = [track.mask_in(number) for track in tracks]
-    found = set()
-    for row, beside in top.neighbours(masks):
-        one, other = masks[row], masks[beside]
-        assert one is not None
-        assert other is not None
-        if touching(top.frame, one, other):
-            pair = tracks[row].number, tracks[beside].number
-            found.add((min(pair), max(pair)))
-    return found
+def _look(
+    before: SceneState,
+    state: SceneState,
+    moved: Sequence[int],
+    gone: Mapping[int, Thing],
+) -> Look:
+    """Return what a frame has changed."""
+    old = {one.number: one for one in before.objects}
+    new = {one.number: one for one in state.objects}
+    lost = [number for number in old if number not in new]
+    joined = []
+    for number in lost:
+        into = state.world.holder(before.world, number)
+        if number not in gone and into:
+            joined.append((number, into))
+    ended = {number for number, _ in joined}
+    return Look(
+        True,
+        tuple(number for number in new if number not in old),
+        tuple(Move(number, old[number].pose, new[number].pose) for number in moved if number in new and number in old),
+        tuple(number for number in lost if number not in ended),
+        tuple(joined),
+        (*state.tops[-1].warnings, *state.remarks),
+    )

@@ -13,11 +13,10 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.axes import upright_axes
+from nextview.scene.world import World
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
-from nextview.session.following import GONE, SAME_OBJECT_SHARE, Outline, seen_through
-from nextview.session.tracks import EDGE_WIDTH, Track
 from nextview.types import Float, Mask
 
 NEAR_DEVIATIONS = (
@@ -27,6 +26,7 @@ NEAR_DEVIATIONS = (
 NOISIEST_CAMERA = 0.005
 CONSIDERABLE_AREA = 1e-3  # square metres, visible area of a relevant patch, 3 cm wide
 PATCH_GAP = 0.02  # metres, largest gap inside a patch
+EDGE_WIDTH = 2  # pixels of the grid around an object that may show it
 PATCH_POINTS = 400  # sampled points of a patch
 GROUND_POINTS = 2000  # sampled points of the ground, for its convex hull
 REGION_CELL = 0.02  # metres, side of a cell of the ground in a region
@@ -47,32 +47,58 @@ class UnexplainedPatch:
 
 
 def unexplained(
-    tops: Sequence[TableTop],
-    tracks: Sequence[Track],
-    region: Box | None,
+    world: World, tops: Sequence[TableTop], region: Box | None
 ) -> list[UnexplainedPatch]:
-    """Find the larger parts of all frames that are neither ground nor an object.
+    """Find the larger parts of the last frame that are neither ground nor an object.
 
     The test does not depend on how the objects were found. With a region, all points inside count,
-    above and below the ground; without a region, points above the visible ground. Points over an
-    object, and points that a later frame sees through, are explained.
+    above and below the ground; without a region, points above the visible ground.
 
     Args:
+        world: what explains the frames.
         tops: support surfaces of the frames.
-        tracks: the objects.
         region: search region; None for everywhere.
     """
-    outlines = [Outline.of(track, tops[0].up) for track in tracks]
+    if not tops:
+        return []
+    top, view = tops[-1], world.views[-1]
+    frame = top.frame
+    left = ~_near_ground(top) & (frame.depth > 0)
+    left &= (top.height > 0) if region is None else inside_box(frame, region)
+    left &= ~top.seen.background
+    if frame.mask is not None:
+        left &= frame.mask
+    for mask in top.seen.carried_by_none:
+        left &= ~mask
+    stride = view.stride
+    owned = world.owners[-1].reshape(view.grid().depth.shape) > 0
+    owned = ndimage.binary_dilation(owned, iterations=EDGE_WIDTH)
+    owned = np.repeat(np.repeat(owned, stride, 0), stride, 1)
+    left &= ~owned[: frame.shape[0], : frame.shape[1]]
+    if not left.any():
+        return []
+
+    focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
+    away = float(np.median(frame.depth[left]))
+    half = max(1, round(float(np.sqrt(focal)) * THINNEST / 2 / away))
+    left = ndimage.binary_opening(left, np.ones((3, 3), bool), half)
+    # neighbouring parts form one patch, for example a heap of small objects
+    beside = round(float(np.sqrt(focal)) * PATCH_GAP / 2 / away)
+    label, _ = ndimage.label(ndimage.binary_dilation(left, iterations=max(beside, 1)))
+    label[~left] = 0
+    areas = np.bincount(label.ravel(), (frame.depth**2 / focal).ravel())
+    areas[0] = 0.0
+    axes = upright_axes(top.up)
+    ground = _ground_of(top) @ axes[:2].T
+
     found = []
-    for number, top in enumerate(tops):
-        for patch in _patches(number, top, tracks, region):
-            later = tops[number + 1 :]
-            over = (one.holds(patch.points).mean() for one in outlines if one)
-            if any(share >= SAME_OBJECT_SHARE for share in over):
-                continue
-            if any(seen_through(patch.points, one.frame) >= GONE for one in later):
-                continue
-            found.append(patch)
+    for part in np.flatnonzero(areas >= CONSIDERABLE_AREA):
+        rows, columns = np.nonzero(label == part)
+        few = slice(None, None, max(1, len(rows) // PATCH_POINTS))
+        points = frame.positions(rows[few], columns[few])
+        if region is None and not _on_ground(points @ axes[:2].T, ground).mean() > 0.5:
+            continue
+        found.append(UnexplainedPatch(points, float(areas[part])))
     return found
 
 
@@ -104,55 +130,6 @@ def _near_ground(top: TableTop) -> Mask:
     sigma = np.minimum(top.noise.at(depth), NOISIEST_CAMERA) * depth**2
     near = np.maximum(near, NEAR_DEVIATIONS * sigma)
     return np.asarray(np.abs(top.height) <= near)
-
-
-def _patches(
-    number: int,
-    top: TableTop,
-    tracks: Sequence[Track],
-    region: Box | None,
-) -> list[UnexplainedPatch]:
-    """Find the larger parts of one frame that are neither ground nor an object."""
-    frame = top.frame
-    left = ~_near_ground(top) & (frame.depth > 0)
-    if region is not None:
-        left &= inside_box(frame, region)
-    else:
-        left &= top.height > 0
-    left &= ~top.seen.background
-    if frame.mask is not None:
-        left &= frame.mask
-    for mask in top.seen.carried_by_none:
-        left &= ~mask
-    for track in tracks:
-        own = track.mask_in(number)
-        if own is not None:
-            left &= ~ndimage.binary_dilation(own, iterations=EDGE_WIDTH)
-    if not left.any():
-        return []
-
-    focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
-    away = float(np.median(frame.depth[left]))
-    half = max(1, round(float(np.sqrt(focal)) * THINNEST / 2 / away))
-    left = ndimage.binary_opening(left, np.ones((3, 3), bool), half)
-    # neighbouring parts form one patch, for example a heap of small objects
-    beside = round(float(np.sqrt(focal)) * PATCH_GAP / 2 / away)
-    label, _ = ndimage.label(ndimage.binary_dilation(left, iterations=max(beside, 1)))
-    label[~left] = 0
-    areas = np.bincount(label.ravel(), (frame.depth**2 / focal).ravel())
-    areas[0] = 0.0
-    axes = upright_axes(top.up)
-    ground = _ground_of(top) @ axes[:2].T
-
-    found = []
-    for part in np.flatnonzero(areas >= CONSIDERABLE_AREA):
-        rows, columns = np.nonzero(label == part)
-        few = slice(None, None, max(1, len(rows) // PATCH_POINTS))
-        points = frame.positions(rows[few], columns[few])
-        if region is None and not _on_ground(points @ axes[:2].T, ground).mean() > 0.5:
-            continue
-        found.append(UnexplainedPatch(points, float(areas[part])))
-    return found
 
 
 def _ground_of(top: TableTop) -> Float:

@@ -80,14 +80,14 @@ class SceneChoice:
         if ground is None:
             return {}
         return {
-            track.number: object_value(
-                self.system,
-                track,
+            one.number: object_value(
+                self.state.world,
+                one,
                 self.state.tops,
                 ground,
                 self.views,
             )
-            for track in self.state.tracks
+            for one in self.objects
         }
 
     @cached_property
@@ -97,7 +97,7 @@ class SceneChoice:
             return np.zeros(len(self.views.poses))
         return ground_value(
             self.ground,
-            len(self.state.tracks),
+            len(self.objects),
             len(self.system.classes),
             self.views,
         )
@@ -109,7 +109,7 @@ class SceneChoice:
         The sum of ``by_object`` and ``by_ground``. Without an object it is the distance of a view
         from the earlier views.
         """
-        if not self.state.tracks:
+        if not self.objects:
             return elsewhere_value(self.state.tops, self.views)
         return np.sum([*self.by_object.values(), self.by_ground], axis=0)
 

@@ -1,22 +1,23 @@
 """The set of posed things that explains the pixels of all frames best.
 
-A table of hypotheses and views holds the score of each pair. It gains a column with each frame and
+A table of hypotheses and views holds the score of each pair. It gains a column with each frame, and
 rows where a frame shows something that no chosen hypothesis explains. Things are chosen greedily:
-each pixel counts once, for the hypothesis that explains it best. An object of which no model is
-known, a stranger, explains its pixels a little, so that a name has to explain them better.
+each pixel counts once, for what explains it best. Something of which no model is known, a stranger,
+explains its pixels a little, so that a name has to explain them better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from nextview.segmentation.view import Segment, View
+from nextview.segmentation.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.propose import propose
-from nextview.things.register import camera_error, register
+from nextview.things.register import register
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
 
@@ -26,152 +27,266 @@ EXPLAINED = 0.6  # share of a segment that is explained, from which on it is not
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
-CLEAR_SHARE = 0.5  # share of the possible gain from which on a thing corrects the camera
+CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
+MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
+LEAST_OWN = 0.5  # share of a stranger that nothing else explains, at least
+SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Thing:
     """One thing of a world.
 
     Attributes:
-        row: of its hypothesis.
+        number: identifies it in all frames; 0 before it is numbered.
+        row: of its hypothesis; -1 for a stranger.
+        scores: of what explains it, in each view; None where it is not in the image.
         gain: over what the others explain, nats.
-        share: of the gain that it could have at most.
-        lead: over the best hypothesis of another thing at its place, nats.
-        rival: row of that hypothesis; -1 for none.
     """
 
+    number: int
     row: int
+    scores: Sequence[Score | None]
     gain: float
-    share: float
-    lead: float
-    rival: int
+
+    @property
+    def share(self) -> float:
+        """Share of the gain that it could have at most."""
+        seen = sum(one.seen for one in self.scores if one is not None)
+        return self.gain / max(1.0, PIXEL_GAIN * seen)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class World:
     """Hypotheses, views, and how well each explains each.
 
     Attributes:
         library: the taught things.
         views: in the order of their frames.
-        hypotheses: that are kept; None for none.
+        hypotheses: that are kept.
         scores: of each hypothesis in each view.
-        chosen: those that explain the views best together.
+        strangers: of each of them the score in each view: it explains its pixels a little.
+        things: that explain the views best together.
+        owners: number of the thing that explains each pixel of the grid of each view, 0 for none.
+        next_number: number of the next new thing.
+        keys: of each hypothesis, (M,) int64: it keeps it as long as it is kept.
+        next_key: key of the next new hypothesis.
+        given: number of the thing that a hypothesis has explained so far, by its key.
     """
 
     library: Library
-    views: list[View] = field(default_factory=list)
-    hypotheses: Hypotheses | None = None
-    scores: list[list[Score | None]] = field(default_factory=list)
-    chosen: list[Explanation] = field(default_factory=list)
-
-    def update(self, view: View) -> None:
-        """Take another view."""
-        among = np.ones(len(self.library), bool)
-        clear = [one.row for one in self.chosen if one.share > CLEAR_SHARE]
-        if clear:
-            view = camera_error(self.library, view, self.hypotheses[np.array(clear)])
-        self.views.append(view)
-        if self.hypotheses is not None:
-            some = register(self.library, self.views, self.hypotheses, (0.03, 0.02), 96)
-            self.hypotheses = some
-            columns = [score(self.library, one, some) for one in self.views]
-            self.scores = [list(row) for row in zip(*columns, strict=True)]
-            self.choose()
-        for segments in (view.instances, view.unions, view.fragments):
-            explained = self.explained(len(self.views) - 1)
-            left = [
-                one
-                for one in segments()
-                if explained[one.mask].mean() < EXPLAINED
-            ]
-            new = propose(self.library, view, left, among)
-            if new is None:
-                continue
-            self.add(new)
-            self.choose()
-        self.prune()
-
-    def add(self, new: Hypotheses) -> None:
-        """Add hypotheses, registered to all views."""
-        if len(self.views) > 1:
-            new = register(self.library, self.views, new, (0.04, 0.03, 0.02), 64)
-        columns = [score(self.library, one, new) for one in self.views]
-        self.scores += [list(row) for row in zip(*columns, strict=True)]
-        old = self.hypotheses
-        self.hypotheses = new if old is None else Hypotheses.joined([old, new])
+    views: tuple[View, ...] = ()
+    hypotheses: Hypotheses = field(default_factory=Hypotheses.none)
+    scores: tuple[tuple[Score | None, ...], ...] = ()
+    strangers: tuple[tuple[Score | None, ...], ...] = ()
+    things: tuple[Thing, ...] = ()
+    owners: tuple[NDArray[np.int32], ...] = ()
+    next_number: int = 1
+    keys: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    next_key: int = 0
+    given: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def totals(self) -> Float:
         """Score of each hypothesis alone, over all views, nats, (M,)."""
         return np.array([total(row) for row in self.scores])
 
-    def explained(self, number: int) -> Mask:
-        """Return the pixels of a view that its things explain, (H, W) bool."""
-        view = self.views[number]
+    def thing(self, number: int) -> Thing:
+        """Return the thing with this number."""
+        return next(one for one in self.things if one.number == number)
+
+    def with_view(self, view: View, carried: Sequence[Mask]) -> World:
+        """Return the world after another view, before anything new is searched for.
+
+        Args:
+            view: the view.
+            carried: pixels of what stands on something, (H, W) bool each.
+        """
+        some = self.hypotheses
+        views = (*self.views, view)
+        if len(self.views) < SETTLED_VIEWS and len(some):
+            some = register(self.library, views, some, (0.03, 0.02), 96)
+            columns = [score(self.library, one, some) for one in self.views]
+            scores = list(zip(*columns, strict=True))
+        else:
+            scores = list(self.scores)
+        column = score(self.library, view, some)
+        world = replace(
+            self,
+            views=views,
+            hypotheses=some,
+            scores=tuple((*row, new) for row, new in zip(scores, column, strict=True)),
+            strangers=_seen_again(self, view, carried),
+            owners=(*self.owners, np.zeros(view.grid().depth.size, np.int32)),
+        )
+        return world.chosen()
+
+    def searched(self, among: Mask) -> World:
+        """Return the world with names for what the last view shows unexplained.
+
+        Args:
+            among: things that may be there, (T,) bool.
+        """
+        world = self
+        view = self.views[-1]
+        for segments in (view.instances, view.unions, view.fragments):
+            shown = world.explained()
+            left = [one for one in segments() if shown[one.mask].mean() < EXPLAINED]
+            new = propose(self.library, view, left, among)
+            if new is not None:
+                world = world.with_hypotheses(new).chosen()
+        return world.pruned()
+
+    def with_hypotheses(self, new: Hypotheses) -> World:
+        """Return the world with more hypotheses, registered to all views."""
+        if len(self.views) > 1:
+            new = register(self.library, self.views, new, (0.04, 0.03, 0.02), 64)
+        columns = [score(self.library, one, new) for one in self.views]
+        rows = [_since_it_stands(row) for row in zip(*columns, strict=True)]
+        return replace(
+            self,
+            hypotheses=Hypotheses.joined([self.hypotheses, new]),
+            scores=(*self.scores, *rows),
+            keys=np.append(self.keys, self.next_key + np.arange(len(new))),
+            next_key=self.next_key + len(new),
+        )
+
+    def explained(self) -> Mask:
+        """Return the pixels of the last view that named things explain, (H, W) bool."""
+        view = self.views[-1]
         shown = np.zeros(view.grid().depth.shape, bool)
-        for one in self.chosen:
-            found = self.scores[one.row][number]
-            if found is not None and one.share > CLEAR_SHARE:
+        for one in self.things:
+            found = one.scores[-1]
+            if one.row >= 0 and found is not None and one.share > CLEAR_SHARE:
                 shown.ravel()[found.cells[found.gain > EXPLAINS]] = True
         stride = view.stride
         large = np.repeat(np.repeat(shown, stride, 0), stride, 1)
         return large[: view.depth.shape[0], : view.depth.shape[1]]
 
-    def choose(self) -> None:
-        """Choose the things that explain all views best together."""
-        totals = self.totals
-        have = [np.zeros(view.grid().depth.size, np.float32) for view in self.views]
-        bounds = {
-            int(row): float(totals[row]) for row in np.flatnonzero(totals > NEW_OBJECT)
-        }
-        gains: list[tuple[int, float]] = []
-        while bounds:
-            row = max(bounds, key=lambda one: bounds[one])
-            gain = sum(
-                float(_added(one, have[number]).sum()) + one.paid
-                for number, one in enumerate(self.scores[row])
-                if one is not None
-            )
-            if gain <= NEW_OBJECT:
-                del bounds[row]
-                continue
-            if gain < max((bounds[one] for one in bounds if one != row), default=0.0):
-                bounds[row] = gain
-                continue
-            del bounds[row]
-            gains.append((row, gain))
-            for number, one in enumerate(self.scores[row]):
-                if one is not None:
-                    cells = one.cells
-                    have[number][cells] = np.maximum(have[number][cells], one.gain)
-        self.chosen = [self._explanation(row, gain, totals) for row, gain in gains]
+    def chosen(self, ruled_out: Collection[int] = ()) -> World:
+        """Return the world with the things that explain all views best together.
 
-    def _explanation(self, row: int, gain: float, totals: Float) -> Explanation:
-        """Say how well a chosen hypothesis explains the views."""
-        some = self.hypotheses
-        thing = some.things[row]
-        near = np.linalg.norm(some.centres - some.centres[row], axis=1)
-        beside = (some.things != thing) & (near < self.library.radii[thing])
-        best = np.where(beside, totals, 0.0)
-        rival = int(best.argmax())
-        seen = sum(one.seen for one in self.scores[row] if one is not None)
-        return Explanation(
-            row,
-            gain,
-            gain / max(1.0, PIXEL_GAIN * seen),
-            float(totals[row] - best[rival]),
-            rival if best[rival] > 0 else -1,
+        Args:
+            ruled_out: rows of hypotheses that do not hold.
+        """
+        rows: dict[int, Sequence[Score | None]] = {
+            row: scores
+            for row, scores in enumerate(self.scores)
+            if row not in ruled_out
+        }
+        # strangers have negative rows
+        rows |= {-1 - k: scores for k, scores in enumerate(self.strangers)}
+        sizes = [view.grid().depth.size for view in self.views]
+        kept = _greedy(rows, sizes)
+        while kept:
+            gains = _alone(kept, rows, sizes)
+            gains |= {
+                row: 0.0
+                for row in kept
+                if row < 0 and gains[row] < LEAST_OWN * total(rows[row])
+            }
+            worst = min(kept, key=lambda row: gains[row])
+            if gains[worst] > NEW_OBJECT:
+                break
+            kept = [row for row in kept if row != worst]
+        things = [
+            Thing(0, max(row, -1), rows[row], gains[row]) for row in kept
+        ]
+        return replace(self, things=tuple(things))
+
+    def numbered(self) -> World:
+        """Return the world with a number for each thing: that of what held its pixels before."""
+        sizes = [view.grid().depth.size for view in self.views]
+        owners = _owners([one.scores for one in self.things], sizes)
+        count = len(self.things) + 1
+        most = max(self.next_number, 1)
+        shared = np.zeros((most, count))
+        for before, now in zip(self.owners, owners, strict=True):
+            shared += np.bincount(
+                before.astype(np.int64) * count + now + 1, minlength=most * count
+            ).reshape(most, count)
+        before_sizes = np.maximum(shared.sum(1), 1)
+        now_sizes = np.maximum(shared[1:].sum(0), 1)
+        alike = shared / np.minimum(before_sizes[:, None], now_sizes)
+        alike[0] = alike[:, 0] = 0
+
+        numbers = np.array(
+            [
+                0 if one.row < 0 else self.given.get(int(self.keys[one.row]), 0)
+                for one in self.things
+            ],
+            np.int64,
+        )
+        alike[numbers] = 0
+        alike[:, 1:][:, numbers > 0] = 0
+        while alike.max(initial=0) > SAME_SEGMENT:
+            number, row = np.unravel_index(alike.argmax(), alike.shape)
+            numbers[row - 1] = number
+            alike[number] = 0
+            alike[:, row] = 0
+        new = np.flatnonzero(numbers == 0)
+        numbers[new] = self.next_number + np.arange(len(new))
+        given = np.append(numbers, 0)
+        return replace(
+            self,
+            things=tuple(
+                replace(one, number=int(number))
+                for one, number in zip(self.things, numbers, strict=True)
+            ),
+            owners=tuple(given[owner].astype(np.int32) for owner in owners),
+            next_number=self.next_number + len(new),
+            given={
+                int(self.keys[one.row]): int(number)
+                for one, number in zip(self.things, numbers, strict=True)
+                if one.row >= 0
+            },
         )
 
-    def prune(self) -> None:
-        """Keep the chosen hypotheses, and the likeliest others of each place."""
+    def with_numbers(self, renamed: Mapping[int, int]) -> World:
+        """Return the world with other numbers for some things, by their present ones."""
+        if not renamed:
+            return self
+        given = np.arange(self.next_number, dtype=np.int32)
+        for number, other in renamed.items():
+            given[number] = other
+        things = (replace(one, number=int(given[one.number])) for one in self.things)
+        return replace(
+            self,
+            things=tuple(things),
+            owners=tuple(given[owner] for owner in self.owners),
+            given={key: int(given[number]) for key, number in self.given.items()},
+        )
+
+    def holder(self, before: World, number: int) -> int:
+        """Return the number of the thing that has most pixels of an earlier one; 0 for none.
+
+        Args:
+            before: the world in which it was.
+            number: of the earlier thing.
+        """
+        shared = np.zeros(self.next_number, np.int64)
+        count = 0
+        for old, new in zip(before.owners, self.owners, strict=False):
+            mine = old == number
+            count += np.count_nonzero(mine)
+            shared += np.bincount(new[mine], minlength=self.next_number)
+        shared[0] = 0
+        return int(shared.argmax()) if 2 * shared.max() > count else 0
+
+    def rivals(self, row: int) -> Index:
+        """Return the rows of all hypotheses at the place of one, itself among them, (N,) int64."""
         some = self.hypotheses
-        if some is None:
-            return
+        radius = np.maximum(
+            self.library.radii[some.things], self.library.radii[some.things[row]]
+        )
+        apart = np.linalg.norm(some.centres - some.centres[row], axis=1)
+        return np.flatnonzero(apart < radius)
+
+    def pruned(self) -> World:
+        """Return the world with the chosen hypotheses and the likeliest others of each place."""
+        some = self.hypotheses
         totals = self.totals
-        kept = {one.row for one in self.chosen}
+        kept = {one.row for one in self.things if one.row >= 0}
         places: list[int] = []
         for row in np.argsort(-totals).tolist():
             radius = np.maximum(
@@ -185,20 +300,195 @@ class World:
             if row in kept or (few and totals[row] > 0):
                 kept.add(row)
                 places.append(row)
-        rows = np.array(sorted(kept), np.int64)
-        number = {int(row): at for at, row in enumerate(rows)}
-        self.hypotheses = some[rows]
-        self.scores = [self.scores[row] for row in rows]
-        self.chosen = [
-            replace(
-                one,
-                row=number[one.row],
-                rival=number.get(one.rival, -1),
-            )
-            for one in self.chosen
+        return self.with_rows(np.array(sorted(kept), np.int64))
+
+    def with_rows(self, rows: Index) -> World:
+        """Return the world with some of its hypotheses, and the things that hold with them."""
+        at = {int(row): k for k, row in enumerate(rows)}
+        things = [
+            one if one.row < 0 else replace(one, row=at[one.row])
+            for one in self.things
+            if one.row < 0 or one.row in at
         ]
+        return replace(
+            self,
+            hypotheses=self.hypotheses[rows],
+            scores=tuple(self.scores[row] for row in rows),
+            things=tuple(things),
+            keys=self.keys[rows],
+        )
 
 
-def _added(one: Score, have: Float32) -> Float32:
-    """Return what each pixel of a score adds to what is explained, nats."""
-    return np.maximum(one.gain - have[one.cells], np.minimum(one.gain, 0))
+SETTLED_VIEWS = 3  # views after which poses are not refined
+
+
+def _since_it_stands(row: Sequence[Score | None]) -> tuple[Score | None, ...]:
+    """Leave out earlier views in which a new hypothesis was not there yet.
+
+    It was not there if every earlier view sees through it.
+    """
+    earlier = [one for one in row[:-1] if one is not None and one.seen > 0]
+    if earlier and all(one.through > MOST_THROUGH * one.seen for one in earlier):
+        return (*[None] * (len(row) - 1), row[-1])
+    return tuple(row)
+
+
+def _greedy(
+    rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]
+) -> list[int]:
+    """Choose rows, the one that adds most to what is explained first.
+
+    Args:
+        rows: scores in each view.
+        sizes: pixels of the grid of each view.
+    """
+    have = [np.zeros(size, np.float32) for size in sizes]
+    bounds = {row: total(scores) for row, scores in rows.items()}
+    bounds = {row: bound for row, bound in bounds.items() if bound > NEW_OBJECT}
+    kept = []
+    while bounds:
+        row = max(bounds, key=lambda one: bounds[one])
+        gain = sum(
+            float(_added(one.gain, have[number][one.cells]).sum()) + one.paid
+            for number, one in enumerate(rows[row])
+            if one is not None
+        )
+        if gain <= NEW_OBJECT or (row < 0 and gain < LEAST_OWN * total(rows[row])):
+            del bounds[row]
+            continue
+        if gain < max((bounds[one] for one in bounds if one != row), default=0.0):
+            bounds[row] = gain
+            continue
+        del bounds[row]
+        kept.append(row)
+        for number, one in enumerate(rows[row]):
+            if one is not None:
+                cells = one.cells
+                have[number][cells] = np.maximum(have[number][cells], one.gain)
+    return kept
+
+
+def _alone(
+    kept: Sequence[int], rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]
+) -> dict[int, float]:
+    """Return what each row adds to what all the others explain, nats."""
+    gains = dict.fromkeys(kept, 0.0)
+    for number, size in enumerate(sizes):
+        best = np.zeros(size, np.float32)
+        second = np.zeros(size, np.float32)
+        for row in kept:
+            one = rows[row][number]
+            if one is not None:
+                cells = one.cells
+                second[cells] = np.maximum(
+                    second[cells], np.minimum(one.gain, best[cells])
+                )
+                best[cells] = np.maximum(best[cells], one.gain)
+        for row in kept:
+            one = rows[row][number]
+            if one is not None:
+                cells = one.cells
+                others = np.where(one.gain >= best[cells], second[cells], best[cells])
+                gains[row] += float(_added(one.gain, others).sum()) + one.paid
+    return gains
+
+
+def _added(gain: Float32, have: Float32) -> Float32:
+    """Return what pixels add to what is explained, nats."""
+    return np.maximum(gain - have, np.minimum(gain, 0))
+
+
+def _owners(
+    things: Sequence[Sequence[Score | None]], sizes: Sequence[int]
+) -> list[NDArray[np.int64]]:
+    """Return which thing explains each pixel best, from 0 on; -1 for none."""
+    found = []
+    for number, size in enumerate(sizes):
+        best = np.zeros(size, np.float32)
+        owner = np.full(size, -1, np.int64)
+        for row, scores in enumerate(things):
+            one = scores[number]
+            if one is not None:
+                better = one.gain > best[one.cells]
+                best[one.cells[better]] = one.gain[better]
+                owner[one.cells[better]] = row
+        found.append(owner)
+    return found
+
+
+def _seen_again(
+    world: World, view: View, carried: Iterable[Mask]
+) -> tuple[tuple[Score | None, ...], ...]:
+    """Return strangers after another view: those of before, and new ones.
+
+    Args:
+        world: before the view.
+        view: the view.
+        carried: pixels of what stands on something, (H, W) bool each.
+    """
+    stride = view.stride
+    masks = [mask[::stride, ::stride].ravel() & (view.grid().depth.ravel() > 0) for mask in carried]
+    sizes = np.array([np.count_nonzero(mask) for mask in masks])
+    expected = [_expected(world, row, view) for row in world.strangers]
+    alike = np.zeros((len(expected), len(masks)))
+    for k, cells in enumerate(expected):
+        for n, mask in enumerate(masks):
+            alike[k, n] = np.count_nonzero(mask[cells]) / max(1, len(cells))
+    column: list[Score | None] = [None] * len(expected)
+    new = set(range(len(masks)))
+    while alike.max(initial=0) > SAME_SEGMENT:
+        k, n = np.unravel_index(alike.argmax(), alike.shape)
+        column[k] = _weak(masks[n])
+        new.discard(int(n))
+        alike[k] = 0
+        alike[:, n] = 0
+    found = [(*row, last) for row, last in zip(world.strangers, column, strict=True)]
+    before = (None,) * len(world.views)
+    found += [(*before, _weak(masks[n])) for n in sorted(new) if sizes[n]]
+    return tuple(found)
+
+
+def _weak(mask: Mask) -> Score:
+    """Return the score of a stranger with such pixels of the grid, (P,) bool."""
+    cells = np.flatnonzero(mask).astype(np.int32)
+    gain = np.full(len(cells), STRANGER_GAIN, np.float32)
+    return Score(cells, gain, 0.0, float(len(cells)), 0.0)
+
+
+def _expected(world: World, row: Sequence[Score | None], view: View) -> Index:
+    """Return the pixels of the grid of a view that show again what a stranger is, (N,) int64."""
+    points = world_points(world, row)
+    camera = view.camera
+    seen = (points - camera[:3, 3]) @ camera[:3, :3]
+    seen = seen[seen[:, 2] > 0.05]
+    if not len(seen):
+        return np.zeros(0, np.int64)
+    grid = view.grid()
+    column = np.searchsorted(grid.x, seen[:, 0] / seen[:, 2])
+    line = np.searchsorted(grid.y, seen[:, 1] / seen[:, 2])
+    height, width = grid.depth.shape
+    inside = (column > 0) & (column < width) & (line > 0) & (line < height)
+    column, line, z = column[inside], line[inside], seen[inside, 2]
+    there = np.abs(grid.depth[line, column] - z) < SAME_DEPTH
+    return np.unique(line[there] * width + column[there])
+
+
+SAME_DEPTH = 0.03  # metres between the points of one stranger in two views
+
+
+def world_points(world: World, row: Sequence[Score | None]) -> Float:
+    """Return the measured points that something explains in all views, (N, 3), metres."""
+    found = [np.zeros((0, 3))]
+    for view, one in zip(world.views, row, strict=False):
+        if one is not None:
+            found.append(points_of(view, one.cells[one.gain > 0]))
+    return np.concatenate(found)
+
+
+def points_of(view: View, cells: Index) -> Float:
+    """Return the measured points of pixels of the grid, (N,), in the world, (N, 3), metres."""
+    grid = view.grid()
+    line, column = np.divmod(cells, grid.depth.shape[1])
+    z = grid.depth[line, column].astype(np.float64)
+    own = np.stack([grid.x[column] * z, grid.y[line] * z, z], 1)
+    return own @ view.camera[:3, :3].T + view.camera[:3, 3]

@@ -117,6 +117,16 @@ class View:
         """Return the view from another pose of its camera, camera-to-world, (4, 4)."""
         return replace(self, camera=camera)
 
+    def without(self, cells: Mask) -> View:
+        """Return the view without some pixels of its grid, (h, w) bool: they say nothing more."""
+        stride = self.stride
+        large = np.repeat(np.repeat(cells, stride, 0), stride, 1)
+        depth = self.depth.copy()
+        depth[large[: depth.shape[0], : depth.shape[1]]] = 0
+        left = replace(self, frame=self.frame.with_depth(depth))
+        object.__setattr__(left, "_grids", {})
+        return left
+
     @property
     def depth(self) -> Float32:
         """Depth of the frame, (H, W) float32, metres; 0 where nothing was measured."""

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from nextview.session.result import Recognition
+from nextview.recognition.poses import PoseCandidate, PoseUncertainty
 from nextview.session.view import View
+from nextview.types import Float
 
 
 def episode_as_json(
@@ -45,7 +47,14 @@ def episode_as_json(
         "radius",
     )
     whole = {"name": name} | {part: getattr(result, part) for part in parts}
-    whole |= pose_as_json(result)
+    whole |= pose_as_json(
+        result.pose, result.pose_uncertainty, result.pose_candidates, result.symmetry
+    )
+    whole |= {
+        "pose_of": result.pose_of,
+        "pose_frame": result.pose_frame,
+        "why_no_pose": result.why_no_pose,
+    }
     whole |= {
         "unit": None if result.radius is None else "m",
         "threshold_reached": result.confident,
@@ -85,13 +94,20 @@ def _view_as_json(result: Recognition, view: View) -> dict[str, Any]:
     }
 
 
-def pose_as_json(result: Recognition) -> dict[str, Any]:
-    """Return the pose attributes of a ``Recognition`` under the same names.
+def pose_as_json(
+    pose: Float | None,
+    off: PoseUncertainty | None,
+    every: Sequence[PoseCandidate],
+    symmetry: Sequence[Any] | None,
+) -> dict[str, Any]:
+    """Return what is known of a pose.
 
     Args:
-        result: of a session, or of one object of a scene.
+        pose: of the scan, (4, 4), metres; None if it is not known.
+        off: its uncertainty.
+        every: candidate poses, the likeliest first.
+        symmetry: of the thing; None if it is not known.
     """
-    off = result.pose_uncertainty
     candidates = [
         {
             "thing": each.thing,
@@ -100,10 +116,9 @@ def pose_as_json(result: Recognition) -> dict[str, Any]:
             "degrees": each.degrees,
             "millimetres": each.millimetres,
         }
-        for each in result.pose_candidates
+        for each in every
     ]
 
-    symmetry = result.symmetry
     axes = (
         None
         if symmetry is None
@@ -111,9 +126,7 @@ def pose_as_json(result: Recognition) -> dict[str, Any]:
     )
 
     return {
-        "pose": result.pose,
-        "pose_of": result.pose_of,
-        "pose_frame": result.pose_frame,
+        "pose": pose,
         "pose_uncertainty": (
             None
             if off is None
@@ -121,7 +134,6 @@ def pose_as_json(result: Recognition) -> dict[str, Any]:
         ),
         "pose_candidates": candidates,
         "symmetry": axes,
-        "why_no_pose": result.why_no_pose,
     }
 
 

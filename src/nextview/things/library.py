@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -17,20 +19,28 @@ class Library:
 
     Attributes:
         names: of the things, in their order.
+        symmetries: of each thing, by its name.
         caster: casts rays at their surfaces.
         templates: their depth images from all directions.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
         radii: radius of each, (T,) float64, metres.
     """
 
-    def __init__(self, surfaces: Sequence[Surface], threads: int = 1) -> None:
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        symmetries: Mapping[str, Any] = MappingProxyType({}),
+        threads: int = 1,
+    ) -> None:
         """Render the templates.
 
         Args:
             surfaces: of the things, with their names.
+            symmetries: of each thing, by its name.
             threads: number of threads; 0 for one on each core.
         """
         self.names = tuple(surface.name for surface in surfaces)
+        self.symmetries = symmetries
         self.caster = SurfaceCaster(surfaces)
         self.templates: ViewTemplates = templates_of(self.caster, threads)
         self.centres = self.caster.centres.astype(np.float64)
@@ -39,6 +49,10 @@ class Library:
     def __len__(self) -> int:
         """Number of things."""
         return len(self.names)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Library:
+        """The same object: it is immutable."""
+        return self
 
     def seen_from(
         self, things: Index, towards: Float, count: int
@@ -82,6 +96,11 @@ class Hypotheses:
     def of(cls, things: Index, rotations: Float, centres: Float) -> Hypotheses:
         """Return hypotheses of the things in the sizes that were taught."""
         return cls(things, rotations, centres, np.ones((len(things), 3)))
+
+    @classmethod
+    def none(cls) -> Hypotheses:
+        """Return no hypotheses."""
+        return cls.of(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
     @classmethod
     def joined(cls, several: Sequence[Hypotheses]) -> Hypotheses:

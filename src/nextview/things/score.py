@@ -42,15 +42,16 @@ class Score:
         cells: pixels of the grid that it explains or that are in front of it, (N,) int32.
         gain: of each, (N,) float32, nats; 0 for those in front of it.
         paid: sum of what is paid for, nats, 0 or less.
-        shown: pixels of the grid in which it would be visible if nothing were in front of it.
-        seen: the same without those that something hides.
+        seen: pixels of the grid in which it is measured, or seen through; those on its outline
+            count less.
+        through: those of them that are seen through.
     """
 
     cells: NDArray[np.int32]
     gain: Float32
     paid: float
-    shown: int
     seen: float
+    through: float
 
     @property
     def total(self) -> float:
@@ -85,8 +86,8 @@ def score(
                     one.cells,
                     one.gain * count,
                     one.paid * count,
-                    one.shown * count,
                     one.seen * count,
+                    one.through * count,
                 )
             found[row] = one
     return found
@@ -176,7 +177,8 @@ def _scored(
     carries = grid.surface.ravel()[at]
     # a surface explains itself
     gain = np.where(on & carries, np.minimum(gain, 0), gain)
-    paid = OUTLIER * (weight * behind).sum((1, 2))
+    through = (weight * behind).sum((1, 2))
+    paid = OUTLIER * through
     paid += NOT_MEASURED * (cosine * weight * (shown & (measured == 0))).sum((1, 2))
 
     piece = np.where(within, grid.piece.ravel()[at], 0)
@@ -193,8 +195,8 @@ def _scored(
             at[row][held[row]].astype(np.int32),
             gain[row][held[row]].astype(np.float32),
             float(paid[row]),
-            int(np.count_nonzero(shown[row])),
             float(seen[row]),
+            float(through[row]),
         )
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.recognition.model_card import Symmetry
-from nextview.things.depth_view import DepthView, MetricImage
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.things.depth_view import NOT_MEASURED, THING, DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.registration import (
     COARSE_LEVELS,
@@ -31,7 +32,12 @@ from nextview.things.stability import Stability, carried, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
-from nextview.things.view_templates import ViewTemplates, rank_within, templates_of
+from nextview.things.view_templates import (
+    SeenOutline,
+    ViewTemplates,
+    rank_within,
+    templates_of,
+)
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Index, Mask
 
@@ -264,6 +270,18 @@ class _Judged:
         )
 
 
+def _outline(image: MetricImage) -> SeenOutline | None:
+    """Return the outline of the thing in a view; None if too little of it is visible."""
+    return SeenOutline.of(
+        image.depth,
+        image.kind == THING,
+        image.kind == NOT_MEASURED,
+        image.hiding,
+        PinholeCamera.of(image.intrinsics, image.depth.shape),
+        image.pose,
+    )
+
+
 class Verifier:
     """Recognises things of known geometry and estimates their poses.
 
@@ -324,23 +342,30 @@ class Verifier:
         else:
             images, level = _levelled(observations)
 
-        found = self.templates.propose(images, self.among)
-        if not len(found.things):
+        outlines = [one for one in map(_outline, images) if one is not None]
+        among = np.ones(len(self.caster.surfaces), bool)
+        among = among if self.among is None else self.among
+        found = [self.templates.propose(one, among) for one in outlines]
+        things = np.concatenate([np.zeros(0, np.int64), *(one.things for one in found)])
+        if not len(things):
             raise ObservationError(
                 "no view shows enough of the thing to compare it with the scans"
             )
-        by_outline = found.log_belief + (0 if prior is None else prior)
+        by_outline = -np.mean([one.of_things for one in found], axis=0)
+        by_outline = np.where(among, by_outline + (0 if prior is None else prior), -np.inf)
         by_outline -= by_outline.max()
         belief = np.exp(by_outline)
         proposed = _Proposed(
-            things=found.things,
-            rotations=found.rotations,
-            centres=found.centres,
-            log_belief=by_outline[found.things],
+            things=things,
+            rotations=np.concatenate([one.rotations for one in found]),
+            centres=np.concatenate([one.centres for one in found]),
+            log_belief=by_outline[things],
             by_outline=belief / belief.sum(),
         )
+        ranks = np.concatenate([one.ranks for one in found])
+        hidden = all(one.hidden for one in outlines)
         return self._settled(
-            *self._started(proposed, found.ranks, found.hidden, images), images, level
+            *self._started(proposed, ranks, hidden, images), images, level
         )
 
     def log_odds_of_stranger(

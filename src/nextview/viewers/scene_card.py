@@ -135,7 +135,7 @@ def _object_card(thing: SceneObject) -> str:
     if thing.touches:
         where += f", touches {', '.join(str(number) for number in thing.touches)}"
 
-    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[
+    beliefs = sorted(thing.beliefs.items(), key=lambda pair: -pair[1])[
         :PAGE_CANDIDATES
     ]
     rows = "".join(

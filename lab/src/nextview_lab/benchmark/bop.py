@@ -440,7 +440,7 @@ def _look(
     poses = []
     others = []
     for thing in scene.objects:
-        name = thing.result.pose_of
+        name = thing.candidates[0].thing
         pose = thing.pose
         if name is None or pose is None:
             continue
