@@ -214,9 +214,34 @@ class View:
                 yield Segment(mask, whole & ~mask)
 
     def unions(self) -> Iterator[Segment]:
-        """Return pairs of neighbouring instances: a thing that was cut in two is one."""
+        """Return neighbouring instances as one: a thing that was cut in two or more is one.
+
+        Those that touch each other most for their size are joined first, and so on: as many unions
+        as there are joins.
+        """
+        touching = self._touching()
+        sizes = np.bincount(self.labels.ravel()).astype(np.float64)
+        group = np.arange(len(sizes))
+        while True:
+            smaller = np.sqrt(np.minimum(sizes[:, None], sizes))
+            close = np.where(touching >= FEWEST_NEIGHBOURS, touching / (smaller + 1), 0)
+            low, high = np.unravel_index(close.argmax(), close.shape)
+            if close[low, high] <= 0:
+                return
+            touching[low] += touching[high]
+            touching[:, low] += touching[:, high]
+            touching[high] = touching[:, high] = touching[low, low] = 0
+            sizes[low] += sizes[high]
+            group[group == high] = low
+            mask = np.isin(self.labels, np.flatnonzero(group == low))
+            if np.count_nonzero(mask) >= self.fewest:
+                yield Segment(mask)
+
+    def _touching(self) -> Float:
+        """Count the pixels along which each two instances touch, (N, N) float64."""
+        count = int(self.labels.max(initial=0)) + 1
+        found = np.zeros((count, count))
         depth = self.depth
-        count: dict[tuple[int, int], int] = {}
         for gap in (self.stride, 2 * self.stride + 1):
             for one, two in (
                 (np.s_[:, :-gap], np.s_[:, gap:]),
@@ -225,13 +250,9 @@ class View:
                 first, second = self.labels[one], self.labels[two]
                 beside = (first != second) & (first > 0) & (second > 0)
                 beside &= np.abs(depth[one] - depth[two]) < NEIGHBOURS_APART
-                low = np.minimum(first[beside], second[beside])
-                high = np.maximum(first[beside], second[beside])
-                for pair in zip(low.tolist(), high.tolist(), strict=True):
-                    count[pair] = count.get(pair, 0) + 1
-        for (low, high), touching in sorted(count.items(), key=lambda one: -one[1]):
-            if touching >= FEWEST_NEIGHBOURS:
-                yield Segment((self.labels == low) | (self.labels == high))
+                key = first[beside] * count + second[beside]
+                found += np.bincount(key, minlength=count**2).reshape(count, count)
+        return found + found.T
 
 
 def _parts(labels: NDArray[np.int32], fewest: int) -> Iterator[Mask]:
