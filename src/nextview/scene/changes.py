@@ -42,6 +42,8 @@ class Changes:
         moved: numbers of things that stand elsewhere.
         gone: things that are no longer where they were.
         stand: numbers of things that the view shows where they were.
+        wrong_pose: whether most of several things are not where they were, though the camera may
+            have moved: its pose is likely to be wrong.
     """
 
     world: World
@@ -49,12 +51,7 @@ class Changes:
     moved: tuple[int, ...] = ()
     gone: tuple[Thing, ...] = ()
     stand: tuple[int, ...] = ()
-
-    @property
-    def wrong_pose(self) -> bool:
-        """Whether most of several things are not where they were: the pose is likely to be wrong."""
-        changed = len(self.moved) + len(self.gone)
-        return changed > 1 and changed > len(self.stand)
+    wrong_pose: bool = False
 
 
 def changes(world: World, view: View, camera_stands: bool) -> Changes:
@@ -71,7 +68,7 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         known = [one for one in named if one.share > CLEAR_SHARE]
         if known and not camera_stands:
             view = _corrected(world, view, np.array([one.row for one in known]))
-        return _compared(world, view, named, rows)
+        return _compared(world, view, named, rows, camera_stands)
     return _without_gone_strangers(Changes(world, view))
 
 
@@ -111,7 +108,13 @@ def _cost(given: View, believed: View) -> float:
     return float((angle / CAMERA_TURN) ** 2 + (shift / CAMERA_SHIFT) ** 2) / 2
 
 
-def _compared(world: World, view: View, named: Sequence[Thing], rows: Index) -> Changes:
+def _compared(
+    world: World,
+    view: View,
+    named: Sequence[Thing],
+    rows: Index,
+    camera_stands: bool,
+) -> Changes:
     """Compare the view with each named thing."""
     library = world.library
     there = world.hypotheses[rows]
@@ -145,8 +148,10 @@ def _compared(world: World, view: View, named: Sequence[Thing], rows: Index) -> 
             gone.append(one)
         elif found.total > NEW_OBJECT:
             stand.append(one.number)
-    told = Changes(world, view, tuple(moved), tuple(gone), tuple(stand))
-    if told.wrong_pose or not (moved or gone):
+    changed = len(moved) + len(gone)
+    wrong = not camera_stands and changed > 1 and changed > len(stand)
+    told = Changes(world, view, tuple(moved), tuple(gone), tuple(stand), wrong)
+    if wrong or not changed:
         return _without_gone_strangers(told)
     return _without_gone_strangers(replace(told, world=_after(world, told, alone, new_poses)))
 

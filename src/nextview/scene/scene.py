@@ -593,7 +593,7 @@ class Scene:
         # the pose of a camera that has not moved is as right as before
         stands = self._known_frames.stands(top.frame)
         told = changes(before.world, view, stands)
-        if told.wrong_pose and not stands:
+        if told.wrong_pose:
             return before, Look(False, warnings=(self._why_wrong(top),))
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
@@ -628,6 +628,11 @@ class Scene:
             new = ruled_out_by(self.rule, state.objects)
             if not new:
                 return state
+            known = state.world.library.names
+            for name in {name for names in new.values() for name in names}:
+                if name not in known:
+                    what = f"{one_line(name)} is none of the taught things"
+                    raise UsageError(f"{what}{did_you_mean(name, known)}")
             ruled_out = {
                 number: {**state.ruled_out.get(number, {}), **new.get(number, {})}
                 for number in {*state.ruled_out, *new}

@@ -15,7 +15,7 @@ from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame, within
 from nextview.types import Float, Float32, Index, Mask
 
-GRID_COLUMNS = 320  # columns of the grid on which hypotheses are scored, about
+GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
 # standard deviation of a measured depth, relative, at least: real depth is bent
 LEAST_ERROR = 0.0025
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least

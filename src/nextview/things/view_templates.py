@@ -28,7 +28,7 @@ from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
 TEMPLATE_DIRECTIONS = 162  # viewing directions of the templates, some 15 degrees apart
-TURNS = 12  # rotations of the view in the image plane, 30 degrees apart
+TURNS = 24  # rotations of the view in the image plane, 15 degrees apart
 TEMPLATE_SIDE = 12  # rows and columns of a template
 TEMPLATE_REACH = 2.2  # half width of a template, root mean squares of the outline
 RENDERING_PIXELS = 28  # rows and columns of a rendering
