@@ -38,7 +38,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -64,6 +64,7 @@ from nextview.sensing import Frame
 Part = Literal["tables", "single", "parts", "moves", "places", "real", "counts"]
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
+Shapes = dict[str, tuple[Float, Float]]  # points on each scan and normals there
 
 IN_VIEW = 500  # pixels of a thing, from which on it counts
 NEAR = 0.03  # metres from the true middle
@@ -72,20 +73,14 @@ PIXELS_NEAR = 8  # of a given pixel in a real frame
 LEAST_LABEL = 200  # pixels of a label in a real frame
 UNKNOWN = "unknown"
 REAL_YCB = np.array([[618.017, 0, 312.377], [0, 618.003, 232.375], [0, 0, 1]])
-REAL_TABLES = 12
+REAL_TABLES = 12  # frames
+CHANGED = 3  # number of the first frame after a move
 SPREAD = ("mm", "seconds")  # columns of which median and worst are shown
 DEFAULT_FRAMES = Path("~/.cache/nextview/gate")
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A name that was given.
-
-    Attributes:
-        name: of the thing.
-        confident: whether the name is.
-        pose: scan-to-world, (4, 4), metres.
-    """
+class Found(NamedTuple):
+    """A name that was given, whether it is confident, and the pose, scan-to-world, (4, 4)."""
 
     name: str
     confident: bool
@@ -94,12 +89,8 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What parts share.
-
-    Attributes:
-        data: folder of the scans and of the real frames.
-        frames: folder of the drawn frames.
-        every: each so manyth case is measured.
+    """What parts share: the folders of the data and of the drawn frames, and that each so manyth
+    case is measured.
     """
 
     data: Path
@@ -111,44 +102,35 @@ class Bench:
         """Files of the scans by their names."""
         return {path.stem: path for path in sorted((self.data / "YCB").glob("*.ply"))}
 
-    @property
-    def shapes(self) -> Shapes:
-        """Points and normals of all scans."""
-        return {name: cloud(scan(path)) for name, path in self.scans.items()}
+    def taught(self) -> tuple[nextview.System, Shapes]:
+        """The bundled system, and the scans that it knows."""
+        system = nextview.load("ycb", threads=1)
+        missing = set(system.classes) - set(self.scans)
+        if missing:
+            sys.exit(f"{self.data}/YCB: holds no scan of {min(missing)}")
+        return system, {name: cloud(scan(path)) for name, path in self.scans.items()}
 
     def cases(self, part: str) -> Iterator[tuple[str, Case]]:
         """The cases of a part, each with its name."""
         for number in range(0, DRAWS[part][1], self.every):
             yield f"{part} {number}", case(part, number, self.scans, self.frames)
 
-    def system(self) -> nextview.System:
-        """The system of the scans."""
-        system = nextview.load("ycb", threads=1)
-        missing = set(system.classes) - set(self.scans)
-        if missing:
-            sys.exit(f"{self.data}/YCB: holds no scan of {sorted(missing)[0]}")
-        return system
 
-
-Shapes = dict[str, tuple[Float, Float]]
+def updated(scene: nextview.Session | nextview.Scene, frame: Frame) -> tuple[Any, Row]:
+    """Give a frame to a scene or a session; what it returns, and the seconds that it took."""
+    begun = time.process_time()
+    told = None
+    try:
+        told = scene.update(frame)
+    except nextview.NextviewError as error:
+        print(f"    refused: {error}", file=sys.stderr)
+    seconds = time.process_time() - begun
+    return told, {"refused": int(told is None), "seconds": [seconds]}
 
 
 def frame_of(seen: Case, number: int, mask: Mask | None = None) -> Frame:
     """A frame of a case."""
     return Frame(seen.depth[number], INTRINSICS, seen.told[number], mask)
-
-
-def updated(scene: nextview.Session | nextview.Scene, frame: Frame) -> tuple[Any, Row]:
-    """Give a frame to a scene or a session; what it returns, and the seconds that it took."""
-    begun = time.process_time()
-    told: Any = None
-    refused = 0
-    try:
-        told = scene.update(frame)
-    except nextview.NextviewError as error:
-        print(f"    refused: {error}", file=sys.stderr)
-        refused = 1
-    return told, {"refused": refused, "seconds": [time.process_time() - begun]}
 
 
 def found_in(scene: nextview.Scene) -> list[Found]:
@@ -182,65 +164,64 @@ def compared(
 ) -> Row:
     """Compare the names that are given after a frame with the truth."""
     names = seen.names.tolist()
-    there = np.isfinite(seen.poses[frame, :, 0, 0])
     true = [moved(*pair) for pair in zip(seen.points, seen.poses[frame], strict=True)]
+    pixels = [
+        (seen.labels[: frame + 1] == n + 1).sum((1, 2)) for n in range(len(names))
+    ]
     known = {
-        number
-        for number, name in enumerate(names)
-        if there[number]
-        and not name.startswith(STRANGER)
-        and (seen.labels[: frame + 1] == number + 1).sum((1, 2)).max() >= IN_VIEW
+        name
+        for name, points, counted in zip(names, true, pixels, strict=True)
+        if not name.startswith(STRANGER)
+        and np.isfinite(points).all()
+        and counted.max() >= IN_VIEW
     }
-
-    row = tally(len(known))
-    taken = set()
+    right: set[str] = set()
+    judged: list[tuple[Found, bool]] = []
+    off = []
+    on_strangers = []
     for one in found:
         centre = middle(moved(shapes[one.name][0], one.pose))
-        number = names.index(one.name) if one.name in names else None
-        if (
-            number is not None
-            and number not in taken
-            and np.linalg.norm(centre - middle(true[number])) < NEAR
-        ):
-            taken.add(number)
-            if number in known:  # hardly visible things count neither way
-                count(row, one, right=True)
-                off = millimetres_off(true[number], shapes[one.name], one.pose)
-                row["mm"].append(off)
-            continue
-        count(row, one, right=False)
-        nearest = nearest_of(true, there, centre)
-        if names[nearest].startswith(STRANGER):
-            row["on strangers"] += 1
-            row["sure on strangers"] += one.confident
-    row["missed"] = [names[number] for number in sorted(known - taken)]
-    return row
+        own = (
+            true[names.index(one.name)]
+            if one.name in names
+            else np.full((1, 3), np.inf)
+        )
+        at = one.name not in right and np.linalg.norm(centre - middle(own)) < NEAR
+        if not at and names[nearest_of(true, centre)].startswith(STRANGER):
+            on_strangers.append(one)
+        if at:
+            right.add(one.name)
+        if not at or one.name in known:  # a thing that hardly shows counts neither way
+            judged.append((one, bool(at)))
+        if at and one.name in known:
+            off.append(millimetres_off(own, shapes[one.name], one.pose))
+    return {
+        **row_of(known, judged),
+        "on strangers": len(on_strangers),
+        "sure on strangers": sum(one.confident for one in on_strangers),
+        "mm": off,
+    }
 
 
-def tally(known: int) -> Row:
-    """A row in which nothing is counted yet."""
-    counted = ("right", "named", "sure right", "sure wrong", "on strangers")
-    row: Row = {"known": known, **dict.fromkeys(counted, 0), "sure on strangers": 0}
-    return {**row, "mm": [], "wrong": []}
+def row_of(known: set[str], judged: Sequence[tuple[Found, bool]]) -> Row:
+    """Count the names that are given, each of which is right or not."""
+    right = [one for one, is_right in judged if is_right]
+    wrong = [one for one, is_right in judged if not is_right]
+    return {
+        "known": len(known),
+        "right": len(right),
+        "named": len(judged),
+        "sure right": sum(one.confident for one in right),
+        "sure wrong": sum(one.confident for one in wrong),
+        "missed": sorted(known - {one.name for one in right}),
+        "wrong": [one.name + " (sure)" * one.confident for one in wrong],
+    }
 
 
-def count(row: Row, one: Found, right: bool) -> None:
-    """Count a name in a row."""
-    row["named"] += 1
-    row["right"] += right
-    row["sure right"] += right and one.confident
-    row["sure wrong"] += one.confident and not right
-    if not right:
-        row["wrong"].append(one.name + " (sure)" * one.confident)
-
-
-def nearest_of(true: Sequence[Float], there: Mask, place: Float) -> int:
-    """The thing with the point that is nearest to a place."""
-    distances = [
-        np.linalg.norm(points - place, axis=1).min() if is_there else np.inf
-        for points, is_there in zip(true, there, strict=True)
-    ]
-    return int(np.argmin(distances))
+def nearest_of(true: Sequence[Float], place: Float) -> int:
+    """The thing with the point that is nearest to a place; those that are gone have none."""
+    distances = [np.linalg.norm(points - place, axis=1).min() for points in true]
+    return int(np.nanargmin(distances))
 
 
 def in_scenes(
@@ -254,37 +235,31 @@ def in_scenes(
         scene = nextview.Scene(system)
         for frame in range(len(seen.depth)):
             cost = updated(scene, frame_of(seen, frame))[1]
-            of_many = f", frame {frame + 1}" if len(seen.depth) > 1 else ""
-            yield {
-                "group": f"{seen.kind}{of_many}",
-                "case": name,
-                **compared(found_in(scene), seen, frame, shapes),
-                **cost,
-            }
+            row = compared(found_in(scene), seen, frame, shapes)
+            group = f"{seen.kind} {frame + 1}"
+            yield {"group": group, "case": name, **row, **cost}
 
 
 def tables(bench: Bench) -> Iterator[Row]:
     """Tables of taught things and strangers."""
-    yield from in_scenes(bench, "tables", bench.system(), bench.shapes)
+    return in_scenes(bench, "tables", *bench.taught())
 
 
 def places(bench: Bench) -> Iterator[Row]:
     """Things that are partly hidden or cut off."""
-    yield from in_scenes(bench, "places", bench.system(), bench.shapes)
+    return in_scenes(bench, "places", *bench.taught())
 
 
 def single(bench: Bench) -> Iterator[Row]:
     """Single things by their masks."""
-    system = bench.system()
-    shapes = bench.shapes
+    system, shapes = bench.taught()
     for name, seen in bench.cases("single"):
         session = system.session()
-        cost = updated(session, frame_of(seen, 0, seen.labels[0] == 1))[1]
+        told, cost = updated(session, frame_of(seen, 0, seen.labels[0] == 1))
         found = []
-        if not cost["refused"]:
-            said = session.result
-            if said.answer is not None and said.pose is not None:
-                found = [Found(said.answer, said.confident, said.pose)]
+        said = None if told is None else session.result
+        if said is not None and said.pose is not None:
+            found = [Found(str(said.answer), said.confident, said.pose)]
         row = compared(found, seen, 0, shapes)
         yield {"group": "by mask", "case": name, **row, **cost}
 
@@ -308,93 +283,83 @@ def parts(bench: Bench) -> Iterator[Row]:
 
 def moves(bench: Bench) -> Iterator[Row]:
     """Things that are moved or removed between frames."""
-    system = bench.system()
-    shapes = bench.shapes
+    system, shapes = bench.taught()
     for name, seen in bench.cases("moves"):
         scene = nextview.Scene(system)
-        same = (seen.poses == seen.poses[0]).all((2, 3)).all(0)
-        changed = int(np.argmin(same))
-        row: Row = {"group": str(seen.kind), "case": name, "changes": 1}
-        row |= {"told": 0, "kind right": 0, "false alarms": 0, "refused": 0}
-        row["seconds"] = []
+        same = (seen.poses == seen.poses[0]).all((0, 2, 3))
+        told: list[str] = []  # of what was changed, once it was
+        alarms: list[str] = []
+        costs = []
         for frame in range(len(seen.depth)):
             before = {one.number: one.place for one in scene.objects}
             look, cost = updated(scene, frame_of(seen, frame))
-            row["refused"] += cost["refused"]
-            row["seconds"] += cost["seconds"]
-            if look is None:
-                continue
-            stood = seen.poses[max(frame - 1, 0)]
-            there = np.isfinite(stood[:, 0, 0])
-            true = [moved(*pair) for pair in zip(seen.points, stood, strict=True)]
-            alarms = [("moved", one.number) for one in look.moved]
-            alarms += [("removed", number) for number in look.gone]
-            for kind, number in alarms:
-                owner = nearest_of(true, there, before[number])
-                if frame < 3 or owner != changed:
-                    row["false alarms"] += 1
-                    continue
-                row["told"] = 1
-                row["kind right"] |= kind == seen.kind
-        last = len(seen.depth) - 1
-        yield {**compared(found_in(scene), seen, last, shapes), **row}
+            costs.append(cost)
+            stood = zip(seen.points, seen.poses[max(frame - 1, 0)], strict=True)
+            true = [moved(*pair) for pair in stood]
+            said = [] if look is None else [("moved", one.number) for one in look.moved]
+            said += (
+                [] if look is None else [("removed", number) for number in look.gone]
+            )
+            for kind, number in said:
+                owner = nearest_of(true, before[number])
+                (alarms if frame < CHANGED or same[owner] else told).append(kind)
+        yield {
+            "group": str(seen.kind),
+            "case": name,
+            "changes": 1,
+            "told": int(bool(told)),
+            "kind right": int(str(seen.kind) in told),
+            "false alarms": len(alarms),
+            **compared(found_in(scene), seen, len(costs) - 1, shapes),
+            "refused": sum(cost["refused"] for cost in costs),
+            "seconds": [second for cost in costs for second in cost["seconds"]],
+        }
 
 
 def real(bench: Bench) -> Iterator[Row]:
     """Real frames, each alone and without a pose."""
-    system = bench.system()
-    shapes = bench.shapes
+    system, shapes = bench.taught()
     for group, name, frame, things in real_frames(bench):
         scene = nextview.Scene(system, up=None)
         cost = updated(scene, frame)[1]
-        row = tally(len(things))
-        missed = dict(things)
-        for one in found_in(scene):
-            pixels = missed.get(one.name)
-            right = pixels is not None and meets(one, pixels, frame, shapes)
-            if right:
-                del missed[one.name]
-            count(row, one, right)
-        yield {"group": group, "case": name, **row, "missed": [*missed], **cost}
-
-
-def real_frames(
-    bench: Bench,
-) -> Iterator[tuple[str, str, Frame, list[tuple[str, Mask]]]]:
-    """Group, name, frame, and the taught things in it with some of their pixels."""
-    for group in ("real_taught", "real_ycb", "real_tables"):
-        if not (bench.data / group).is_dir():
-            sys.exit(f"{bench.data}: holds no folder {group}")
-
-    folder = bench.data / "real_taught"
-    truth = json.loads((folder / "truth.json").read_text())
-    for name in sorted(truth)[:: bench.every]:
-        frame = frame_in(folder / name)
-        rows, columns = np.indices(frame.depth.shape)
-        things = [
-            (
-                one["name"],
-                np.hypot(rows - one["row"], columns - one["column"]) <= PIXELS_NEAR,
-            )
-            for one in truth[name]
+        judged = [
+            (one, one.name in things and meets(one, things[one.name], frame, shapes))
+            for one in found_in(scene)
         ]
+        yield {"group": group, "case": name, **row_of(set(things), judged), **cost}
+
+
+def real_frames(bench: Bench) -> Iterator[tuple[str, str, Frame, dict[str, Mask]]]:
+    """Group, name, frame, and some of the pixels of each taught thing in it."""
+    taught, labelled, untaught = (
+        bench.data / name for name in ("real_taught", "real_ycb", "real_tables")
+    )
+    truth = json.loads((taught / "truth.json").read_text())
+    for name in sorted(truth)[:: bench.every]:
+        frame = frame_in(taught / name)
+        places = {one["name"]: (one["row"], one["column"]) for one in truth[name]}
+        rows, columns = np.indices(frame.depth.shape)
+        things = {
+            thing: np.hypot(rows - row, columns - column) <= PIXELS_NEAR
+            for thing, (row, column) in places.items()
+        }
         yield "taught", name, frame, things
 
-    folder = bench.data / "real_ycb"
-    names = (folder / "names.txt").read_text().split()
-    for path in sorted(folder.glob("*.depth.png"))[:: bench.every]:
-        name = path.name.split(".")[0]
-        labels = np.asarray(Image.open(folder / f"{name}.labels.png"))
-        things = [
-            (names[number], labels == number)
-            for number in range(1, len(names))
-            if (labels == number).sum() >= LEAST_LABEL
-        ]
-        yield "labelled", name, Frame(np.asarray(Image.open(path)), REAL_YCB), things
+    names = (labelled / "names.txt").read_text().split()
+    for path in sorted(labelled.glob("*.depth.png"))[:: bench.every]:
+        labels = np.asarray(Image.open(str(path).replace("depth", "labels")))
+        things = {name: labels == number for number, name in enumerate(names) if number}
+        things = {name: own for name, own in things.items() if own.sum() >= LEAST_LABEL}
+        yield (
+            "labelled",
+            path.stem,
+            Frame(np.asarray(Image.open(path)), REAL_YCB),
+            things,
+        )
 
-    files = sorted((bench.data / "real_tables").glob("*/depth.png"))
+    files = sorted(untaught.glob("*/depth.png"))
     for path in files[:: len(files) // REAL_TABLES][: REAL_TABLES : bench.every]:
-        yield "none taught", path.parent.name, frame_in(path.parent), []
+        yield "none taught", path.parent.name, frame_in(path.parent), {}
 
 
 def frame_in(folder: Path) -> Frame:
@@ -464,71 +429,64 @@ PARTS: dict[Part, Callable[[Bench], Iterator[Row]]] = {
 }
 
 
-def summed(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """The figures of each group of rows, and of all."""
-    groups = {row["group"]: None for row in rows}
-    figures = {}
-    for group in [*groups, "all"]:
-        own = [row for row in rows if group in (row["group"], "all")]
-        figure: dict[str, float] = {}
-        for column in dict.fromkeys(column for row in own for column in row):
-            values = [row[column] for row in own if column in row]
-            if column in SPREAD:
-                each = [value for some in values for value in some]
-                if each:
-                    figure[f"{column}, median"] = round(float(np.median(each)), 2)
-                    figure[f"{column}, worst"] = round(max(each), 2)
-            elif isinstance(values[0], int):
-                figure[column] = sum(int(value) for value in values)
-        if figure.get("named"):
-            figure["precision %"] = round(100 * figure["right"] / figure["named"])
-        figures[group] = figure
+def summed(rows: Sequence[Row]) -> dict[str, float]:
+    """The figures of some rows."""
+    figures: dict[str, float] = {}
+    for column in dict.fromkeys(column for row in rows for column in row):
+        values = [row[column] for row in rows if column in row]
+        if column in SPREAD and any(values):
+            each = np.concatenate(values)
+            figures[f"{column}, median"] = round(float(np.median(each)), 2)
+            figures[f"{column}, worst"] = round(float(each.max()), 2)
+        elif isinstance(values[0], int):
+            figures[column] = sum(values)
+    if figures.get("named"):
+        figures["precision %"] = round(100 * figures["right"] / figures["named"])
     return figures
 
 
-def table_of(figures: dict[str, Any], against: dict[str, Any] | None) -> str:
-    """A table of the figures of a part, with those of another run in brackets."""
+def table_of(figures: dict[str, Any], against: dict[str, Any]) -> str:
+    """A table of the figures of a part, a row for each group, beside those of another run."""
     columns = [*dict.fromkeys(name for figure in figures.values() for name in figure)]
     lines = [["", *columns]]
     for group, figure in figures.items():
-        line = [group]
-        for column in columns:
-            value = figure.get(column)
-            said = "" if value is None else f"{value:g}"
-            before = None if against is None else against.get(group, {}).get(column)
-            if value is not None and before is not None:
-                said = f"{before:g} > {value:g} ({value - before:+.4g})"
-            line.append(said)
-        lines.append(line)
-    widths = [max(map(len, some)) for some in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(
-            [line[0].ljust(widths[0])]
-            + [
-                one.rjust(width)
-                for one, width in zip(line[1:], widths[1:], strict=True)
-            ]
-        )
-        for line in lines
-    )
+        before = against.get(group, {})
+        said = [f"{figure[name]:g}" if name in figure else "" for name in columns]
+        for place, name in enumerate(columns):
+            if name in figure and name in before:
+                change = figure[name] - before[name]
+                said[place] = f"{before[name]:g} > {figure[name]:g} ({change:+.3g})"
+        lines.append([group, *said])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    padded = [map(str.rjust, line, widths) for line in lines]
+    return "\n".join("  ".join(line) for line in padded)
 
 
 def measured(part: Part, bench: Bench) -> dict[str, Any]:
     """The rows and the figures of a part, which is measured now."""
     rows = []
-    begun = time.process_time()
     for row in PARTS[part](bench):
         rows.append(row)
-        if part != "counts":
-            line = (
-                f"{part}: {len(rows)} rows, {time.process_time() - begun:.0f} s of CPU"
-            )
-            print(line, file=sys.stderr)
-    return {"figures": summed(rows), "rows": rows}
+        print(f"{row['case']}: {row['group']}", file=sys.stderr)
+    groups = dict.fromkeys(row["group"] for row in rows)
+    figures = {
+        name: summed([row for row in rows if row["group"] == name]) for name in groups
+    }
+    return {"figures": {**figures, "all": summed(rows)}, "rows": rows}
+
+
+def run_in(file: Path | None, quick: bool) -> dict[str, Any]:
+    """A run that is in a file, or that begins."""
+    if file is None:
+        return {"quick": quick, "parts": {}}
+    run: dict[str, Any] = json.loads(file.read_text())
+    if run["quick"] != quick:
+        sys.exit(f"{file}: one of the two runs is quick, the other is not")
+    return run
 
 
 def main(
-    data: tyro.conf.Positional[Path | None] = None,
+    data: tyro.conf.Positional[Path] = Path(os.environ.get("NEXTVIEW_DATA", "data")),
     out: Path | None = None,
     against: Path | None = None,
     only: tuple[Part, ...] = (),
@@ -538,27 +496,18 @@ def main(
     """Measure all parts, and print a table for each.
 
     Args:
-        data: folder of the scans and of the real frames; by default NEXTVIEW_DATA.
+        data: folder of the scans and of the real frames.
         out: JSON file of the results, which keeps finished parts.
         against: JSON file of another run, whose figures are printed as "other > this (change)".
         only: parts to measure.
         quick: measure a third of the cases.
         frames: folder of the drawn frames.
     """
-    folder = data or os.environ.get("NEXTVIEW_DATA")
-    if folder is None:
-        sys.exit("name the folder of the data, or set NEXTVIEW_DATA")
-    bench = Bench(Path(folder), frames.expanduser(), 3 if quick else 1)
-    kept: dict[str, Any] = {"quick": quick, "parts": {}}
-    other: dict[str, Any] = {"quick": quick, "parts": {}}
-    if out is not None and out.exists():
-        kept = json.loads(out.read_text())
-    if against is not None:
-        other = json.loads(against.read_text())
-    for file, run in ((out, kept), (against, other)):
-        if run["quick"] != quick:
-            sys.exit(f"{file}: one of the two runs is quick, the other is not")
-
+    bench = Bench(data, frames.expanduser(), 3 if quick else 1)
+    kept, other = (
+        run_in(out if out and out.exists() else None, quick),
+        run_in(against, quick),
+    )
     for part in only or PARTS:
         if part not in kept["parts"]:
             kept["parts"][part] = measured(part, bench)
@@ -566,10 +515,9 @@ def main(
                 half = out.with_name(f"{out.name}.half")
                 half.write_text(json.dumps(kept, indent=1))
                 half.rename(out)
-        before = other["parts"].get(part, {}).get("figures")
-        print(
-            f"\n{part}\n{table_of(kept['parts'][part]['figures'], before)}", flush=True
-        )
+        before = other["parts"].get(part, {}).get("figures", {})
+        table = table_of(kept["parts"][part]["figures"], before)
+        print(f"\n{part}\n{table}", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
@@ -37,10 +39,20 @@ STRANGER = "?"  # begins the name of a thing that is not taught
 CLOUD = 4000  # points on a thing
 TOUCHING = 0.002  # metres between the points of two things that touch
 NEARER = (0.35, 0.5)  # metres, of the camera from small parts
+STEPS = np.linspace(0, 0.4, 41)  # metres, by which a thing is hidden or cut off
 STEP_AZIMUTH = 40.0  # degrees from view to view
-SMALL = ("lemon", "plum", "strawberry", "golf_ball", "dice", "apple", "padlock")
-FLAT = ("tuna_fish_can", "pudding_box", "gelatin_box", "sponge", "rubiks_cube", "mug")
-LONG = ("sugar_box", "mustard_bottle", "spatula", "large_marker", "hammer")
+HOLDERS = {
+    "in a bowl": (
+        "bowl",
+        ("lemon", "plum", "strawberry", "golf_ball", "dice", "apple"),
+    ),
+    "on a box": (
+        "cracker_box",
+        ("tuna_fish_can", "gelatin_box", "sponge", "rubiks_cube"),
+    ),
+    "leaning": ("cracker_box", ("sugar_box", "mustard_bottle", "spatula", "hammer")),
+}
+"""What holds others, and which others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +103,11 @@ class Thing:
         pose[:3, 3] += shift
         return Thing(self.name, self.mesh, pose)
 
-    def stood(self, height: float = 0.0) -> Thing:
-        """The thing above the origin, its lowest point at a height."""
+    def stood(self) -> Thing:
+        """The thing above the origin, its lowest point at z = 0."""
         corners = moved(self.mesh.vertices, self.pose)
         low, high = corners.min(0), corners.max(0)
-        middle = (low + high) / 2
-        return self.by((-middle[0], -middle[1], height - low[2]))
+        return self.by((*-(low + high)[:2] / 2, -low[2]))
 
 
 def moved(points: Float, pose: Float) -> Float:
@@ -139,36 +150,37 @@ def resting(name: str, mesh: trimesh.Trimesh, rng: np.random.Generator) -> Thing
     return Thing(name, mesh, turned((0, 0, rng.uniform(0, 2 * np.pi)), pose)).stood()
 
 
-def upright(name: str, mesh: trimesh.Trimesh, tilt: float, azimuth: float) -> Thing:
-    """A thing with its longest side up, tilted towards an azimuth."""
-    long = int(np.argmax(mesh.extents))
-    up: list[Float] = [turned((0, -np.pi / 2, 0)), turned((np.pi / 2, 0, 0)), np.eye(4)]
+def posed(
+    name: str, mesh: trimesh.Trimesh, up: int, tilt: float = 0.0, azimuth: float = 0.0
+) -> Thing:
+    """A thing that stands with one of its axes up, tilted towards an azimuth."""
+    turns = turned((0, -np.pi / 2, 0)), turned((np.pi / 2, 0, 0)), np.eye(4)
     axis = tilt * np.array([-np.sin(azimuth), np.cos(azimuth), 0])
-    return Thing(name, mesh, turned(axis, up[long])).stood()
+    return Thing(name, mesh, turned(axis, turns[up])).stood()
+
+
+def distance(thing: Thing, others: cKDTree, shift: Float | float = 0.0) -> float:
+    """How far a thing, shifted, is from points of others, metres."""
+    return float(np.min(others.query(thing.points + shift)[0]))
+
+
+def together(things: Sequence[Thing]) -> cKDTree:
+    """The points of some things."""
+    return cKDTree(np.concatenate([thing.points for thing in things]))
 
 
 def advanced(
     thing: Thing,
     others: Sequence[Thing],
     direction: Float,
-    gap: float,
-) -> Thing | None:
-    """A thing, moved in a direction until it is so near to others; None if it misses them."""
-    tree = cKDTree(np.concatenate([other.points for other in others]))
-    points = thing.points
-    way = 0.0
-    while way < 1:
-        distance = float(np.min(tree.query(points + way * direction)[0])) - gap
-        if distance < 5e-4:
-            return thing.by(way * direction)
-        way += distance
-    return None
-
-
-def apart(thing: Thing, others: Sequence[Thing], gap: float) -> bool:
-    """Whether a thing is so far from all others."""
-    tree = cKDTree(np.concatenate([other.points for other in others]))
-    return float(np.min(tree.query(thing.points)[0])) >= gap
+    gap: float = TOUCHING,
+) -> Thing:
+    """A thing, moved in a direction until it is so near to others, or for a metre."""
+    points = together(others)
+    way = left = 0.0
+    while way < 1 and (left := distance(thing, points, way * direction) - gap) > 5e-4:
+        way += left
+    return thing.by(way * direction)
 
 
 def added(thing: Thing, others: Sequence[Thing], rng: np.random.Generator) -> Thing:
@@ -181,21 +193,8 @@ def added(thing: Thing, others: Sequence[Thing], rng: np.random.Generator) -> Th
         out = np.array([np.cos(azimuth), np.sin(azimuth), 0])
         away = thing.by((*(aim + 0.6 * out)[:2], 0))
         place = advanced(away, others, -out, TOUCHING + rng.uniform(0, 0.03))
-        if place is not None and np.abs(place.points[:, :2]).max() < 0.36:
+        if np.abs(place.points[:, :2]).max() < 0.36:
             return place
-
-
-def lowered(
-    thing: Thing,
-    others: Sequence[Thing],
-    place: Float,
-) -> Thing:
-    """A thing, lowered above a place until it touches others."""
-    found = advanced(
-        thing.by((*place[:2], 0.4)), others, np.array([0, 0, -1.0]), TOUCHING
-    )
-    assert found is not None, thing.name
-    return found
 
 
 def stranger(number: int, rng: np.random.Generator) -> Thing:
@@ -218,30 +217,29 @@ def stranger(number: int, rng: np.random.Generator) -> Thing:
 def machine_parts() -> dict[str, trimesh.Trimesh]:
     """Five machine parts by their names, metres."""
     make = trimesh.creation
-
-    def at(mesh: trimesh.Trimesh, *place: float) -> trimesh.Trimesh:
-        return mesh.apply_translation(place)
-
-    def rod(radius: float, height: float, middle: float, sides: int = 48) -> Any:
-        return at(make.cylinder(radius, height, sections=sides), 0, 0, middle)
-
+    at = trimesh.transformations.translation_matrix
     lying = turned((np.pi / 2, 0, 0))
+
+    def rod(radius: float, low: float, high: float, sides: int = 48) -> trimesh.Trimesh:
+        ends = [(0, 0, low), (0, 0, high)]
+        return make.cylinder(radius, segment=ends, sections=sides)
+
     parts = {
         "flange": [
             make.annulus(0.010, 0.040, 0.008, sections=64),
-            at(make.annulus(0.010, 0.018, 0.018, sections=64), 0, 0, 0.013),
+            make.annulus(0.010, 0.018, 0.018, sections=64, transform=at((0, 0, 0.013))),
         ],
         "bracket": [
-            make.box((0.070, 0.030, 0.004)),
-            at(make.box((0.004, 0.030, 0.046)), -0.033, 0, 0.023),
-            at(make.box((0.030, 0.004, 0.030)), -0.020, 0, 0.015),
+            make.box(bounds=[(-0.035, -0.015, 0), (0.035, 0.015, 0.004)]),
+            make.box(bounds=[(-0.035, -0.015, 0), (-0.031, 0.015, 0.048)]),
+            make.box(bounds=[(-0.035, -0.002, 0), (0, 0.002, 0.030)]),
         ],
-        "bolt": [rod(0.015, 0.012, 0, 6), rod(0.008, 0.060, 0.035)],
-        "shaft": [rod(0.012, 0.040, 0), rod(0.018, 0.015, 0.027), rod(0.008, 0.035, 0.052)],
+        "bolt": [rod(0.015, 0, 0.012, 6), rod(0.008, 0.010, 0.070)],
+        "shaft": [rod(0.012, 0, 0.040), rod(0.018, 0.040, 0.055), rod(0.008, 0.055, 0.090)],
         "tee": [
-            rod(0.012, 0.050, 0.025),
+            rod(0.012, 0, 0.050),
+            rod(0.016, 0.041, 0.051),
             make.cylinder(0.014, 0.070, sections=48, transform=lying),
-            rod(0.016, 0.010, 0.046),
         ],
     }  # fmt: skip
     return {name: trimesh.util.concatenate(solids) for name, solids in parts.items()}
@@ -249,90 +247,72 @@ def machine_parts() -> dict[str, trimesh.Trimesh]:
 
 def shallow_box() -> Thing:
     """A box without a lid, 32 x 26 x 6 cm, that stands on the table."""
-    walls = [trimesh.creation.box((0.32, 0.26, 0.004))]
-    for side in (-1, 1):
-        long = trimesh.creation.box((0.32, 0.004, 0.06))
-        short = trimesh.creation.box((0.004, 0.26, 0.06))
-        walls += [
-            long.apply_translation((0, 0.13 * side, 0.03)),
-            short.apply_translation((0.16 * side, 0, 0.03)),
-        ]
-    return Thing(f"{STRANGER}box", trimesh.util.concatenate(walls), np.eye(4)).stood()
+    x, y, wall, height = 0.16, 0.13, 0.004, 0.06
+    sides = [
+        [(-x, -y, 0), (x, y, wall)],
+        [(-x, -y, 0), (wall - x, y, height)],
+        [(x - wall, -y, 0), (x, y, height)],
+        [(-x, -y, 0), (x, wall - y, height)],
+        [(-x, y - wall, 0), (x, y, height)],
+    ]
+    solids = [trimesh.creation.box(bounds=side) for side in sides]
+    return Thing(f"{STRANGER}box", trimesh.util.concatenate(solids), np.eye(4))
 
 
 def room(rng: np.random.Generator) -> list[trimesh.Trimesh]:
     """A table that is not quite even, the floor, a wall, furniture."""
-    count = 40
-    x, y = np.meshgrid(np.linspace(-0.6, 0.6, count), np.linspace(-0.45, 0.45, count))
-    uneven = gaussian_filter(rng.normal(size=x.shape), 4)
-    uneven *= 0.0007 / uneven.std()
-    at = np.arange(count * count).reshape(count, count)
-    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
-    faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
-    top = trimesh.Trimesh(
-        np.c_[x.ravel(), y.ravel(), uneven.ravel()], faces, process=False
-    )
     box = trimesh.creation.box
-    parts = [
+    top = box((1.2, 0.9, 0)).subdivide_to_size(0.03)
+    waves = rng.uniform(-40, 40, (6, 2)), rng.uniform(0, 2 * np.pi, 6)
+    uneven = np.sin(top.vertices[:, :2] @ waves[0].T + waves[1]).sum(1)
+    top.vertices[:, 2] = 0.0007 * uneven / uneven.std()
+    lows = [(1.5 * np.cos(a), 1.5 * np.sin(a), -0.75) for a in rng.uniform(0, 6.28, 4)]
+    return [
         top,
         box(bounds=[(-0.6, -0.45, -0.04), (0.6, 0.45, -0.004)]),
         box(bounds=[(-6, -6, -0.8), (6, 6, -0.75)]),
         box(bounds=[(-6, 2.2, -0.8), (6, 2.3, 3)]),
-    ]
-    for _ in range(4):
-        azimuth = rng.uniform(0, 2 * np.pi)
-        low = np.array([1.5 * np.cos(azimuth), 1.5 * np.sin(azimuth), -0.75])
-        parts.append(
+        *[
             box(bounds=[low, low + rng.uniform((0.2, 0.2, 0.4), (0.6, 0.5, 1))])
-        )
-    return parts
+            for low in lows
+        ],
+    ]
 
 
 class World:
     """Things on a table in a room, at which rays are cast."""
 
-    def __init__(self, things: Sequence[Thing], around: Sequence[Any]) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        solids = [moved(one.mesh.vertices, one.pose)[one.mesh.faces] for one in things]
-        solids += [mesh.triangles for mesh in around]
-        triangles = np.concatenate(solids).astype(np.float32)
+    def __init__(self, things: Sequence[Thing], around: Sequence[Any] = ()) -> None:
+        solids = [one.mesh.copy().apply_transform(one.pose) for one in things]
+        solids += around
+        whole = trimesh.util.concatenate(solids)
         numbers = [*range(1, len(things) + 1), *[0] * len(around)]
-        self.labels = np.repeat(numbers, [len(one) for one in solids])
-        sides = np.cross(
-            triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-        )
-        lengths = np.linalg.norm(sides, axis=1, keepdims=True)
-        self.normals = sides / np.maximum(lengths, 1e-12)
+        self.labels = np.repeat(numbers, [len(one.faces) for one in solids])
+        self.normals = whole.face_normals
         self.scene = EmbreeScene()
-        TriangleMesh(self.scene, triangles)
+        TriangleMesh(self.scene, whole.triangles.astype(np.float32))
 
     def cast(self, pose: Float, step: int = 1) -> tuple[Float, Any, Float]:
-        """Exact depth, 0 for nothing, label and cosine of the incidence in each pixel, or in one of
-        ``step`` rows and columns.
+        """Exact depth, 0 for nothing, 1 + number of the thing and cosine of the incidence in each
+        pixel, or in one of ``step`` rows and columns.
         """
         rows, columns = np.mgrid[0:HEIGHT:step, 0:WIDTH:step]
         pixels = np.stack([columns, rows, np.ones(rows.shape)], -1).reshape(-1, 3)
         rays = pixels @ np.linalg.inv(INTRINSICS).T @ pose[:3, :3].T
-        starts = np.broadcast_to(pose[:3, 3], rays.shape)
-        hits = self.scene.run(
-            np.ascontiguousarray(starts, np.float32),
-            np.ascontiguousarray(rays, np.float32),
-            output=1,
-        )
+        starts = np.tile(pose[:3, 3], (len(rays), 1)).astype(np.float32)
+        hits = self.scene.run(starts, rays.astype(np.float32), output=1)
         hit = hits["primID"] >= 0
         number = np.where(hit, hits["primID"], 0)
-        depth = np.where(hit, hits["tfar"], 0.0).astype(float)
-        across = np.abs((self.normals[number] * rays).sum(1))
-        cosine = across / np.linalg.norm(rays.astype(float), axis=1)
-        label = np.where(hit, self.labels[number], 0)
-        shape = rows.shape
-        return depth.reshape(shape), label.reshape(shape), cosine.reshape(shape)
+        along = np.abs((self.normals[number] * rays).sum(1))
+        depth = np.where(hit, hits["tfar"], 0.0).reshape(rows.shape)
+        label = np.where(hit, self.labels[number], 0).reshape(rows.shape)
+        cosine = (along / np.linalg.norm(rays, axis=1)).reshape(rows.shape)
+        return depth.astype(float), label, cosine
 
-    def share(self, pose: Float, number: int) -> int:
-        """How many pixels of a coarse picture show a thing."""
-        return int((self.cast(pose, 4)[1] == number + 1).sum())
+
+def shown(pose: Float, *things: Thing) -> int:
+    """How many pixels of a coarse picture show the first of some things."""
+    return int((World(things).cast(pose, 4)[1] == 1).sum())
 
 
 def sensed(depth: Float, cosine: Float, rng: np.random.Generator) -> Any:
@@ -359,8 +339,8 @@ def sensed(depth: Float, cosine: Float, rng: np.random.Generator) -> Any:
 def looking(place: Float, at: Float) -> Float:
     """Pose of a camera at a place that looks at another, camera-to-world, (4, 4)."""
     forward = (at - place) / np.linalg.norm(at - place)
-    right = np.cross(forward, (0, 0, 1))
-    right /= np.linalg.norm(right)
+    level = np.cross(forward, (0, 0, 1))
+    right = level / np.linalg.norm(level)
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(forward, right), forward, place], 1)
     return pose
@@ -401,25 +381,20 @@ def case_of(
         kind: of the case.
     """
     first = [thing for thing in shots[0][0] if thing is not None]
-    worlds: dict[int, tuple[World, list[int]]] = {}
+    gone = Thing("", first[0].mesh, np.full((4, 4), np.nan))
     depths, labels, told, poses = [], [], [], []
     for things, pose in shots:
-        there = [number for number, thing in enumerate(things) if thing is not None]
-        if id(things) not in worlds:
-            shown = [thing for thing in things if thing is not None]
-            worlds[id(things)] = World(shown, around), [0, *(n + 1 for n in there)]
-        world, numbers = worlds[id(things)]
+        # what is gone keeps its number, and lies far below the floor
+        world = World([thing or first[0].by((0, 0, -9)) for thing in things], around)
         depth, label, cosine = world.cast(pose)
         depths.append(sensed(depth, cosine, rng))
-        labels.append(np.array(numbers, np.uint8)[label])
-
-        error = turned(rng.normal(size=3) * np.radians(POSE_DEGREES) / np.sqrt(3))
-        wrong = pose.copy()
-        wrong[:3, :3] = pose[:3, :3] @ error[:3, :3]
-        wrong[:3, 3] += rng.normal(size=3) * POSE_METRES / np.sqrt(3)
-        told.append(wrong)
-        gone = np.full((4, 4), np.nan)
-        poses.append([gone if thing is None else thing.pose for thing in things])
+        labels.append(label.astype(np.uint8))
+        turn = rng.normal(size=3) * np.radians(POSE_DEGREES) / np.sqrt(3)
+        shift = rng.normal(size=3) * POSE_METRES / np.sqrt(3)
+        error = turned(turn)
+        error[:3, 3] = shift
+        told.append(pose @ error)
+        poses.append([(thing or gone).pose for thing in things])
     return Case(
         np.stack(depths),
         np.stack(labels),
@@ -446,40 +421,26 @@ def drawn(name: str, scans: Scans, rng: np.random.Generator) -> Thing:
 
 
 def table(number: int, scans: Scans, rng: np.random.Generator) -> Case:
-    """Things on a table; from the thirteenth on some lie in a bowl, on a box or lean against
-    one.
-    """
-    names = rng.permutation(sorted(scans)).tolist()
+    """Things on a table; from the thirteenth on some are in, on or against one of them."""
+    kind = "apart" if number < 12 else list(HOLDERS)[number % 3]
     things: list[Thing] = []
-    kind = "apart"
-    if number >= 12:
-        kind = ("in a bowl", "on a box", "leaning")[number % 3]
-        holder = ("bowl", "wood_block", "cracker_box")[number % 3]
+    if kind != "apart":
+        holder, pool = HOLDERS[kind]
         mesh = scan(scans[holder])
-        base = Thing(holder, mesh, np.eye(4)).stood()
-        if kind == "in a bowl":
-            things = [base]
-            for name in rng.choice(SMALL, 2, replace=False).tolist():
-                place = rng.uniform(-0.02, 0.02, 2)
-                things.append(lowered(drawn(name, scans, rng), things, place))
-        elif kind == "on a box":
-            base = Thing(holder, mesh, turned((np.pi / 2, 0, 0))).stood()
-            name = str(rng.choice(FLAT))
-            flat = Thing(name, scan(scans[name]), np.eye(4)).stood()
-            things = [base, lowered(flat, [base], rng.uniform(-0.02, 0.02, 2))]
-        else:
-            base = upright(holder, mesh, 0.0, 0.0)
-            things = [base]
-            for side, name in enumerate(rng.choice(LONG, 2, replace=False).tolist()):
+        up = int(np.argmin(mesh.extents)) if kind == "on a box" else 2
+        things = [posed(holder, mesh, up)]
+        for side, name in enumerate(rng.choice(pool, 2, replace=False).tolist()):
+            thing = drawn(name, scans, rng).by((0.04 * (2 * side - 1), 0, 0))
+            direction = np.array([0, 0, -1.0])
+            if kind == "leaning":
                 azimuth = np.pi / 2 * side
+                direction = np.array([np.cos(azimuth), np.sin(azimuth), 0])
+                long = int(np.argmax(thing.mesh.extents))
                 tilt = np.radians(rng.uniform(15, 30))
-                leans = upright(name, scan(scans[name]), tilt, azimuth)
-                out = np.array([np.cos(azimuth), np.sin(azimuth), 0])
-                found = advanced(leans.by(-0.4 * out), things, out, TOUCHING)
-                assert found is not None, name
-                things.append(found)
-    used = {thing.name for thing in things}
-    names = [name for name in names if name not in used]
+                thing = posed(name, thing.mesh, long, tilt, azimuth)
+            things.append(advanced(thing.by(-0.5 * direction), things, direction))
+    left = set(scans) - {thing.name for thing in things}
+    names = rng.permutation(sorted(left)).tolist()
     for count in range(int(rng.integers(4, 10)) - len(things)):
         new = rng.random() < 0.15
         thing = stranger(count, rng) if new else drawn(names.pop(), scans, rng)
@@ -504,18 +465,16 @@ def part(number: int, scans: Scans, rng: np.random.Generator) -> Case:
         things = [resting(name, meshes[name], rng)]
         shots = [(things, views(middle(things), (0,), rng, NEARER)[0])]
         return case_of(shots, room(rng), rng, "alone")
-    box = shallow_box()
-    things = [box]
-    for name, mesh in meshes.items():
-        while True:
-            place = (*rng.uniform((-0.13, -0.1), (0.13, 0.1)), 0.004)
-            lies = resting(name, mesh, rng).by(place)
-            inside = (np.abs(lies.points[:, :2]) < (0.152, 0.122)).all()
-            if inside and (len(things) == 1 or apart(lies, things[1:], 2 * TOUCHING)):
-                break
-        things.append(lies)
-    turn = turned((0, 0, rng.uniform(0, 2 * np.pi)))
-    things = [Thing(one.name, one.mesh, turn @ one.pose) for one in things]
+
+    things = []
+    while len(things) < len(meshes):
+        name = sorted(meshes)[len(things)]
+        place = (*rng.uniform((-0.13, -0.1), (0.13, 0.1)), 0.004)
+        lies = resting(name, meshes[name], rng).by(place)
+        inside = (np.abs(lies.points[:, :2]) < (0.152, 0.122)).all()
+        if inside and (not things or distance(lies, together(things)) > 2 * TOUCHING):
+            things.append(lies)
+    things.append(shallow_box())
     shots = [(things, pose) for pose in views(middle(things), (0, 1), rng, NEARER)]
     return case_of(shots, room(rng), rng, "in a box")
 
@@ -526,59 +485,43 @@ def move(number: int, scans: Scans, rng: np.random.Generator) -> Case:
     things: list[Thing] = []
     while len(things) < 5:
         things.append(added(drawn(names.pop(), scans, rng), things, rng))
-    around = room(rng)
-    poses = views(middle(things), (0, 1, 2, 0.5, 1.5), rng)
     after: list[Thing | None] = [*things]
     while after == things:
         which = int(rng.integers(5))
-        azimuth = rng.uniform(0, 2 * np.pi)
-        way = rng.uniform(0.03, 0.12)
+        azimuth, way = rng.uniform((0, 0.03), (2 * np.pi, 0.12))
         there = things[which].by((way * np.cos(azimuth), way * np.sin(azimuth), 0))
         others = [*things[:which], *things[which + 1 :]]
-        if number % 2:
-            after[which] = None
-        elif apart(there, others, 2 * TOUCHING):
-            after[which] = there
-    before: list[Thing | None] = [*things]
-    shots = [(before, pose) for pose in poses[:3]]
-    shots += [(after, pose) for pose in poses[3:]]
-    return case_of(shots, around, rng, "removed" if number % 2 else "moved")
+        if number % 2 or distance(there, together(others)) > 2 * TOUCHING:
+            after[which] = None if number % 2 else there
+    poses = views(middle(things), (0, 1, 2, 0.5, 1.5), rng)
+    states = [[*things]] * 3 + [after] * 2
+    shots = list(zip(states, poses, strict=True))
+    return case_of(shots, room(rng), rng, "removed" if number % 2 else "moved")
 
 
 def hidden(number: int, scans: Scans, rng: np.random.Generator) -> Case:
     """A thing behind a box, or at the border of the picture."""
     order = np.random.default_rng(6).permutation(sorted(scans))
     thing = drawn(str(order[number % len(order)]), scans, rng)
-    things = [thing]
-    around = room(rng)
-    pose = views(middle(things), (0,), rng)[0]
-    whole = World(things, []).share(pose, 0)
+    centre = middle([thing])
+    pose = views(centre, (0,), rng)[0]
+    left = shown(pose, thing) * (1 / 2 if number >= 12 or number % 2 == 0 else 1 / 3)
     if number >= 12:
-        right = pose[:3, 0] * rng.choice([-1, 1])
-        aims = []
-        for shift in np.linspace(0.1, 0.5, 41):
-            aim = looking(pose[:3, 3], pose[:3, 3] + pose[:3, 2] * 0.65 + shift * right)
-            aims.append((abs(World(things, []).share(aim, 0) - whole / 2), aim))
-        pose = min(aims, key=lambda pair: pair[0])[1]
-        return case_of([(things, pose)], around, rng, "at the border")
+        side = pose[:3, 0] * rng.choice([-1, 1])
+        aims = [looking(pose[:3, 3], centre + shift * side) for shift in STEPS + 0.1]
+        pose = min(aims, key=lambda aim: abs(shown(aim, thing) - left))
+        return case_of([([thing], pose)], room(rng), rng, "at the border")
 
-    left = (1 / 2, 1 / 3)[number % 2]
-    back = pose[:3, 3] - middle(things)
-    azimuth = np.arctan2(back[1], back[0])
-    height = float(np.ptp(thing.points[:, 2])) + 0.12
-    screen = trimesh.creation.box((0.05, 0.3, height))
-    box = Thing(f"{STRANGER}screen", screen, turned((0, 0, azimuth))).stood()
+    azimuth = np.arctan2(*(pose[:3, 3] - centre)[1::-1])
     out = np.array([np.cos(azimuth), np.sin(azimuth), 0])
     side = np.array([-out[1], out[0], 0]) * rng.choice([-1, 1])
-    before = advanced(
-        box.by(middle(things) * (1, 1, 0) + 0.6 * out), things, -out, 0.02
-    )
-    assert before is not None
-    tried = [before.by(shift * side) for shift in np.linspace(0, 0.3, 41)]
-    shares = [World([thing, one], []).share(pose, 0) for one in tried]
-    best = int(np.abs(np.array(shares) - left * whole).argmin())
+    solid = trimesh.creation.box((0.05, 0.3, 2 * centre[2] + 0.12))
+    screen = Thing(f"{STRANGER}screen", solid, turned((0, 0, azimuth))).stood()
+    near = advanced(screen.by(centre * (1, 1, 0) + 0.6 * out), [thing], -out, 0.02)
+    tried = [near.by(shift * side) for shift in STEPS]
+    best = min(tried, key=lambda one: abs(shown(pose, thing, one) - left))
     kind = "half hidden" if number % 2 == 0 else "two thirds hidden"
-    return case_of([([thing, tried[best]], pose)], around, rng, kind)
+    return case_of([([thing, best], pose)], room(rng), rng, kind)
 
 
 DRAWS: dict[str, tuple[Callable[[int, Scans, np.random.Generator], Case], int]] = {
@@ -600,8 +543,7 @@ def case(part: str, number: int, scans: Scans, folder: Path) -> Case:
     file.parent.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([sorted(DRAWS).index(part), number])
     made = DRAWS[part][0](number, scans, rng)
-    values = dict(zip([f.name for f in fields(Case)], astuple(made), strict=True))
     half = file.with_suffix(".half.npz")
-    np.savez_compressed(half, **values)
+    np.savez_compressed(half, **vars(made))
     half.rename(file)
     return made
