@@ -38,7 +38,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -56,6 +57,7 @@ from benchmarks.gate_frames import (
     case,
     cloud,
     machine_parts,
+    middle,
     moved,
     scan,
 )
@@ -77,14 +79,6 @@ REAL_TABLES = 12  # frames
 CHANGED = 3  # number of the first frame after a move
 SPREAD = ("mm", "seconds")  # columns of which median and worst are shown
 DEFAULT_FRAMES = Path("~/.cache/nextview/gate")
-
-
-class Found(NamedTuple):
-    """A name that was given, whether it is confident, and the pose, scan-to-world, (4, 4)."""
-
-    name: str
-    confident: bool
-    pose: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,68 +127,56 @@ def frame_of(seen: Case, number: int, mask: Mask | None = None) -> Frame:
     return Frame(seen.depth[number], INTRINSICS, seen.told[number], mask)
 
 
-def found_in(scene: nextview.Scene) -> list[Found]:
-    """All names that a scene gives."""
-    return [
-        Found(one.name, one.confident, one.pose)
-        for one in scene.objects
-        if one.name != UNKNOWN and one.pose is not None
-    ]
-
-
-def middle(points: Float) -> Float:
-    """The middle of some points, (3,)."""
-    return np.asarray((points.min(0) + points.max(0)) / 2)
+def named_in(scene: nextview.Scene) -> list[Any]:
+    """The objects to which a scene gives a name."""
+    return [one for one in scene.objects if one.name != UNKNOWN]
 
 
 def millimetres_off(true: Float, shape: tuple[Float, Float], pose: Float) -> float:
     """Mean distance of points on a thing from the surface of its posed scan."""
     points, normals = moved(shape[0], pose), shape[1] @ pose[:3, :3].T
-    compared = true[::COMPARED]
-    nearest = cKDTree(points).query(compared)[1]
-    across = ((compared - points[nearest]) * normals[nearest]).sum(1)
+    some = true[::COMPARED]
+    nearest = cKDTree(points).query(some)[1]
+    across = ((some - points[nearest]) * normals[nearest]).sum(1)
     return 1000 * float(np.abs(across).mean())
 
 
-def compared(
-    found: Sequence[Found],
-    seen: Case,
-    frame: int,
-    shapes: Shapes,
-) -> Row:
-    """Compare the names that are given after a frame with the truth."""
+def compared(found: Sequence[Any], seen: Case, frame: int, shapes: Shapes) -> Row:
+    """Compare the names that are given after a frame with the truth.
+
+    Args:
+        found: objects with a name, whether it is confident, and the pose of their scan.
+        seen: the case.
+        frame: number of the frame.
+        shapes: points on the scans by their names.
+    """
     names = seen.names.tolist()
-    true = [moved(*pair) for pair in zip(seen.points, seen.poses[frame], strict=True)]
-    pixels = [
-        (seen.labels[: frame + 1] == n + 1).sum((1, 2)) for n in range(len(names))
+    poses = seen.poses[frame]
+    true = dict(zip(names, map(moved, seen.points, poses), strict=True))
+    counts = [
+        (seen.labels[: frame + 1] == n).sum((1, 2)).max()
+        for n in range(1, len(names) + 1)
     ]
     known = {
         name
-        for name, points, counted in zip(names, true, pixels, strict=True)
-        if not name.startswith(STRANGER)
-        and np.isfinite(points).all()
-        and counted.max() >= IN_VIEW
+        for name, pose, pixels in zip(names, poses, counts, strict=True)
+        if name in shapes and np.isfinite(pose).all() and pixels >= IN_VIEW
     }
     right: set[str] = set()
-    judged: list[tuple[Found, bool]] = []
-    off = []
+    judged = []
     on_strangers = []
+    off = []
     for one in found:
         centre = middle(moved(shapes[one.name][0], one.pose))
-        own = (
-            true[names.index(one.name)]
-            if one.name in names
-            else np.full((1, 3), np.inf)
-        )
+        own = true.get(one.name, np.full((1, 3), np.inf))
         at = one.name not in right and np.linalg.norm(centre - middle(own)) < NEAR
-        if not at and names[nearest_of(true, centre)].startswith(STRANGER):
-            on_strangers.append(one)
-        if at:
-            right.add(one.name)
         if not at or one.name in known:  # a thing that hardly shows counts neither way
             judged.append((one, bool(at)))
-        if at and one.name in known:
+        if at:
+            right.add(one.name)
             off.append(millimetres_off(own, shapes[one.name], one.pose))
+        elif nearest_of(true, centre).startswith(STRANGER):
+            on_strangers.append(one)
     return {
         **row_of(known, judged),
         "on strangers": len(on_strangers),
@@ -203,7 +185,7 @@ def compared(
     }
 
 
-def row_of(known: set[str], judged: Sequence[tuple[Found, bool]]) -> Row:
+def row_of(known: set[str], judged: Sequence[tuple[Any, bool]]) -> Row:
     """Count the names that are given, each of which is right or not."""
     right = [one for one, is_right in judged if is_right]
     wrong = [one for one, is_right in judged if not is_right]
@@ -218,10 +200,12 @@ def row_of(known: set[str], judged: Sequence[tuple[Found, bool]]) -> Row:
     }
 
 
-def nearest_of(true: Sequence[Float], place: Float) -> int:
+def nearest_of(true: dict[str, Float], place: Float) -> str:
     """The thing with the point that is nearest to a place; those that are gone have none."""
-    distances = [np.linalg.norm(points - place, axis=1).min() for points in true]
-    return int(np.nanargmin(distances))
+    distances = [
+        np.linalg.norm(points - place, axis=1).min() for points in true.values()
+    ]
+    return list(true)[np.nanargmin(distances)]
 
 
 def in_scenes(
@@ -235,7 +219,7 @@ def in_scenes(
         scene = nextview.Scene(system)
         for frame in range(len(seen.depth)):
             cost = updated(scene, frame_of(seen, frame))[1]
-            row = compared(found_in(scene), seen, frame, shapes)
+            row = compared(named_in(scene), seen, frame, shapes)
             group = f"{seen.kind} {frame + 1}"
             yield {"group": group, "case": name, **row, **cost}
 
@@ -257,9 +241,13 @@ def single(bench: Bench) -> Iterator[Row]:
         session = system.session()
         told, cost = updated(session, frame_of(seen, 0, seen.labels[0] == 1))
         found = []
-        said = None if told is None else session.result
-        if said is not None and said.pose is not None:
-            found = [Found(str(said.answer), said.confident, said.pose)]
+        if told is not None and session.result.answer is not None:
+            said = session.result
+            found.append(
+                SimpleNamespace(
+                    name=said.answer, confident=said.confident, pose=said.pose
+                )
+            )
         row = compared(found, seen, 0, shapes)
         yield {"group": "by mask", "case": name, **row, **cost}
 
@@ -287,6 +275,7 @@ def moves(bench: Bench) -> Iterator[Row]:
     for name, seen in bench.cases("moves"):
         scene = nextview.Scene(system)
         same = (seen.poses == seen.poses[0]).all((0, 2, 3))
+        changed = seen.names[np.argmin(same)]
         told: list[str] = []  # of what was changed, once it was
         alarms: list[str] = []
         costs = []
@@ -294,15 +283,13 @@ def moves(bench: Bench) -> Iterator[Row]:
             before = {one.number: one.place for one in scene.objects}
             look, cost = updated(scene, frame_of(seen, frame))
             costs.append(cost)
-            stood = zip(seen.points, seen.poses[max(frame - 1, 0)], strict=True)
-            true = [moved(*pair) for pair in stood]
-            said = [] if look is None else [("moved", one.number) for one in look.moved]
-            said += (
-                [] if look is None else [("removed", number) for number in look.gone]
-            )
-            for kind, number in said:
-                owner = nearest_of(true, before[number])
-                (alarms if frame < CHANGED or same[owner] else told).append(kind)
+            stood = map(moved, seen.points, seen.poses[max(frame - 1, 0)])
+            true = dict(zip(seen.names.tolist(), stood, strict=True))
+            said = {} if look is None else dict.fromkeys(look.gone, "removed")
+            said |= {} if look is None else {one.number: "moved" for one in look.moved}
+            for number, kind in said.items():
+                right = frame >= CHANGED and nearest_of(true, before[number]) == changed
+                (told if right else alarms).append(kind)
         yield {
             "group": str(seen.kind),
             "case": name,
@@ -310,7 +297,7 @@ def moves(bench: Bench) -> Iterator[Row]:
             "told": int(bool(told)),
             "kind right": int(str(seen.kind) in told),
             "false alarms": len(alarms),
-            **compared(found_in(scene), seen, len(costs) - 1, shapes),
+            **compared(named_in(scene), seen, len(costs) - 1, shapes),
             "refused": sum(cost["refused"] for cost in costs),
             "seconds": [second for cost in costs for second in cost["seconds"]],
         }
@@ -322,10 +309,13 @@ def real(bench: Bench) -> Iterator[Row]:
     for group, name, frame, things in real_frames(bench):
         scene = nextview.Scene(system, up=None)
         cost = updated(scene, frame)[1]
-        judged = [
-            (one, one.name in things and meets(one, things[one.name], frame, shapes))
-            for one in found_in(scene)
-        ]
+        judged = []
+        left = dict(things)
+        for one in named_in(scene):
+            right = one.name in left and meets(one, left[one.name], frame, shapes)
+            judged.append((one, right))
+            if right:
+                del left[one.name]
         yield {"group": group, "case": name, **row_of(set(things), judged), **cost}
 
 
@@ -372,7 +362,7 @@ def frame_in(folder: Path) -> Frame:
     return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 
-def meets(one: Found, pixels: Mask, frame: Frame, shapes: Shapes) -> bool:
+def meets(one: Any, pixels: Mask, frame: Frame, shapes: Shapes) -> bool:
     """Whether a posed scan shows in some of the pixels of a frame without a pose."""
     seen = moved(shapes[one.name][0], one.pose) @ frame.intrinsics.T
     columns, rows = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
@@ -458,8 +448,10 @@ def table_of(figures: dict[str, Any], against: dict[str, Any]) -> str:
                 said[place] = f"{before[name]:g} > {figure[name]:g} ({change:+.3g})"
         lines.append([group, *said])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = [map(str.rjust, line, widths) for line in lines]
-    return "\n".join("  ".join(line) for line in padded)
+    return "\n".join(
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
+        for line in lines
+    )
 
 
 def measured(part: Part, bench: Bench) -> dict[str, Any]:

@@ -115,6 +115,11 @@ def moved(points: Float, pose: Float) -> Float:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
+def middle(points: Float) -> Float:
+    """The middle of the box around points, (3,)."""
+    return np.asarray((points.min(0) + points.max(0)) / 2)
+
+
 def cloud(mesh: trimesh.Trimesh) -> tuple[Float, Float]:
     """The same points on a mesh each time, (CLOUD, 3), and the normals there."""
     if "gate_cloud" not in mesh.metadata:
@@ -159,14 +164,14 @@ def posed(
     return Thing(name, mesh, turned(axis, turns[up])).stood()
 
 
-def distance(thing: Thing, others: cKDTree, shift: Float | float = 0.0) -> float:
-    """How far a thing, shifted, is from points of others, metres."""
-    return float(np.min(others.query(thing.points + shift)[0]))
+def together(things: Sequence[Thing]) -> Float:
+    """The points of some things, (N, 3)."""
+    return np.concatenate([thing.points for thing in things])
 
 
-def together(things: Sequence[Thing]) -> cKDTree:
-    """The points of some things."""
-    return cKDTree(np.concatenate([thing.points for thing in things]))
+def distance(thing: Thing, points: Float) -> float:
+    """How far a thing is from points, metres."""
+    return float(np.min(cKDTree(points).query(thing.points)[0]))
 
 
 def advanced(
@@ -176,9 +181,13 @@ def advanced(
     gap: float = TOUCHING,
 ) -> Thing:
     """A thing, moved in a direction until it is so near to others, or for a metre."""
-    points = together(others)
-    way = left = 0.0
-    while way < 1 and (left := distance(thing, points, way * direction) - gap) > 5e-4:
+    tree = cKDTree(together(others))
+    points = thing.points
+    way = 0.0
+    while way < 1:
+        left = float(np.min(tree.query(points + way * direction)[0])) - gap
+        if left <= 5e-4:
+            break
         way += left
     return thing.by(way * direction)
 
@@ -347,12 +356,13 @@ def looking(place: Float, at: Float) -> Float:
 
 
 def views(
-    at: Float,
+    things: Sequence[Thing],
     steps: Sequence[float],
     rng: np.random.Generator,
     distances: tuple[float, float] = (0.5, 0.8),
 ) -> list[Float]:
-    """Poses of a camera on a wrist around a place, so many steps of azimuth from the first."""
+    """Poses of a camera on a wrist around things, so many steps of azimuth from the first."""
+    at = middle(together(things))
     first = rng.uniform(0, 360)
     poses = []
     for step in steps:
@@ -406,12 +416,6 @@ def case_of(
     )
 
 
-def middle(things: Sequence[Thing]) -> Float:
-    """Centre of some things, (3,)."""
-    points = np.concatenate([thing.points for thing in things])
-    return np.asarray((points.min(0) + points.max(0)) / 2)
-
-
 Scans = dict[str, Path]
 
 
@@ -445,7 +449,7 @@ def table(number: int, scans: Scans, rng: np.random.Generator) -> Case:
         new = rng.random() < 0.15
         thing = stranger(count, rng) if new else drawn(names.pop(), scans, rng)
         things.append(added(thing, things, rng))
-    shots = [(things, pose) for pose in views(middle(things), (0, 1, 2), rng)]
+    shots = [(things, pose) for pose in views(things, (0, 1, 2), rng)]
     return case_of(shots, room(rng), rng, kind)
 
 
@@ -453,7 +457,7 @@ def single(number: int, scans: Scans, rng: np.random.Generator) -> Case:
     """One thing on a table: other ones than those of the numbers before."""
     order = np.random.default_rng(5).permutation(sorted(scans))
     things = [drawn(str(order[number % len(order)]), scans, rng)]
-    pose = views(middle(things), (0,), rng)[0]
+    pose = views(things, (0,), rng)[0]
     return case_of([(things, pose)], room(rng), rng, "single")
 
 
@@ -463,7 +467,7 @@ def part(number: int, scans: Scans, rng: np.random.Generator) -> Case:
     if number < 2 * len(meshes):
         name = sorted(meshes)[number % len(meshes)]
         things = [resting(name, meshes[name], rng)]
-        shots = [(things, views(middle(things), (0,), rng, NEARER)[0])]
+        shots = [(things, views(things, (0,), rng, NEARER)[0])]
         return case_of(shots, room(rng), rng, "alone")
 
     things = []
@@ -475,7 +479,7 @@ def part(number: int, scans: Scans, rng: np.random.Generator) -> Case:
         if inside and (not things or distance(lies, together(things)) > 2 * TOUCHING):
             things.append(lies)
     things.append(shallow_box())
-    shots = [(things, pose) for pose in views(middle(things), (0, 1), rng, NEARER)]
+    shots = [(things, pose) for pose in views(things, (0, 1), rng, NEARER)]
     return case_of(shots, room(rng), rng, "in a box")
 
 
@@ -493,7 +497,7 @@ def move(number: int, scans: Scans, rng: np.random.Generator) -> Case:
         others = [*things[:which], *things[which + 1 :]]
         if number % 2 or distance(there, together(others)) > 2 * TOUCHING:
             after[which] = None if number % 2 else there
-    poses = views(middle(things), (0, 1, 2, 0.5, 1.5), rng)
+    poses = views(things, (0, 1, 2, 0.5, 1.5), rng)
     states = [[*things]] * 3 + [after] * 2
     shots = list(zip(states, poses, strict=True))
     return case_of(shots, room(rng), rng, "removed" if number % 2 else "moved")
@@ -503,8 +507,8 @@ def hidden(number: int, scans: Scans, rng: np.random.Generator) -> Case:
     """A thing behind a box, or at the border of the picture."""
     order = np.random.default_rng(6).permutation(sorted(scans))
     thing = drawn(str(order[number % len(order)]), scans, rng)
-    centre = middle([thing])
-    pose = views(centre, (0,), rng)[0]
+    centre = middle(thing.points)
+    pose = views([thing], (0,), rng)[0]
     left = shown(pose, thing) * (1 / 2 if number >= 12 or number % 2 == 0 else 1 / 3)
     if number >= 12:
         side = pose[:3, 0] * rng.choice([-1, 1])
