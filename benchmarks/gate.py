@@ -3,8 +3,11 @@
     python -m benchmarks.gate [DATA] [--out FILE] [--against FILE] [--only PART ...] [--quick]
 
 DATA, by default the environment variable NEXTVIEW_DATA, holds the scans of the bundled memory,
-YCB/NAME.ply, in metres, and real frames in the folders real_taught, real_ycb and real_tables, as
-``benchmarks.real_frames`` reads them. All other frames are drawn once by ``benchmarks.gate_frames``
+YCB/NAME.ply, in metres, and three folders of real frames: real_taught and real_tables have a folder
+a frame, with depth.png (uint16, millimetres; scale.json has metres a step, if it is another one)
+and K.json (fx, fy, cx, cy, the middle of the first pixel at 0), and real_taught has truth.json, for
+each frame its things as {"name", "column", "row"}; real_ycb has NAME.depth.png, NAME.labels.png
+and names.txt, a line for each label. All other frames are drawn once by ``benchmarks.gate_frames``
 and kept in the folder ``--frames``. Only the public interface of nextview is used.
 
 | part | what |
@@ -70,15 +73,12 @@ Shapes = dict[str, tuple[Float, Float]]  # points on each scan and normals there
 
 IN_VIEW = 500  # pixels of a thing, from which on it counts
 NEAR = 0.03  # metres from the true middle
-COMPARED = 8  # each so manyth point of a thing is compared with the posed scan
 PIXELS_NEAR = 8  # of a given pixel in a real frame
 LEAST_LABEL = 200  # pixels of a label in a real frame
-UNKNOWN = "unknown"
 REAL_YCB = np.array([[618.017, 0, 312.377], [0, 618.003, 232.375], [0, 0, 1]])
 REAL_TABLES = 12  # frames
 CHANGED = 3  # number of the first frame after a move
 SPREAD = ("mm", "seconds")  # columns of which median and worst are shown
-DEFAULT_FRAMES = Path("~/.cache/nextview/gate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +129,13 @@ def frame_of(seen: Case, number: int, mask: Mask | None = None) -> Frame:
 
 def named_in(scene: nextview.Scene) -> list[Any]:
     """The objects to which a scene gives a name."""
-    return [one for one in scene.objects if one.name != UNKNOWN]
+    return [one for one in scene.objects if one.name != "unknown"]
 
 
 def millimetres_off(true: Float, shape: tuple[Float, Float], pose: Float) -> float:
     """Mean distance of points on a thing from the surface of its posed scan."""
     points, normals = moved(shape[0], pose), shape[1] @ pose[:3, :3].T
-    some = true[::COMPARED]
+    some = true[::8]  # enough for a mean
     nearest = cKDTree(points).query(some)[1]
     across = ((some - points[nearest]) * normals[nearest]).sum(1)
     return 1000 * float(np.abs(across).mean())
@@ -483,7 +483,7 @@ def main(
     against: Path | None = None,
     only: tuple[Part, ...] = (),
     quick: bool = False,
-    frames: Path = DEFAULT_FRAMES,
+    frames: Path = Path("~/.cache/nextview/gate"),
 ) -> None:
     """Measure all parts, and print a table for each.
 
