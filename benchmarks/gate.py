@@ -435,17 +435,23 @@ def summed(rows: Sequence[Row]) -> dict[str, float]:
     return figures
 
 
+def cell(now: float | None, before: float | None) -> str:
+    """A figure, and how it was before if it has changed."""
+    if before is None or now == before:
+        return "" if now is None else f"{now:g}"
+    if now is None:
+        return f"{before:g} > none"
+    return f"{before:g} > {now:g} ({now - before:+.3g})"
+
+
 def table_of(figures: dict[str, Any], against: dict[str, Any]) -> str:
     """A table of the figures of a part, a row for each group, beside those of another run."""
-    columns = [*dict.fromkeys(name for figure in figures.values() for name in figure)]
+    rows = [*figures.values(), *against.values()]
+    columns = [*dict.fromkeys(name for figure in rows for name in figure)]
     lines = [["", *columns]]
-    for group, figure in figures.items():
+    for group, now in figures.items():
         before = against.get(group, {})
-        said = [f"{figure[name]:g}" if name in figure else "" for name in columns]
-        for place, name in enumerate(columns):
-            if name in figure and name in before:
-                change = figure[name] - before[name]
-                said[place] = f"{before[name]:g} > {figure[name]:g} ({change:+.3g})"
+        said = [cell(now.get(name), before.get(name)) for name in columns]
         lines.append([group, *said])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(

@@ -80,8 +80,10 @@ def test_tables_beside_another_run():
     assert figures["right"] == 6
     assert figures["precision %"] == 75
     assert (figures["seconds, median"], figures["seconds, worst"]) == (2, 3)
-    table = table_of({"one": figures}, {"one": {**figures, "right": 8}})
+    table = table_of({"one": figures}, {"one": {**figures, "right": 8, "mm, worst": 2}})
     assert "8 > 6 (-2)" in table
+    assert "2 > none" in table
+    assert table.count(">") == 2  # what has not changed stands alone
 
 
 def test_what_is_gone_is_nearest_to_nothing():
