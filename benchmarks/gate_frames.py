@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
@@ -26,6 +27,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 Float = NDArray[np.float64]
+DEVICE = EmbreeDevice()  # one, as embreex does not notice if another one fails
 VERSION = 1  # of what is drawn; a change of this file that changes frames raises it
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 600.0  # pixels
@@ -298,7 +300,7 @@ class World:
         numbers = [*range(1, len(things) + 1), *[0] * len(around)]
         self.labels = np.repeat(numbers, [len(one.faces) for one in solids])
         self.normals = whole.face_normals
-        self.scene = EmbreeScene()
+        self.scene = EmbreeScene(DEVICE)
         TriangleMesh(self.scene, whole.triangles.astype(np.float32))
 
     def cast(self, pose: Float, step: int = 1) -> tuple[Float, Any, Float]:
