@@ -26,7 +26,6 @@ from nextview.things.register import (
     MATCHING_ERROR,
     normal_equations,
 )
-from nextview.things.rivals import other_size
 from nextview.things.score import PIXEL_GAIN
 from nextview.types import Float, Index, Mask
 
@@ -35,9 +34,10 @@ if TYPE_CHECKING:
 
 UNKNOWN_NAME = "unknown"
 PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats count once
-# log-odds that a name is right: of what it explains, of what it could explain, of the lead over
-# other names, and of what the same shape in another size explains better
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD, OF_SIZE = -6.0, 8.0, 0.6, 20.0, -30.0
+# log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
+# explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
+LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
 SETTLED_VIEWS = 2  # views after which an unknown object is settled
 TOUCHING = 0.015  # metres of depth between two objects that touch
@@ -131,7 +131,6 @@ class Named:
         right: probability that the likeliest name is right.
         lead: over the likeliest other name, nats.
         share: of what the likeliest hypothesis could explain.
-        larger: how much better the same shape in another size explains the views, a share.
     """
 
     rows: Index
@@ -139,7 +138,6 @@ class Named:
     right: float
     lead: float
     share: float
-    larger: float
 
     def beliefs(self, world: World) -> dict[str, float]:
         """Return the belief in each name, the likeliest first."""
@@ -176,12 +174,8 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     lead = float(totals[0] - totals[others].max(initial=0.0))
     share = float(totals[0]) / max(1.0, PIXEL_GAIN * seen)
     odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(totals[0], 1.0))
-    odds += OF_LEAD * lead / max(totals[0], 1.0)
-    larger = 0.0
-    if expit(odds) > CONFIDENT:
-        larger = other_size(world.library, world.views, world.hypotheses[rows[:1]])[0]
-        odds += OF_SIZE * larger
-    return Named(rows, probabilities, float(expit(odds)), lead, share, larger)
+    odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
+    return Named(rows, probabilities, float(expit(odds)), lead, share)
 
 
 def objects_of(state: SceneState) -> tuple[SceneObject, ...]:
@@ -259,15 +253,12 @@ def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
             OF_SHARE * (found.share - 0.7)
         ),
         "few pixels show it": OF_GAIN * (np.log(max(thing.gain, 1.0)) - np.log(1000)),
-        "the same shape in another size explains the views better": (
-            OF_SIZE * found.larger
-        ),
     }
     rival = things[things != things[0]]
     if len(rival):
         name = world.library.names[int(rival[0])]
         terms[f"{name} explains the views nearly as well"] = OF_LEAD * (
-            found.lead / max(thing.gain, 1.0) - 0.2
+            min(found.lead / max(thing.gain, 1.0), LARGEST_LEAD) - LARGEST_LEAD
         )
     return min(terms, key=lambda one: terms[one])
 
