@@ -188,11 +188,26 @@ def _after(
 
 def _forgotten(world: World, numbers: Sequence[int]) -> World:
     """Return the world without the pixels that some things explained: they say nothing any more."""
-    views = []
+    views, held = [], []
     for view, owner in zip(world.views, world.owners, strict=True):
-        cells = np.isin(owner, numbers).reshape(view.grid().depth.shape)
-        views.append(view.without(cells) if cells.any() else view)
-    return replace(world, views=tuple(views))
+        cells = np.isin(owner, numbers)
+        held.append(cells)
+        shape = view.grid().depth.shape
+        views.append(view.without(cells.reshape(shape)) if cells.any() else view)
+
+    # what is no longer there was no stranger, either
+    kept = []
+    for row in world.strangers:
+        shown = [(one, cells) for one, cells in zip(row, held, strict=True) if one]
+        count = sum(len(one.cells) for one, _ in shown)
+        left = sum(np.count_nonzero(~cells[one.cells]) for one, cells in shown)
+        if 2 * left > count:
+            kept.append(row)
+    owners = tuple(
+        np.where(cells, 0, owner).astype(np.int32)
+        for cells, owner in zip(held, world.owners, strict=True)
+    )
+    return replace(world, views=tuple(views), strangers=tuple(kept), owners=owners)
 
 
 def _without_gone_strangers(told: Changes) -> Changes:

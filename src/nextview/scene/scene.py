@@ -579,7 +579,7 @@ class Scene:
         warnings = tuple(check_mistakes(seen, self._known_frames))
         ground = None if earlier is None else earlier.plane
         top = TableTop.of(seen, self.up, ground, inside, self._widest)
-        view = View.of(frame, _carried(instances, top), inside)
+        view = View.of(frame, _carried(instances, top), inside, top.height)
         return replace(top, warnings=warnings), view
 
     def _after(

@@ -18,6 +18,7 @@ from nextview.types import Float, Float32, Index, Mask
 GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
 # standard deviation of a measured depth, relative, at least: real depth is bent
 LEAST_ERROR = 0.0025
+LEVEL = 2.0  # standard deviations of the depth, within which a pixel lies on a plane
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
 NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of one thing
 FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
@@ -89,14 +90,23 @@ class View:
     _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, frame: Frame, instances: Instances, inside: Mask) -> View:
+    def of(
+        cls, frame: Frame, instances: Instances, inside: Mask, height: Float32
+    ) -> View:
         """Return the view of a frame.
 
         Args:
             frame: of a depth camera.
             instances: what its segmentation says.
             inside: pixels that are to be explained, (H, W) bool.
+            height: of each pixel above the plane that carries it, (H, W) float32, metres.
         """
+        noise = noise_of(frame)
+        sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
+        # what lies on a plane within the noise is explained by the plane
+        level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
+        surface = instances.surface | level
+        inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
         for number, mask in enumerate(instances.masks, 1):
             labels[mask & inside] = number
@@ -105,10 +115,10 @@ class View:
         return cls(
             frame,
             frame.camera_to_world,
-            noise_of(frame),
+            noise,
             labels,
             pieces,
-            instances.surface,
+            surface,
             instances.background,
             inside,
         )
