@@ -579,7 +579,8 @@ class Scene:
         warnings = tuple(check_mistakes(seen, self._known_frames))
         ground = None if earlier is None else earlier.plane
         top = TableTop.of(seen, self.up, ground, inside, self._widest)
-        view = View.of(frame, _carried(instances, top), inside, top.height)
+        carried = _carried(instances, top)
+        view = View.of(frame, carried, inside, top.height, self._widest)
         return replace(top, warnings=warnings), view
 
     def _after(
@@ -598,7 +599,7 @@ class Scene:
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
 
-        world = told.world.with_view(told.view, top.seen.segments())
+        world = told.world.with_view(told.view)
         world = world.searched(np.ones(len(world.library), bool)).numbered()
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, before.world, gone)

@@ -8,7 +8,7 @@ explains its pixels a little, so that a name has to explain them better.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -95,13 +95,8 @@ class World:
         """Return the thing with this number."""
         return next(one for one in self.things if one.number == number)
 
-    def with_view(self, view: View, carried: Sequence[Mask]) -> World:
-        """Return the world after another view, before anything new is searched for.
-
-        Args:
-            view: the view.
-            carried: pixels of what stands on something, (H, W) bool each.
-        """
+    def with_view(self, view: View) -> World:
+        """Return the world after another view, before anything new is searched for."""
         some = self.hypotheses
         views = (*self.views, view)
         if len(self.views) < SETTLED_VIEWS and len(some):
@@ -116,7 +111,7 @@ class World:
             views=views,
             hypotheses=some,
             scores=tuple((*row, new) for row, new in zip(scores, column, strict=True)),
-            strangers=_seen_again(self, view, carried),
+            strangers=_seen_again(self, view),
             owners=(*self.owners, np.zeros(view.grid().depth.size, np.int32)),
         )
         return world.chosen()
@@ -416,18 +411,13 @@ def _owners(
     return found
 
 
-def _seen_again(
-    world: World, view: View, carried: Iterable[Mask]
-) -> tuple[tuple[Score | None, ...], ...]:
-    """Return strangers after another view: those of before, and new ones.
-
-    Args:
-        world: before the view.
-        view: the view.
-        carried: pixels of what stands on something, (H, W) bool each.
-    """
+def _seen_again(world: World, view: View) -> tuple[tuple[Score | None, ...], ...]:
+    """Return strangers after another view: those of before, and new ones."""
     stride = view.stride
-    masks = [mask[::stride, ::stride].ravel() & (view.grid().depth.ravel() > 0) for mask in carried]
+    measured = view.grid().depth.ravel() > 0
+    masks = [
+        one.mask[::stride, ::stride].ravel() & measured for one in view.instances()
+    ]
     sizes = np.array([np.count_nonzero(mask) for mask in masks])
     expected = [_expected(world, row, view) for row in world.strangers]
     alike = np.zeros((len(expected), len(masks)))

@@ -19,6 +19,8 @@ GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
 # standard deviation of a measured depth, relative, at least: real depth is bent
 LEAST_ERROR = 0.0025
 LEVEL = 2.0  # standard deviations of the depth, within which a pixel lies on a plane
+LARGER = 1.2  # times the largest thing, above which an instance is none
+OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
 NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of one thing
 FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
@@ -91,7 +93,12 @@ class View:
 
     @classmethod
     def of(
-        cls, frame: Frame, instances: Instances, inside: Mask, height: Float32
+        cls,
+        frame: Frame,
+        instances: Instances,
+        inside: Mask,
+        height: Float32,
+        widest: float,
     ) -> View:
         """Return the view of a frame.
 
@@ -100,6 +107,7 @@ class View:
             instances: what its segmentation says.
             inside: pixels that are to be explained, (H, W) bool.
             height: of each pixel above the plane that carries it, (H, W) float32, metres.
+            widest: diameter of the largest thing, metres.
         """
         noise = noise_of(frame)
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
@@ -108,8 +116,14 @@ class View:
         surface = instances.surface | level
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
+        large = np.zeros(frame.shape, bool)
         for number, mask in enumerate(instances.masks, 1):
-            labels[mask & inside] = number
+            if _extent(frame, mask & inside) > LARGER * widest:
+                large |= mask  # a table, a wall, a room: no thing is as large
+            else:
+                labels[mask & inside] = number
+        surface |= large
+        inside &= ~large
         given = labels if instances.pieces is None else instances.pieces
         pieces = np.where(inside, given, 0).astype(np.int32)
         return cls(
@@ -263,6 +277,17 @@ class View:
                 key = first[beside] * count + second[beside]
                 found += np.bincount(key, minlength=count**2).reshape(count, count)
         return found + found.T
+
+
+def _extent(frame: Frame, mask: Mask) -> float:
+    """Return how far apart the measured points of some pixels lie, without outliers, metres."""
+    rows, columns = np.nonzero(mask & (frame.depth > 0))
+    few = slice(None, None, max(1, len(rows) // 500))
+    if len(rows) < 2:
+        return 0.0
+    points = frame.positions_in_camera(rows[few], columns[few])
+    low, high = np.quantile(points, OUTLIERS, axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def _parts(labels: NDArray[np.int32], fewest: int) -> Iterator[Mask]:

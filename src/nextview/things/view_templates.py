@@ -462,11 +462,16 @@ class SeenOutline:
         found = cls.of_depth(depth, shown, known | shown, camera, pose)
 
         around = ndimage.binary_dilation(shown, iterations=2) & ~shown
-        covered = around & hiding
-        if np.count_nonzero(covered) < HIDDEN_SHARE * np.count_nonzero(around):
+        rows, columns = np.nonzero(around & hiding)
+        # beyond the border of the image it may go on, too
+        ends = np.zeros(shown.shape, bool)
+        ends[[0, -1]] = ends[:, [0, -1]] = True
+        ends_at = np.nonzero(shown & ends)
+        rows = np.concatenate([rows, ends_at[0]])
+        columns = np.concatenate([columns, ends_at[1]])
+        if len(rows) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
 
-        rows, columns = np.nonzero(covered)
         towards = np.array([columns.mean(), rows.mean()]) - found.centre
         step, reach = SHIFTS
         lines = np.arange(-reach, reach + step / 2, step)
