@@ -1,10 +1,10 @@
 """Recognise objects in rooms: by the aim of the camera alone, by a point or by a mask, through a
 good and a poor camera.
 
-    nextview-lab scenes ModelNet10 rooms --room --split train --scenes 60
+    nextview-lab scenes ModelNet10 rooms --levels room --split train --scenes 60
     python -m benchmarks.room rooms ModelNet10 out [--mistakes page]
 
-    nextview-lab scenes YCB tables --room --unit m --scenes 40
+    nextview-lab scenes YCB tables --levels room --unit m --scenes 40
     python -m benchmarks.room tables YCB out-ycb --models ycb --by point mask
 
 Each room is looked at from its first view on, with all defaults, until the session is done. By
@@ -49,8 +49,9 @@ from nextview.sensing import Frame, ObservedObject
 from nextview.session.session import Session
 from nextview.simulation.sensor import Sensor, sensor_named
 from nextview.types import Mask
-from nextview_lab.worlds.room import Room, RoomCamera, build_room
-from nextview_lab.worlds.room_layout import RoomLayout
+from nextview_lab.worlds.scene import TargetScene, build_scene
+from nextview_lab.worlds.scene_cameras import RoomCamera
+from nextview_lab.worlds.scene_layout import SceneLayout
 
 By = Literal["pose", "point", "mask"]
 
@@ -78,7 +79,6 @@ class Outcome(Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         room: its name.
         label: the class, or the thing, that it shows.
-        kind: "floor" or "table".
         by: how the object was said.
         sensor: NAME or NAME:STRENGTH.
         answer: what it was called; None for nothing.
@@ -95,7 +95,6 @@ class Outcome(Struct, frozen=True, forbid_unknown_fields=True):
 
     room: str
     label: str
-    kind: str
     by: str
     sensor: str
     answer: str | None
@@ -177,9 +176,10 @@ def system_of(models: str) -> System:
 
 
 @lru_cache(maxsize=1)
-def room_of(file: Path, meshes: Path) -> Room:
+def room_of(file: Path, meshes: Path) -> tuple[SceneLayout, TargetScene]:
     """A room, built once for the episodes in it."""
-    return build_room(RoomLayout.load(file), meshes)
+    layout = SceneLayout.load(file)
+    return layout, build_scene(layout, meshes)
 
 
 @dataclass(frozen=True)
@@ -193,22 +193,22 @@ class Look:
     error: str
 
 
-def episode(job: Job) -> tuple[Room, Session, list[Look]]:
+def episode(job: Job) -> tuple[SceneLayout, Session, list[Look]]:
     """Run an episode."""
-    room = room_of(job.room, job.meshes)
+    layout, room = room_of(job.room, job.meshes)
     sensor = sensor_named(job.sensor)
     if not isinstance(sensor, Sensor):
         raise UsageError(f"{job.sensor}: a camera in a room is one sensor, no mix")
     seed = job.settings.seed
     camera = RoomCamera(room, sensor, seed)
 
-    pose = room.pose
-    distance = float(np.linalg.norm(pose[:3, 3] - room.centre))
-    rng = np.random.default_rng([seed, crc32(room.layout.name.encode())])
-    point = room.centre + np.append(rng.normal(0, POINT_OFF * distance, 2), 0.0)
+    pose = layout.first_pose
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    rng = np.random.default_rng([seed, crc32(layout.name.encode())])
+    point = np.append(rng.normal(0, POINT_OFF * distance, 2), 0.0)
     thing = ObservedObject(point=point) if job.by == "point" else ObservedObject()
     session = system_of(job.settings.models).session(object=thing, distance=distance)
-    session.reachable = room.reachable
+    session.reachable = camera.reachable
 
     looks: list[Look] = []
     while not session.done and len(looks) < MOST_LOOKS:
@@ -228,12 +228,12 @@ def episode(job: Job) -> tuple[Room, Session, list[Look]]:
             session.failed()
         if not session.done:
             pose = session.target
-    return room, session, looks
+    return layout, session, looks
 
 
 def outcome(job: Job) -> Outcome:
     """Run an episode, and say how it ended."""
-    room, session, looks = episode(job)
+    layout, session, looks = episode(job)
     result = session.result if session.views else None
     accepted = [look for look in looks if not look.error]
     shares = [
@@ -243,9 +243,8 @@ def outcome(job: Job) -> Outcome:
     taken, own = min(shares, key=lambda pair: pair[0] * pair[1], default=(0.0, 0.0))
     radius = session.object.object_frame.radius if accepted else None
     return Outcome(
-        room=room.layout.name,
-        label=room.layout.label,
-        kind=room.layout.kind,
+        room=layout.name,
+        label=layout.label,
         by=job.by,
         sensor=job.sensor,
         answer=None if result is None else result.answer,
@@ -257,7 +256,7 @@ def outcome(job: Job) -> Outcome:
         warnings=tuple(
             warning.name for view in session.views for warning in view.warnings
         ),
-        ratio=None if radius is None else radius / room.radius,
+        ratio=None if radius is None else radius / (layout.metres or 1.0),
         taken=taken,
         own=own,
     )
@@ -291,7 +290,7 @@ def jobs_of(
     )
     if not files:
         raise DatasetError(
-            f"{rooms}: holds no rooms; nextview-lab scenes --room draws some"
+            f"{rooms}: holds no rooms; nextview-lab scenes --levels room draws some"
         )
     return [
         Job(
@@ -401,7 +400,7 @@ def main(
     """Recognise the objects in some rooms, and print how it went.
 
     Args:
-        rooms: folder that nextview-lab scenes --room drew.
+        rooms: folder that nextview-lab scenes --levels room drew.
         meshes: folder of the meshes that they are made of.
         out: folder of the episodes; those that are there are not run again.
         by: how the object is said.

@@ -35,7 +35,7 @@ from nextview.teaching.learn import learn
 from nextview.things import view_templates
 from nextview.things.memory import open_memory
 from nextview_lab.benchmark import table_runs
-from nextview_lab.data import room_drawing
+from nextview_lab.data import scene_drawing
 
 LONG = (
     "test_workflow.py",
@@ -122,7 +122,7 @@ def kept_things(shared):
             (learn_module, "show", kept_results.of_show),
             (small_tables, "resting_poses", kept_results.of_mesh),
             (table_runs, "resting_poses", kept_results.of_mesh),
-            (room_drawing, "resting_poses", kept_results.of_mesh),
+            (scene_drawing, "resting_poses", kept_results.of_mesh),
         ):
             function = getattr(module, name)
             kept = kept_results.Kept(function, folder, given)

@@ -131,7 +131,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
     ),
     r"nextview-lab scenes YCB ": "needs the YCB scans; tests/test_room_scenes.py draws tables",
-    r"RoomLayout\.load": "names one of the drawn rooms; tests/test_room_scenes.py looks into some",
     r"agent_on_things": (
         "needs things that were taught; tests/test_thing_environment.py lets it learn"
     ),
