@@ -29,8 +29,9 @@ import tyro
 from scipy.stats import combine_pvalues
 
 from nextview.errors import UsageError
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.comparison import ALL, corrected
-from nextview_lab.benchmark.results import RECORD, markdown
+from nextview_lab.benchmark.results import RECORD
 from nextview_lab.benchmark.thing_tables import FAR_POSE, POSE_AFTER
 
 COLUMNS = (

@@ -254,12 +254,13 @@ def compared(
     tests = []
     for level, of in scenes.items():
         count = len(of[REFERENCE].right)
-        sums = {
-            Key(name, None, k, "accuracy"): (reached.right[:, k - 1], np.ones(count))
+        shares = {
+            Key(name, None, k, "accuracy"): reached.right[:, k - 1]
             for name, reached in of.items()
             for k in COUNTS
         }
-        counted = Counted.of(sums, np.arange(count))
+        top = np.stack(list(shares.values()), 1)
+        counted = Counted(tuple(shares), top, np.ones_like(top), np.arange(count))
         weights = resample(count, samples, rng)
         others = counted.tests(
             level, weights, REFERENCE, lambda key: key.policy != ours

@@ -34,13 +34,13 @@ from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.errors import UsageError
 from nextview.session.style import FIGURE_STYLE, GREY, to_png
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ONE_STEP, after_views
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview_lab.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
 from nextview_lab.benchmark.figures import OWN, POLICY_COLOURS
 from nextview_lab.benchmark.leaderboard import after_views_rows
 from nextview_lab.benchmark.replay import Grid, make_specs, run_grid
-from nextview_lab.benchmark.results import markdown
 from nextview_lab.benchmark.statistics import resample_families, target_families
 from nextview_lab.data.predictions import Predictions
 
@@ -96,7 +96,7 @@ def front(
     A line joins the travel weights of one policy. Dots are filled where p against random,
     corrected, is under 0.05.
     """
-    found = values_of(tables, ALL)
+    found = values_of(tables.measures, ALL)
     table = tables.measures
     n_views = [int(k) for k in table["views"].unique()]
     tests = tables.tests[tables.tests["reference"] == REFERENCES[0]]

@@ -15,11 +15,12 @@ from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_stopping import own_stopping
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ClassResults, ClassTables, summarise
 from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.leaderboard import after_views_rows
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
-from nextview_lab.benchmark.results import RECORD, markdown, write_results
+from nextview_lab.benchmark.results import RECORD, write_results
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import EntryError
 from nextview_lab.extras import extras
