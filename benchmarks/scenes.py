@@ -47,7 +47,7 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import of_true_class
 from nextview.session.style import FIGURE_STYLE, PAPER
-from nextview_lab.benchmark.class_tables import grid_mean, levels_of
+from nextview_lab.benchmark.class_tables import levels_of
 from nextview_lab.benchmark.comparison import Counted, Key, corrected
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.replay import Grid, make_specs, run_grid
@@ -157,7 +157,7 @@ def reached_in(grid: Grid, name: str) -> Reached:
     travel = path.travel[rows, last], SECONDS * last + TURN * path.arc[rows, last]
     return Reached(
         *(
-            grid_mean(grid, np.asarray(values, np.float64))
+            np.asarray(values, np.float64).reshape(grid.runs, -1, most).mean(0)
             for values in (right, *travel)
         )
     )
