@@ -1,6 +1,6 @@
 """Accuracy, losses and speed of the tracker on simulated trajectories of things in a gripper.
 
-    python -m benchmarks.tracking SCANS OUT.jsonl [--trajectories 10] [--seed 0]
+    python -m nextview_lab.studies.tracking SCANS OUT.jsonl [--trajectories 10] [--seed 0]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Four of
 them stand on a table, and a scene names them from three views. One whose pose it finds is then
@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import nextview
-from benchmarks.shared import mesh_of, results, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh
@@ -47,6 +46,7 @@ from nextview.sensing.frame import Frame
 from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float
+from nextview_lab.studies.shared import mesh_of, results, scans_in
 from nextview_lab.worlds.tables import (
     PlacedThing,
     SimulatedTable,
@@ -149,8 +149,8 @@ class Trajectory:
 
     def cast(self, number: int) -> tuple[NDArray[np.float32], float]:
         """Depth of a frame without noise, and the share of the thing's pixels that is visible."""
-        rays = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
-        rays = rays @ self.camera[:3, :3].T
+        pinhole = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape)
+        rays = pinhole.rays.reshape(-1, 3) @ self.camera[:3, :3].T
         origin = self.camera[:3, 3]
         thing = self.table.things[self.row]
         pose = self.poses[number]
@@ -255,8 +255,8 @@ def errors(
     if axis is None:
         turn = Rotation.from_matrix(estimate[:3, :3] @ truth[:3, :3].T).magnitude()
     else:
-        cosine = abs((estimate[:3, :3] @ axis) @ (truth[:3, :3] @ axis))
-        turn = np.arccos(min(cosine, 1))
+        cosine = abs(float((estimate[:3, :3] @ axis) @ (truth[:3, :3] @ axis)))
+        turn = np.arccos(min(cosine, 1.0))
     return 1000 * float(np.linalg.norm(apart)), float(np.degrees(turn))
 
 

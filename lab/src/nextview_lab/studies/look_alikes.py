@@ -1,12 +1,8 @@
-"""Things that are made by rule from scans and models, to teach and to recognise, as PLY in metres.
+"""Pairs of things that differ in one place only, made from scans and models, as PLY in metres.
 
-    python -m benchmarks.made_things look-alikes YCB OUT [--models ModelNet10] [--pairs 40]
-        [--seed 0] [--pictures pairs.png]
-    python -m benchmarks.made_things toys PSB princeton --every-second --each 5
-    python -m benchmarks.made_things toys ModelNet10 chairs --classes chair --each 50 --split test
-    python -m benchmarks.made_things stretched YCB OUT [--count 1000] [--seed 0]
+    python -m nextview_lab.studies.look_alikes YCB OUT [--models ModelNet10] [--pairs 40] [--seed 0]
 
-``look-alikes``: pairs of things that differ in one place only. Each pair is one body with and
+Each pair is one body with and
 without a change, or with two changes that differ, and the change is on one side of the body:
 
 | change | first | second |
@@ -24,16 +20,6 @@ and models take turns, and so do the changes; bodies and places are drawn by the
 taken if the two things differ in 15 to 60 % of the 40 views, that is by more than 4 mm in 10 or
 more pixels of a picture of 64 x 64; so a view chosen at random often tells nothing. OUT receives
 two files a pair, in one frame of reference, and ``pairs.csv``; the table of pairs is printed.
-
-``toys``: things of 20 cm from models that have no scale. Each model is scaled to a diameter of
-20 cm, placed on the plane z = 0 and written under the name of its file. Models are taken in the
-order of their names. Those that cannot be read, and those with more than 60,000 faces, are passed
-over and printed.
-
-``stretched``: many things. The first ones are the scans of the folder YCB themselves. All others
-are scans in turn, each stretched along its x, y and z by factors of its own, drawn between 0.7 and
-1.4, evenly in the logarithm. The seed decides them. A thing is called by the number of its round
-and its scan, as 03_mug. ``benchmarks.verified_things`` shows them.
 """
 
 from __future__ import annotations
@@ -48,23 +34,19 @@ import numpy as np
 import trimesh
 import tyro
 
-from benchmarks.shared import progress, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import MeshError, UsageError
-from nextview.files import new_folder
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import pinhole
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.things.surface import Surface
 from nextview.types import Float
+from nextview_lab.studies.shared import scans_in
 
 SMALLEST_DIAMETER = 0.06  # metres, of a body
 SMALLEST_EXTENT = 0.04  # metres, of a body in each direction
 TOY_DIAMETER = 0.2  # metres, to which models without a scale are brought
 MOST_FACES = 60_000  # of a model
-LEAST_STRETCH = 0.7
-MOST_STRETCH = 1.4
 
 VIEWPOINTS = ViewSphere.named("40")
 PICTURE_SIDE = 64  # pixels
@@ -370,43 +352,12 @@ def _changed(
     return None
 
 
-def draw(made: list[Made], path: Path) -> None:
-    """Draw each pair from the viewpoint where it differs most."""
-    from matplotlib.figure import Figure
-
-    columns = 8
-    rows = -(-len(made) // (columns // 2))
-    figure = Figure((1.6 * columns, 1.75 * rows))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes:
-        axis.set_axis_off()
-    for number, pair in enumerate(made):
-        both = _joined(*pair.meshes)
-        centre = both.bounds.mean(0)
-        radius = float(np.linalg.norm(both.vertices - centre, axis=1).max())
-        pictures = np.stack(
-            [depth_pictures(mesh, centre, radius) for mesh in pair.meshes]
-        )
-        with np.errstate(invalid="ignore"):
-            different = ~(
-                np.abs(pictures[0] - pictures[1]) < DIFFERENT_DEPTH
-            ) & np.isfinite(pictures).any(0)
-        view = int(different.sum(1).argmax())
-        for which in (0, 1):
-            image = pictures[which, view].reshape(PICTURE_SIDE, PICTURE_SIDE)
-            axis = axes[2 * number + which]
-            axis.imshow(np.where(np.isfinite(image), image, np.nan), cmap="viridis_r")
-            axis.set_title(pair.names[which], fontsize=6)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
-
-
 def look_alikes(
     ycb: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
     models: Path | None = None,
     pairs: int = 40,
     seed: int = 0,
-    pictures: Path | None = None,
 ) -> None:
     """Make pairs of things that differ in one place only.
 
@@ -416,7 +367,6 @@ def look_alikes(
         models: the folder of ModelNet10; without it all bodies are scans.
         pairs: how many.
         seed: decides bodies and places.
-        pictures: where the pairs are drawn.
     """
     scans = list(scans_in(ycb, (".ply",)).values())
     others = [] if models is None else sorted(models.glob("*/test/*.off"))
@@ -431,108 +381,8 @@ def look_alikes(
             for name, mesh in zip(pair.names, pair.meshes, strict=True):
                 mesh.export(out / f"{name}.ply")
     print((out / "pairs.csv").read_text())
-    if pictures is not None:
-        draw(made, pictures)
-
-
-def toy(path: Path) -> trimesh.Trimesh:
-    """The model in a file as a toy on the plane z = 0.
-
-    Args:
-        path: of the mesh.
-
-    Raises:
-        MeshError: it cannot be read, or has too many faces.
-    """
-    mesh = load_mesh(path)
-    if len(mesh.faces) > MOST_FACES:
-        raise MeshError(f"{path}: has {len(mesh.faces):,} faces")
-
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    body.apply_scale(TOY_DIAMETER / _size(body))
-    low, high = body.bounds
-    body.apply_translation((-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]))
-    return body
-
-
-def toys(
-    models: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    classes: tuple[str, ...] = (),
-    each: int = 5,
-    every_second: bool = False,
-    split: str = "",
-) -> None:
-    """Make things of 20 cm from models that have no scale.
-
-    Args:
-        models: folder with one folder of meshes for each class.
-        out: folder of the toys, which is made.
-        classes: names of folders; by default all.
-        each: models of each class.
-        every_second: only every second class, from the second on.
-        split: folder inside that of a class, such as "test".
-
-    Raises:
-        UsageError: OUT exists, or a class has no models.
-    """
-    if out.exists():
-        raise UsageError(f"{out}: exists already")
-    names = classes or tuple(sorted(p.name for p in models.iterdir() if p.is_dir()))
-    if every_second:
-        names = names[1::2]
-
-    out.mkdir(parents=True)
-    for name in names:
-        paths = sorted((models / name / split).glob("*.off"))
-        if not paths:
-            raise UsageError(f"{models / name / split}: holds no OFF files")
-        made = 0
-        for path in paths:
-            if made == each:
-                break
-            try:
-                body = toy(path)
-            except MeshError as error:
-                print(f"passed over: {error}")
-                continue
-            stem = path.stem if path.stem.startswith(name) else f"{name}_{path.stem}"
-            body.export(out / f"{stem}.ply")
-            made += 1
-        print(f"{name}: {made}")
-
-
-def stretched(
-    scans: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    count: int = 1000,
-    seed: int = 0,
-) -> None:
-    """Make many things by stretching scans.
-
-    Args:
-        scans: folder of scans, metres.
-        out: folder to write.
-        count: how many things.
-        seed: of the factors that the scans are stretched by.
-    """
-    files = list(scans_in(scans).values())
-    rng = np.random.default_rng(seed)
-    bounds = np.log([LEAST_STRETCH, MOST_STRETCH])
-    with new_folder(out, overwrite=False) as part:
-        for number in progress(range(count), "things"):
-            turn, which = divmod(number, len(files))
-            factors = np.exp(rng.uniform(*bounds, 3)) if turn else np.ones(3)
-            file = files[which]
-            surface = Surface.from_mesh(load_mesh(file, unit="m"), file.stem)
-            vertices = surface.vertices * factors
-            thing = trimesh.Trimesh(vertices, surface.faces, process=False)
-            thing.export(part / f"{turn:02d}_{file.stem}.ply")
-    print(f"{count} things in {out}")
 
 
 if __name__ == "__main__":
     with orderly_end("nothing was written"):
-        tyro.extras.subcommand_cli_from_dict(
-            {"look-alikes": look_alikes, "toys": toys, "stretched": stretched}
-        )
+        tyro.cli(look_alikes)

@@ -1,4 +1,4 @@
-"""What benchmarks share: scans, frames in files, results line by line, shares, tables, progress."""
+"""What studies share: scans, frames in files, results line by line, shares, tables, progress."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from nextview.errors import NextviewError, UsageError
 from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 from nextview.sensing import Frame
 from nextview.types import Float
-from research.extras import extras
 
 SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
 Item = TypeVar("Item")
@@ -61,18 +60,6 @@ def scans_of(folder: Path, names: Sequence[str]) -> list[Path]:
             f"{folder}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
         )
     return [files[name] for name in names]
-
-
-def names_to_stage(folder: Path) -> list[str]:
-    """Names of the scans, NAME.ply, that ``benchmarks.staged_things`` can stage.
-
-    Raises:
-        UsageError: there are none.
-        NextviewError: MuJoCo, which stages them, is not installed.
-    """
-    with extras():
-        import mujoco  # noqa: F401
-    return list(scans_in(folder, (".ply",)))
 
 
 def mesh_of(scan: Path) -> Mesh:

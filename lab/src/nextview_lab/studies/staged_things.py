@@ -1,8 +1,9 @@
-"""Things that lie where things lie, and a stereo camera: a world that imports nothing of nextview.
+"""Things that lie where things lie, and a stereo camera: nothing of nextview's own simulation.
 
 Things fall by the physics of MuJoCo and are seen along its rays. ``STAGES`` holds a function for
 each place, which returns a scene in which a thing may come to rest there; ``at_rest`` lets it fall,
-and ``shots_of`` takes three views around it. ``benchmarks.places`` judges nextview with them.
+and ``shots_of`` takes three views around it. ``nextview_lab.studies.places`` judges nextview with
+them.
 
 The same seed shows the same on every x86-64 processor. Matrix products, decompositions and
 exponentials differ in their last bits between processors, by the kernels that BLAS and NumPy choose
@@ -29,6 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
+
+from nextview_lab.extras import extras
 
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -105,6 +108,13 @@ class Staging:
     stays: Callable[[Any, Any], bool]
 
 
+def physics() -> Any:
+    """MuJoCo, which is imported when something is staged."""
+    with extras():
+        import mujoco
+    return mujoco
+
+
 @cache
 def scan_of(folder: str, name: str) -> trimesh.Trimesh:
     """The scan of a thing, metres."""
@@ -154,7 +164,7 @@ def add_scan(
     scale: float = 1.0,
 ) -> None:
     """Add a scan to a scene, free to fall unless its place and rotation are given."""
-    import mujoco
+    mujoco = physics()
 
     body = spec.worldbody.add_body(name=body_name)
     if pose is None:
@@ -183,7 +193,7 @@ def add_box(
     body: Any, low: Sequence[float], high: Sequence[float], turn: Float | None = None
 ) -> None:
     """Add a box to a body by two opposite corners, (3,), metres, and its rotation, (3, 3)."""
-    import mujoco
+    mujoco = physics()
 
     corners = rounded([low, high])
     box = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX)
@@ -195,7 +205,7 @@ def add_box(
 
 def room(rng: np.random.Generator, table: bool = True) -> Any:
     """A floor and four walls, with a table of uneven planks whose top is near 0."""
-    import mujoco
+    mujoco = physics()
 
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
@@ -272,7 +282,7 @@ def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
 
 def touching(model: Any, data: Any) -> dict[str, float]:
     """What the thing touches, by names of bodies, and the normal force of each, newtons."""
-    import mujoco
+    mujoco = physics()
 
     forces: dict[str, float] = {}
     for number, contact in enumerate(data.contact):
@@ -507,7 +517,7 @@ STAGES: dict[Place, Callable[[Actor, np.random.Generator], Staging]] = {
 
 def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     """Let all things fall: MuJoCo's model and data; None if one still moves after 6 seconds."""
-    import mujoco
+    mujoco = physics()
 
     model = staging.spec.compile()
     data = mujoco.MjData(model)
@@ -534,7 +544,7 @@ def staged(
     """A thing at rest where it should be: MuJoCo's model and data, and how many tries it took; None
     if all were in vain.
     """
-    import mujoco
+    mujoco = physics()
 
     for tries in range(STAGINGS_TRIED):
         staging = STAGES[place](Actor(folder, name, tries), rng)
@@ -658,7 +668,7 @@ def looked(
     """Measured depth, (H, W), steps of which so many make a metre, and the pixels of the thing,
     (H, W).
     """
-    import mujoco
+    mujoco = physics()
 
     rows, columns = np.indices(IMAGE)
     across, down = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]

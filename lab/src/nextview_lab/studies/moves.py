@@ -1,7 +1,6 @@
 """Moves and removals that a scene notices, and its false alarms, on simulated tables.
 
-    python -m benchmarks.moves SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
-        [--masks true network]
+    python -m nextview_lab.studies.moves SCANS OUT.jsonl [--tables 44] [--still 15] [--seed 0]
 
 SCANS is a folder with scans of the things that the memory knows, in metres, by their names. Six of
 them stand on each table, 0 to 8 cm apart; a camera 0.55 to 0.7 m away sees them through the model
@@ -12,8 +11,7 @@ there and one error of its pose; elsewhere it goes on by 25 to 70 degrees. The p
 tables with moves, and of all still ones, have an arm's errors: 3 mm and 0.3 degrees along and about
 each axis, and 0.3 degrees of the vertical.
 
-With ``--masks true`` it is known which thing each pixel shows; with ``--masks network`` the bundled
-network finds the objects.
+It is known which thing each pixel shows: this judges the comparison, not the segmentation.
 
 A move counts if the thing was found in the first frame, and 350 of its pixels show it there and
 would show its old place in the next frame. It is noticed if the next frame reports the object in
@@ -31,14 +29,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
 
 import nextview
-from benchmarks.shared import mesh_of, results, scans_in
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh
@@ -47,10 +44,9 @@ from nextview.scene.scene import Look, Scene
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float
+from nextview_lab.studies.shared import mesh_of, results, scans_in
 from nextview_lab.worlds.scene import footprint, separation
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
-
-Masks = Literal["true", "network"]
 
 MILLIMETRES = (3, 5, 8, 12, 20, 30, 50, 80, 100, 150, None)  # None: taken away
 THINGS = 6
@@ -65,7 +61,7 @@ FRAMES_MOVED = 2  # after a move
 FRAMES_STILL = 4
 GHOST = 0.02  # metres that a confident pose is off where nothing of the name stands
 CENTRE = np.array([0, 0, 0.03])
-FIELDS = ("seed", "masks", "kind", "table")  # by which a line of the results is known
+FIELDS = ("seed", "kind", "table")  # by which a line of the results is known
 
 
 def kind_of(mesh: Mesh) -> int:
@@ -132,13 +128,11 @@ class Watched:
         self,
         system: nextview.System,
         camera: TableCamera,
-        masks: Masks,
         view: np.random.Generator,
         standing: bool,
     ) -> None:
         self.camera = camera
-        truth = None if masks == "network" else self.owners
-        self.scene = Scene(system, segmentation=truth)
+        self.scene = Scene(system, segmentation=self.owners)
         self.view = view
         self.standing = standing
         self.stands_at: Float | None = None
@@ -252,9 +246,8 @@ def _poses_after(watched: Watched, name: str, number: int | None) -> dict[str, A
             continue
         error = np.inf
         if true is not None:
-            error = np.linalg.norm(
-                _centre(vertices[name], one.pose) - _centre(vertices[name], true)
-            )
+            apart = _centre(vertices[name], one.pose) - _centre(vertices[name], true)
+            error = float(np.linalg.norm(apart))
         ghosts += bool(one.confident and error > GHOST)
         if one.number == number and true is not None:
             off = float(error)
@@ -277,20 +270,20 @@ def watch_still(watched: Watched) -> dict[str, Any]:
 def watch(
     system: nextview.System,
     meshes: Sequence[Mesh],
-    asked: tuple[int, Masks, str, int],
+    asked: tuple[int, str, int],
 ) -> dict[str, Any]:
     """Look at one table.
 
     Args:
         system: that knows the things.
         meshes: scans of the things, in metres.
-        asked: values of ``FIELDS``: the seed of all draws, what tells the things, "moved" or
-            "still", and the number of the table.
+        asked: values of ``FIELDS``: the seed of all draws, "moved" or "still", and the number of
+            the table.
 
     Returns:
         What is written of it.
     """
-    seed, masks, kind, number = asked
+    seed, kind, number = asked
     rng = np.random.default_rng([seed, number, kind == "still"])
     by = MILLIMETRES[number // 3 % len(MILLIMETRES)] if kind == "moved" else None
     table, row, after = draw(meshes, number, by, rng)
@@ -299,7 +292,7 @@ def watch(
         sensor = replace(sensor, tilt=0.3, turned=0.3, moved=0.003)
     camera = TableCamera(table, sensor, rng)
     standing = number % 2 == 0
-    watched = Watched(system, camera, masks, rng, standing)
+    watched = Watched(system, camera, rng, standing)
     line = {"millimetres": by, "standing": standing, "errors": sensor.moved > 0}
     if kind == "moved":
         return line | watch_a_move(watched, row, after)
@@ -342,7 +335,6 @@ def main(
     tables: int = 44,
     still: int = 15,
     seed: int = 0,
-    masks: Masks = "true",
     models: str = "ycb",
 ) -> None:
     """Count the moves and removals that a scene notices, and its false alarms.
@@ -358,7 +350,6 @@ def main(
         tables: number of tables with a move.
         still: number of tables without a move.
         seed: of the tables and cameras.
-        masks: whether the objects in a frame are given ("true"), or found by the bundled network.
         models: memory of the things.
 
     Raises:
@@ -366,8 +357,8 @@ def main(
     """
     meshes = [mesh_of(path) for path in scans_in(scans).values()]
     system = nextview.load(models, max_views=20)
-    asked = [(seed, masks, "moved", number) for number in range(tables)]
-    asked += [(seed, masks, "still", number) for number in range(still)]
+    asked = [(seed, "moved", number) for number in range(tables)]
+    asked += [(seed, "still", number) for number in range(still)]
     print(
         summary(results(out, FIELDS, asked, partial(watch, system, meshes), "tables"))
     )

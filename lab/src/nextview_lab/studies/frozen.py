@@ -1,17 +1,16 @@
 """A frozen archive of depth images, rendered by MuJoCo, for ``nextview-lab submit``.
 
-    python -m benchmarks.frozen SCANS nextview-bench-1.0
-    python -m benchmarks.frozen SCANS part --things 4 --draws 1 --grid 3 4
-    python -m benchmarks.frozen SCANS nextview-bench-1.0 --sealed 78
+    python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0
+    python -m nextview_lab.studies.frozen SCANS part --things 4 --draws 1 --grid 3 4
+    python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0 --sealed 78
 
-Each thing lies in some of seven places (``benchmarks/places.py`` says what they are), by the
-physics of ``benchmarks/staged_things.py``, and a stereo camera takes all candidate views of it:
+Each thing lies in some of seven places (``places`` says what they are), by the
+physics of ``staged_things``, and a stereo camera takes all candidate views of it:
 a grid of azimuths and elevations over where a camera can stand. Nothing of nextview's own
 simulation is used. docs/submit.md describes the files and how methods are compared on them.
 
 All that a method is told of the cameras is drawn before the scene, and without knowing the thing
 (``draw_views``); the scene is then placed so that a detector would have aimed the cameras there.
-``benchmarks/poses_alone.py`` tries to name things by these poses.
 
 The same scans, seed and versions of the libraries give the same archive, with the same SHA-256, on
 every x86-64 processor with AVX2. Sealed episodes depend on a secret instead of the seed. The secret
@@ -19,8 +18,7 @@ and their truth are in a file beside the archive, NAME-truth.json, which is not 
 file that is already there gives its secret. A run that was stopped goes on when the same command is
 given again: the manifest is written last, and a folder without it is no archive.
 
-SCANS holds NAME.ply, metres. It runs from the folder of the repository and needs ``mujoco``
-(``research[arm]``).
+SCANS holds NAME.ply, metres. MuJoCo is needed: ``pip install './lab[arm]'``.
 """
 
 from __future__ import annotations
@@ -42,21 +40,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from benchmarks.shared import names_to_stage
-from benchmarks.staged_things import (
-    CAMERA_MATRIX,
-    ENOUGH_PIXELS,
-    WHERE_CAMERAS_STAND,
-    Float,
-    Place,
-    as_told,
-    camera_at,
-    looked,
-    rounded,
-    scan_of,
-    staged,
-    true_pose,
-)
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.files import only_one, read_record, sha256_of, write_record
@@ -73,6 +56,21 @@ from nextview_lab.benchmark.frozen import (
     SealedTruth,
     as_matrix,
     seal,
+)
+from nextview_lab.studies.shared import scans_in
+from nextview_lab.studies.staged_things import (
+    CAMERA_MATRIX,
+    ENOUGH_PIXELS,
+    WHERE_CAMERAS_STAND,
+    Float,
+    Place,
+    as_told,
+    camera_at,
+    looked,
+    rounded,
+    scan_of,
+    staged,
+    true_pose,
 )
 
 FROZEN_PLACES: tuple[Place, ...] = (
@@ -123,7 +121,7 @@ CARD = """\
   world's origin and heading are drawn without knowing the thing. They are aimed at the mean of what
   a first look shows of it, with errors of {aim:g} mm along each axis for the episode and for each
   view. The first view shows {enough} pixels of the thing or more; others may show little or none.
-- **Made by** `python -m benchmarks.frozen` of nextview with {made_with}.
+- **Made by** `python -m nextview_lab.studies.frozen` of nextview with {made_with}.
   The same scans, seed and versions give the same archive on every x86-64 processor with AVX2.
 - **Licences**: `scans/` are of the {source},
   {licence}, as they were given to the script. Images and poses are derived from them, under the
@@ -453,7 +451,7 @@ def main(
         out: folder of the archive; its name is the archive's, such as nextview-bench-1.0.
         how: what it depends on.
     """
-    names = names_to_stage(scans)
+    names = list(scans_in(scans, (".ply",)))
     if not 1 <= how.draws <= len(how.places):
         raise UsageError("each thing is shown in one place or more, and in each once")
     if not 0 <= how.sealed <= len(names) * len(how.places):

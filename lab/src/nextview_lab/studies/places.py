@@ -1,12 +1,13 @@
 """Single taught things where they really lie: on a table, in a shelf, a bin, a bowl, a gripper.
 
-    python -m benchmarks.places SCANS OUT.jsonl [--places shelf stack] [--things 20] [--seed 1]
+    python -m nextview_lab.studies.places SCANS OUT.jsonl [--places shelf stack] [--things 20]
+        [--seed 1]
 
-A judge that shares no code with nextview's own simulation (``benchmarks/staged_things.py``): things
-fall by the physics of MuJoCo, and a stereo camera measures the depth along MuJoCo's rays. It runs
-from the folder of the repository and needs ``mujoco`` (``research[arm]``). SCANS holds the scans of
-the things that the memory knows, in metres, by their names. One episode is one thing in one place,
-and three views around it; a mask tells which pixels are its own.
+A judge that shares no code with nextview's own simulation (``staged_things``): things fall by the
+physics of MuJoCo, and a stereo camera measures the depth along MuJoCo's rays. MuJoCo is needed:
+``pip install './lab[arm]'``. SCANS holds the scans of the things that the memory knows, in metres,
+by their names. One episode is one thing in one place, and three views around it; a mask tells which
+pixels are its own.
 
 The places: ``alone`` on a table of uneven planks, as it falls; ``stood`` there in any orientation
 in which it stays, however unlikely; ``shelf``, in a compartment; ``stack``, on another thing with a
@@ -45,8 +46,12 @@ import tyro
 from scipy.spatial import cKDTree
 
 import nextview
-from benchmarks.shared import markdown, names_to_stage, results, share
-from benchmarks.staged_things import (
+from nextview.cli.exit_status import orderly_end
+from nextview.errors import ObservationError
+from nextview.recognition.belief import Stopping
+from nextview.sensing import Frame, ObservedObject
+from nextview_lab.studies.shared import markdown, results, scans_in, share
+from nextview_lab.studies.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
     PLACES,
@@ -60,10 +65,6 @@ from benchmarks.staged_things import (
     staged,
     true_pose,
 )
-from nextview.cli.exit_status import orderly_end
-from nextview.errors import ObservationError
-from nextview.recognition.belief import Stopping
-from nextview.sensing import Frame, ObservedObject
 
 FIELDS = ("terms", "place", "thing")  # by which a line of the results is known
 
@@ -283,7 +284,11 @@ def main(
         any_orientation: places in which the things are recognised in any orientation.
         workers: processes.
     """
-    names = np.random.default_rng(seed).permutation(names_to_stage(scans)).tolist()
+    names = (
+        np.random.default_rng(seed)
+        .permutation(list(scans_in(scans, (".ply",))))
+        .tolist()
+    )
     terms = Terms(str(scans), models, seed, arm_error, any_orientation)
     asked = [
         (terms, place, name) for name in names[: things or None] for place in places

@@ -1,7 +1,7 @@
 """Taught things recognised by outline and size, and verified by their geometry, at true size.
 
-    python -m benchmarks.verified_things SCANS [--models ycb] [--draws 0 1] [--every 3]
-        [--poses thrown] [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
+    python -m nextview_lab.studies.verified_things SCANS [--models ycb] [--draws 0 1] [--every 3]
+        [--poses thrown] [--any-orientation] [--known even]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
@@ -9,8 +9,7 @@ with an azimuth, views and errors of the sensor of its own. The camera stands fi
 away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned
 (``--poses scanned``), as they fall (``thrown``: on any face of the convex hull, as often as throws
 end on it) or as people stand them up (``stood``: the pose with the highest centre in which at least
-a thousandth of the throws end). With ``--clutter`` so many boxes stand around each, which hide
-parts of it. With ``--any-orientation`` they hang in the middle of a round
+a thousandth of the throws end). With ``--any-orientation`` they hang in the middle of a round
 room, turned at random about all axes, and are recognised as such; the error of the rotation, modulo
 the symmetries of the thing, stands in the place of those of azimuth and resting pose.
 
@@ -20,19 +19,16 @@ belief of 0.97 and more; of the things that are named right the error of the azi
 a symmetry about the vertical; a box counts modulo half a turn), of the place of the centre in the
 camera's frame, ADD-S below a tenth of the diameter in the same frame (Hinterstoisser et al. 2012;
 the definitions of the BOP toolkit), and the share in the right resting pose, or one that looks the
-same; and the milliseconds of one core from a further frame to the decision. The last line says how
-much memory all of this took.
+same; and the milliseconds of one core from a further frame to the decision.
 
-With ``--save`` each draw that is done is kept in a folder, and not run again. With ``--known even``
-or ``odd`` every other thing is known, as if the others had been removed from the memory, and all
-are shown: printed is how many are called unknown, by a p-value below 0.02.
+With ``--known even`` or ``odd`` every other thing is known, as if the others had been removed from
+the memory, and all are shown: printed is how many are called unknown, by a p-value below 0.02.
 """
 
 from __future__ import annotations
 
-import resource
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -44,16 +40,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from benchmarks.shared import markdown, progress, scans_of
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import ResultsError, UsageError
-from nextview.files import command, read_record, write_record
+from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.recognition.model_card import Symmetry
-from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
@@ -62,6 +55,7 @@ from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float
+from nextview_lab.studies.shared import markdown, progress, scans_of
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 Poses = Literal["scanned", "thrown", "stood"]
@@ -105,14 +99,12 @@ class Setting:
         sensor: what the views are taken with.
         views: how many views are taken.
         poses: how they rest: as they were scanned, as they fall, or as people stand them up.
-        clutter: how many boxes stand around a thing.
         any_orientation: whether they hang in a room, turned at random about all axes.
     """
 
     sensor: str
     views: int
     poses: Poses
-    clutter: int
     any_orientation: bool
 
 
@@ -144,8 +136,6 @@ class Outcome:
         answer: the thing believed most.
         confidence: belief in it.
         seconds: of CPU from the last frame to the decision.
-        residual: how badly the likeliest hypothesis explains the views.
-        explained: share of the thing's pixels that it explains.
         p_value: share of known things that are explained as badly; None if the memory does not say.
         azimuth: error, degrees; None for a thing with every symmetry, and in another resting pose
             that looks the same, too.
@@ -162,8 +152,6 @@ class Outcome:
     answer: int
     confidence: float
     seconds: float
-    residual: float
-    explained: float
     p_value: float | None
     azimuth: float | None
     rotation: float | None
@@ -176,29 +164,6 @@ class Outcome:
     def right(self) -> bool:
         """Whether the thing is named right."""
         return self.answer == self.thing
-
-
-@dataclass(frozen=True)
-class Draw:
-    """What was found in one draw.
-
-    Attributes:
-        setting: how the things were shown.
-        models: memory of the things.
-        known: which of them were taught.
-        every: of how many things one was shown.
-        views: after how many views they were judged.
-        outcomes: of all things, after each number of views.
-        command: that made it.
-    """
-
-    setting: Setting
-    models: str
-    known: Literal["all", "even", "odd"]
-    every: int
-    views: tuple[int, ...]
-    outcomes: tuple[Outcome, ...]
-    command: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +227,8 @@ def symmetry_order(surface: Surface, points: Float) -> int:
     """How many azimuths a thing looks the same from; 0 if all of them."""
     centred = points - surface.centre
     tree = cKDTree(centred)
-    apart = tree.query(centred, k=2)[0][:, 1].mean() / 2  # of the points themselves
+    nearest = np.asarray(tree.query(centred, k=2)[0])
+    apart = nearest[:, 1].mean() / 2  # of the points themselves
     same = []
     for order in ORDERS:
         turn = rotation_z(2 * np.pi / order)
@@ -279,7 +245,6 @@ def shown(
     thing: int,
     draw: int,
     setting: Setting,
-    held: Float | None = None,
 ) -> Episode:
     """Look at a thing from random viewpoints through a sensor, at its true size.
 
@@ -288,7 +253,6 @@ def shown(
         thing: number of the one that is shown.
         draw: number of the draw.
         setting: how it is shown.
-        held: rotation of a thing that hangs in a room, (3, 3); drawn if not given.
     """
     rng = np.random.default_rng([thing, draw])
     turn = rotation_z(rng.uniform(0, 2 * np.pi))
@@ -298,16 +262,9 @@ def shown(
             mesh, setting.poses, np.random.default_rng([thing, draw, 1])
         )
     if setting.any_orientation:
-        drawn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
-        turn = drawn if held is None else held
+        turn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
     standing = rotated(mesh, turn)
     around = None
-    if setting.clutter:
-        around = boxes_around(
-            standing.vertices,
-            setting.clutter,
-            np.random.default_rng([thing, draw, 2]),
-        )
     if setting.any_orientation:
         around = room_around(standing)
     camera = SensedCamera(
@@ -322,6 +279,7 @@ def shown(
     for view in rng.permutation(len(SPHERE)):
         observation = camera.observe(SPHERE.poses[view])
         if observation.seen and observation.scene is not None:
+            assert camera.true_pose is not None
             observations.append(observation)
             cameras.append(camera.true_pose)
         if len(observations) == setting.views:
@@ -384,8 +342,6 @@ def judged(
         answer=answer,
         confidence=float(found.belief.max()),
         seconds=seconds,
-        residual=found.residual,
-        explained=float(found.explained[0].mean()),
         p_value=things.p_value(episode.observations[:views], found),
         **errors,
     )
@@ -427,10 +383,8 @@ def pose_errors(
     true_in_camera = episode.in_cameras[views - 1]
 
     centre = np.append(surface.centre, 1)
-    apart = (
-        cKDTree(moved(points, true_in_camera)).query(moved(points, in_camera))[0].mean()
-    )
-    add_s = apart / surface.diameter
+    tree = cKDTree(moved(points, true_in_camera))
+    add_s = np.mean(tree.query(moved(points, in_camera))[0]) / surface.diameter
     turn = pose[:3, :3] @ episode.true_pose[:3, :3].T
     azimuth = np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
     order = taught.orders[episode.thing]
@@ -477,8 +431,8 @@ def rotation_error(
         ]
         same = [each * turn for each in same for turn in turns] or same
     if free:
-        cosines = [free[0] @ each.apply(free[0]) for each in same]
-        return float(np.degrees(np.arccos(min(max(cosines), 1.0))))
+        cosine = max(float(free[0] @ each.apply(free[0])) for each in same)
+        return float(np.degrees(np.arccos(min(cosine, 1.0))))
     return float(np.degrees(min(each.magnitude() for each in same)))
 
 
@@ -548,21 +502,6 @@ def median_and_most(errors: Sequence[float | None]) -> str:
     )
 
 
-def mistakes(
-    taught: Taught,
-    outcomes: Sequence[Outcome],
-    views: Sequence[int],
-) -> Iterator[str]:
-    """What was taken for what."""
-    for k in views:
-        wrong = [o for o in outcomes if o.views == k and not o.right]
-        pairs = [
-            f"{taught.names[o.thing]} for {taught.names[o.answer]} ({o.confidence:.2f})"
-            for o in wrong
-        ]
-        yield f"after {k}: {', '.join(pairs) or 'none'}"
-
-
 def unknown_table(
     outcomes: Sequence[Outcome],
     known: NDArray[np.int64],
@@ -594,16 +533,6 @@ def unknown(outcome: Outcome) -> bool:
     return outcome.p_value is not None and outcome.p_value < REJECTED
 
 
-def kept(file: Path, asked: Draw) -> list[Outcome]:
-    """The outcomes of a draw that an earlier run kept; ResultsError if it asked for others."""
-    found = read_record(file, Draw, "what was found in a draw", ResultsError)
-    if replace(found, outcomes=(), command=asked.command) != asked:
-        raise ResultsError(
-            f"{file}: is of {found.command!r}; give another folder to --save"
-        )
-    return list(found.outcomes)
-
-
 def main(
     scans: tyro.conf.Positional[Path],
     models: str = "ycb",
@@ -613,9 +542,7 @@ def main(
     every: int = 1,
     known: Literal["all", "even", "odd"] = "all",
     poses: Poses = "scanned",
-    clutter: int = 0,
     any_orientation: bool = False,
-    save: Path | None = None,
 ) -> None:
     """Show the things, recognise them, and print the tables.
 
@@ -628,48 +555,26 @@ def main(
         every: show every so many things only.
         known: which of the things are taught; all are shown.
         poses: show things as they were scanned, as they fall, or as people stand them up.
-        clutter: number of boxes around each thing.
         any_orientation: show things that hang in a room, turned at random about all axes.
-        save: folder in which the draws that are done are kept, and looked for.
     """
     taught = Taught.load(models, scans)
-    setting = Setting(sensor, max(views), poses, clutter, any_orientation)
+    setting = Setting(sensor, max(views), poses, any_orientation)
     everything = np.arange(len(taught.names))
     some = {"all": everything, "even": everything[::2], "odd": everything[1::2]}[known]
     things = taught.things(some)
     if any_orientation:
         things = things.in_any_orientation()
 
-    outcomes: list[list[Outcome]] = []
+    outcomes: list[Outcome] = []
     for draw in draws:
-        file = None if save is None else save / f"draw-{draw}.json"
-        asked = Draw(setting, models, known, every, views, (), command())
-        if file is not None and file.exists():
-            outcomes.append(kept(file, asked))
-            continue
-
-        here: list[Outcome] = []
         for thing in progress(everything[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
-            here += [judged(things, taught, some, episode, k) for k in counts]
-        outcomes.append(here)
-        if file is not None:
-            write_record(file, replace(asked, outcomes=tuple(here)))
-
-    together = [outcome for draw in outcomes for outcome in draw]
+            outcomes += [judged(things, taught, some, episode, k) for k in counts]
     if known == "all":
-        print(
-            table(together, views, any_orientation),
-            "",
-            *mistakes(taught, together, views),
-            sep="\n",
-        )
+        print(table(outcomes, views, any_orientation))
     else:
-        print(unknown_table(together, some, views))
-    print(
-        f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB"
-    )
+        print(unknown_table(outcomes, some, views))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Poses of machine parts that are nearly symmetric: how often a confident one is wrong.
 
-    python -m benchmarks.machine_parts PARTS            # writes the parts as meshes, millimetres
+    python -m nextview_lab.studies.machine_parts PARTS      # writes the parts, millimetres
     nextview learn PARTS taught --unit mm
-    python -m benchmarks.machine_parts PARTS --models taught [--draws 20]
+    python -m nextview_lab.studies.machine_parts PARTS --models taught [--draws 20]
 
 The parts are flanges with bolt holes, a gear with a keyway, L brackets of 20 mm, a die, a hex nut,
 a hex bolt and a shaft with a flat, all exact. Each is shown as it falls (on any face of the convex
@@ -25,7 +25,6 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 import nextview
-from benchmarks.shared import markdown, progress
 from nextview.cli.exit_status import orderly_end
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.resting import rotated, stable_poses
@@ -34,7 +33,9 @@ from nextview.recognition.model_card import Symmetry
 from nextview.session.result import Recognition
 from nextview.session.system import System
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.things.recogniser import VerifiedRecogniser
 from nextview.types import Float
+from nextview_lab.studies.shared import markdown, progress
 from nextview_lab.worlds.solids import Solid, extruded, joined, moved, ring_points
 
 SPHERE = ViewSphere((18.0, 36.0, 54.0, 72.0), 8)
@@ -192,7 +193,10 @@ def main(
         return
 
     system = nextview.load(models, max_views=1, viewpoints="40")
-    about = {thing.name: thing for thing in system.models.recogniser.card.memory.things}
+    recogniser = system.models.recogniser
+    assert isinstance(recogniser, VerifiedRecogniser)
+    assert recogniser.card.memory is not None
+    about = {thing.name: thing for thing in recogniser.card.memory.things}
     rows = []
     sure_of_all = wrong_of_all = 0
     for thing, (name, part) in enumerate(progress(known.items(), "parts", len(known))):
