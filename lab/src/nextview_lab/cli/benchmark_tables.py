@@ -110,7 +110,8 @@ def print_compared(found: ComparedTables) -> None:
             name: replace(column, measures=column.measures[:1])
             for name, column in each.narrow().items()
         }
-        print_tables([written(found, each, columns, stars)])
+        text = written(found, each, columns, stars)
+        print_tables([replace(text, title=f"{each.title}; {each.about}")])
     terminal.print(
         f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT}"
     )
