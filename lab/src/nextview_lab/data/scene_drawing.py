@@ -359,7 +359,8 @@ def draw_scene(
         metres = life_radius(mesh, label, rng)
         small = label in ON_TABLES or (mesh.metres or np.inf) < HAND_SIZED
         if meshes.unit is None:
-            others = [file for file in others if _is_furniture(meshes, file, small)]
+            known = set() if small else set(LIFE_SIZES) - set(ON_TABLES)
+            others = [file for file in others if meshes.labels[file] in known]
         elif small:
             poses = resting_poses(mesh)
             turn = poses[rng.integers(len(poses))]
@@ -414,12 +415,6 @@ def draw_scene(
         f"{meshes.folder / target}: no layout of {SCENE_LAYOUTS_TRIED} lets"
         f" {CLUTTER_LEVELS.get(level, LEAST_SHOWN):.0%} of it show"
     )
-
-
-def _is_furniture(meshes: Meshes, file: str, small: bool) -> bool:
-    """Return True if a mesh of a known class may stand on a floor; none lies on a table."""
-    label = meshes.labels[file]
-    return not small and label in LIFE_SIZES and label not in ON_TABLES
 
 
 def _on_table(level: str, rng: np.random.Generator) -> _Stage:
