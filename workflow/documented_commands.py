@@ -786,10 +786,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
-    **dict.fromkeys(
-        ("picking.gif", "scenes.png"),
-        "drawn by an earlier version, whose script is gone",
-    ),
+    "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 
 
