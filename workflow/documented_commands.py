@@ -477,12 +477,8 @@ def make_rig(folder: Path) -> None:
 FILES = {
     "mine.py": (
         """
-from nextview_lab.data.measures import Measure
-
 def clutter(view):
     return float(view.seen.mean())
-
-uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
 """
     ),
     "spread.py": (
