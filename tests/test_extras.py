@@ -21,12 +21,11 @@ from packaging.utils import canonicalize_name
 
 from nextview.checks import EXTRAS
 from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
-from research.extras import EXTRAS as EXTRAS_OF_RESEARCH
 
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "lab/src").rglob("*.py")])
 SCRIPTS = [
     path
-    for folder in ("benchmarks", "examples", "research", "workflow")
+    for folder in ("examples", "lab/src/nextview_lab/studies", "workflow")
     for path in sorted((ROOT / folder).glob("*.py"))
     if '__name__ == "__main__"' in path.read_text()
 ]
@@ -129,10 +128,10 @@ def test_a_wrong_import_is_found(code, wrong):
     )
 
 
-@pytest.mark.parametrize("folder", [".", "lab", "research"])
+@pytest.mark.parametrize("folder", [".", "lab"])
 def test_an_extra_contains_the_package_that_its_error_names(folder):
     (name,) = [name for name, (place, _) in PROJECTS.items() if place == folder]
-    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB, "research": EXTRAS_OF_RESEARCH}
+    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB}
     for extra, packages in declared[folder].items():
         asked = requirements_of({name: [extra]}).values()
         texts = [text for of_project in asked for text in of_project]
@@ -218,12 +217,8 @@ for script in scripts:
             sys.argv = [script, *options.split()]
             sys.path.insert(0, os.path.dirname(script))
             status = 0
-            package, _, name = script.removesuffix(".py").partition("/")
             try:
-                if package in ("benchmarks", "research"):
-                    runpy.run_module(f"{package}.{name}", None, "__main__", True)
-                else:
-                    runpy.run_path(script, run_name="__main__")
+                runpy.run_path(script, run_name="__main__")
             except SystemExit as ended:
                 status = ended.code or 0
             except BaseException:
@@ -255,22 +250,11 @@ def test_the_help_of_every_script_shows_in_the_base_installation(base):
     for name, (status, said) in ended.items():
         assert status == 0, (name, said)
         assert "usage: " in said, name
-    assert "pip install 'nextview-lab[benchmark]'" in ended["benchmarks/scenes.py"][1]
-    assert "pip install './research[film]'" in ended["research/film.py"][1]
+    assert "pip install 'nextview-lab[benchmark]'" in ended["workflow/results.py"][1]
 
 
 def test_a_script_without_its_extra_prints_installation_advice(base):
-    needing = {
-        "benchmarks/scenes.py": "nextview-lab[benchmark]",
-        "research/example_maps.py": "nextview-lab[benchmark]",
-        "research/film.py": "./research[film]",
-        "research/measure_study.py": "nextview-lab[benchmark]",
-        "research/point_pairs.py": "./research[ppf]",
-        "research/thing_features.py": "nextview-lab[train]",
-        "research/train_agent.py": "./research[rl]",
-        "research/train_grid.py": "nextview-lab[train]",
-    }
-    for name, (status, said) in runs(base, "", list(needing)).items():
-        assert status == 2, (name, said)
-        assert said.endswith(f": pip install '{needing[name]}'\n")
-        assert said.count("\n") == 1
+    ((status, said),) = runs(base, "", ["workflow/results.py"]).values()
+    assert status == 2
+    assert said.endswith(": pip install 'nextview-lab[benchmark]'\n")
+    assert said.count("\n") == 1

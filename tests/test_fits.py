@@ -8,23 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pipeline import change_card, make_recogniser, some_predictions, train_predictions
-from scipy.special import log_softmax, softmax
+from scipy.special import softmax
 from scipy.stats import binomtest
 
 from nextview import SimulatedCamera
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
+from nextview.errors import DatasetError, ModelError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
-from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
-from nextview.policies.registry import make_policy
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import values_of
 from nextview.teaching.view_features import embeddings
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.splits import divide
 from nextview_lab.errors import PredictionsError
 from nextview_lab.training import card_fits as calibration
 from nextview_lab.training.card_fits import (
@@ -37,13 +34,6 @@ from nextview_lab.training.card_fits import (
 )
 from nextview_lab.training.fitting_set import blind_walks, card_to_fit
 from nextview_lab.training.unknown import fit_novelty, fit_unknown
-from research.fit_policies import (
-    fit_class_table,
-    fit_policies,
-    fit_ring,
-    fit_sequence,
-    fitting_set,
-)
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
@@ -213,122 +203,6 @@ def test_a_shape_that_was_copied_counts_once():
     )
     # which of two labels is right is not for us
     assert relabelled.deduplicate().names == (*p.names, "copy8")
-    np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
-    drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
-    assert any(p.logits[0] in data.logits for data in drawn)
-    assert all(
-        sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn
-    )
-    assert not any(
-        (row == p.logits[0] + 1).all() for data in drawn for row in data.logits
-    )
-
-
-def test_it_is_fitted_to_the_objects_that_validate():
-    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
-    _, validation = divide(p.labels, p.depth_entropy, 0.2, 3)
-    data = fitting_set(p, 0.2, 3)
-    np.testing.assert_array_equal(data.logits, p.logits[validation])
-    assert np.bincount(data.labels).tolist() == [4, 4, 4]
-    assert len(fitting_set(p, 1.0, 3)) == 60
-
-
-# Tables
-
-
-def telling(
-    sphere: ViewSphere,
-    rings_of_class: list[list[int]],
-    n: int = 40,
-    seed: int = 0,
-) -> Predictions:
-    """Every view says little of the class, but those on some rings, which depend on the class,
-    say it loudly.
-    """
-    rng = np.random.default_rng(seed)
-    c = len(rings_of_class)
-    labels = np.arange(n) % c
-    logits = rng.normal(size=(n, len(sphere), c)) * 0.1
-    logits[np.arange(n), :, labels] += 0.3
-    for i, label in enumerate(labels):
-        loud = np.isin(sphere.ring, rings_of_class[label])
-        logits[i, loud, label] += 3
-    return train_predictions(
-        logits.astype(np.float32),
-        labels,
-        sphere,
-        tuple("abcdef"[:c]),
-    )
-
-
-@pytest.mark.parametrize("scope", ["global", "local"])
-def test_what_tells_most_is_found(scope):
-    data = telling(SMALL, [[2], [2]])
-    assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
-    assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
-    by_class = fit_class_table(
-        telling(SMALL, [[0], [2]]),
-        4,
-        0.0,
-        PLAIN_SUM,
-        np.random.default_rng(0),
-    )
-    assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
-    assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
-    shared = fit_class_table(
-        telling(SMALL, [[0], [2]]),
-        4,
-        1e9,
-        PLAIN_SUM,
-        np.random.default_rng(0),
-    )
-    np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
-
-
-@pytest.mark.parametrize("scope", ["global", "local"])
-def test_each_move_of_a_sequence_is_the_best_there_is(scope):
-    rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
-    labels = np.array([0, 0, 0, 1, 2])
-    data = train_predictions(
-        rng.normal(size=(5, len(SMALL), 3)).astype(np.float32),
-        labels,
-        SMALL,
-        ("a", "b", "c"),
-    )
-    travel_weight = 0.05
-    moves = fit_sequence(data, scope, 2, calibration, travel_weight)
-
-    def turned(view: int, steps: int) -> int:
-        ring, azimuth = divmod(view, 4)
-        return ring * 4 + (azimuth + steps) % 4
-
-    def value(path: list[int]) -> float:
-        by_class = {0: [], 1: [], 2: []}
-        for i, label in enumerate(labels):
-            for steps in range(4):
-                total = (
-                    data.logits[i, [turned(v, steps) for v in path]]
-                    .astype(float)
-                    .sum(0)
-                )
-                by_class[label].append(
-                    log_softmax(total / calibration.temperature_after(len(path)))[label]
-                )
-        return np.mean([np.mean(values) for values in by_class.values()])
-
-    for ring in range(3):
-        path = [ring * 4]
-        for move in moves[ring]:
-            reachable = (
-                range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
-            )
-            left = [v for v in reachable if v not in path]
-            values = {
-                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v]
-                for v in left
-            }
-            path.append(int(cells_from(SMALL)[path[-1], move]))
-            assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
 
 
 # The stages
@@ -440,44 +314,6 @@ def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(
         with pytest.raises(PredictionsError, match=sentence):
             fit_calibration(path, card)
     assert json.loads(card.read_text()) == whole | {"note": "changed"}
-
-
-def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_path):
-    _, path = training_predictions
-    made = fit_policies(path, tmp_path / "learned", length=3)
-    assert sorted(c.stem for c in made.cards) == [
-        "class-table",
-        "class-table-local",
-        "class-table-near",
-        "fixed-ring",
-        "fixed-ring-local",
-        "fixed-sequence",
-        "fixed-sequence-local",
-        "fixed-sequence-near",
-    ]
-    data = fitting_set(Predictions.load(path), 0.1, 0)
-    fitted = fit_temperature(data, np.random.default_rng([0, 0]), walks=1 + 8000 // 9)
-    values = fit_class_table(data, 5, 20.0, fitted, np.random.default_rng(0))
-    for card in made.cards:
-        policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
-        if isinstance(policy, ClassTable):
-            travel_weight = 0.01 if card.stem.endswith("near") else 0.0
-            for ring, azimuth in [(0, 0), (2, 5)]:
-                view = 8 * ring + azimuth
-                paid = (
-                    values[:, ring, cells_to(SPHERE)[view]]
-                    - travel_weight * SPHERE.travel[view]
-                )
-                here = policy.values[:, ring, cells_to(SPHERE)[view]]
-                np.testing.assert_allclose(here, paid, atol=1e-5)
-    foreign = tmp_path / "learned/fixed-ring-local.json"
-    for card in made.cards:
-        card.unlink()
-    foreign.write_text("of somebody else")
-    with pytest.raises(ResultsError, match="exists"):
-        fit_policies(path, tmp_path / "learned", length=3)
-    assert [p.name for p in foreign.parent.iterdir()] == [foreign.name]
-    assert foreign.read_text() == "of somebody else"
 
 
 def test_valley_classes_are_those_that_gain_by_the_valley():

@@ -37,7 +37,7 @@ def test_the_examples_of_a_page_run(page):
         )
     finally:
         sys.modules.pop("spread", None)
-    assert tried > 10
+    assert tried >= 10
     assert failed == 0
 
 
@@ -68,11 +68,7 @@ def test_the_grasp_point_is_at_the_handle(monkeypatch, capsys):
 
 
 def test_the_tests_named_on_pages_exist():
-    tests = [
-        path
-        for folder in ("tests", "research/tests")
-        for path in (ROOT / folder).glob("test_*.py")
-    ]
+    tests = list((ROOT / "tests").glob("test_*.py"))
     names = {
         name
         for path in tests
@@ -80,7 +76,7 @@ def test_the_tests_named_on_pages_exist():
     }
     for page in (ROOT / "docs").glob("*.md"):
         text = page.read_text()
-        for path in re.findall(r"`((?:research/)?tests/\w+\.py)`", text):
+        for path in re.findall(r"`(tests/\w+\.py)`", text):
             assert (ROOT / path).exists(), (page.name, path)
         column = re.findall(r"\| `(\w+)` \|$", text, re.M) if "| test |" in text else []
         for part in column:
@@ -170,7 +166,7 @@ def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
         for page in documented_commands.PAGES
         for step in documented_commands.steps_of(page)
     ]
-    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {
+    assert {"README.md", "docs/picking.md", "docs/training.md"} <= {
         step.page for step in steps
     }
     for pattern in documented_commands.NOT_RUN:
@@ -276,7 +272,6 @@ def test_each_page_names_what_its_commands_need():
                 name = {
                     "nextview": r"(nextview|\.)",
                     "nextview-lab": r"(nextview-lab|\./lab)",
-                    "research": r"\./research",
                 }[project]
                 said = re.search(
                     name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""),

@@ -7,13 +7,11 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-import pandas as pd
 import pytest
 import trimesh
 from msgspec.structs import replace as replace_record
 from programs import main
 
-from benchmarks import joined_things
 from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import UNITS, load_mesh
@@ -768,37 +766,3 @@ def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings
     assert len(bodies) == 2 * (1 + 3)
     assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in bodies} == {*columns}
     assert "| my_module:Best_50% |" in compared_markdown(tables)
-
-
-def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsys):
-    again = shutil.copytree(results, tmp_path / "again")
-    _, alone = joined_things.read_runs([results])
-    measures, both = joined_things.read_runs([results, again])
-    assert set(measures["run"]) == {results.name, "again"}
-    # Twice as many tests: the least p-value is multiplied by twice as much, up to 1.
-    least = alone["p"].min()
-    count = alone["p"].notna().sum()
-    assert both["p_holm"].min() == pytest.approx(min(1, 2 * count * least))
-
-    joined_things.main([results, again])
-    lines = capsys.readouterr().out.splitlines()
-    rows = [line.split(" | ")[1] for line in lines if line.startswith("| ")]
-    assert rows[1:] == ["random, the reference", "geometry"] * 2
-    with pytest.raises(UsageError, match="holds no results"):
-        joined_things.main([tmp_path / "nothing"])
-
-
-def test_runs_that_agree_tell_more_together_than_each_alone():
-    rows = [
-        {"run": run, "policy": policy, "measure": "accuracy", "views": 2}
-        | {"difference": gain, "p": p, "families": 50}
-        for run, p in (("one", 0.05), ("two", 0.05))
-        for policy, gain in (
-            ("better", 0.06),
-            ("mixed", 0.06 if run == "one" else -0.06),
-        )
-    ]
-    better, mixed = joined_things.over_all(pd.DataFrame(rows)).splitlines()
-    # two normal deviates of 1.96: their sum over sqrt(2) is 2.77
-    assert better == "better: +6.0 points after 2 views, mean of 2 runs, p = 0.0056"
-    assert mixed == "mixed: +0.0 points after 2 views, mean of 2 runs, p = 1"

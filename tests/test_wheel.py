@@ -51,6 +51,10 @@ EXAMPLES = {
     ),
     ("nextview", "dev"): "import hypothesis, mypy, pytest, ruff, skimage",
     ("nextview-lab", ""): "import nextview_lab.data.rendering, nextview_lab.data.store",
+    ("nextview-lab", "arm"): (
+        "from nextview_lab.studies.staged_things import physics; physics();"
+        " import gymnasium_robotics, mink"
+    ),
     ("nextview-lab", "benchmark"): (
         "from nextview_lab.benchmark.classes import benchmark_classes;"
         " from nextview_lab.benchmark.report import report"
@@ -138,9 +142,7 @@ HOLES = {
 """Versions with known holes, the last before each was mended."""
 
 
-@pytest.mark.parametrize(
-    "project", ["pyproject.toml", "lab/pyproject.toml", "research/pyproject.toml"]
-)
+@pytest.mark.parametrize("project", ["pyproject.toml", "lab/pyproject.toml"])
 def test_no_version_with_a_known_hole_is_asked_for(project):
     table = tomllib.loads((ROOT / project).read_text())
     parts = table["project"].get("optional-dependencies", {}).values()
