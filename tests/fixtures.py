@@ -7,22 +7,16 @@ without deadlines (slow is not wrong); tests that take minutes run where NEXTVIE
 
 import os
 import shutil
-import sys
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
+import factories
 import kept_results
-import numpy as np
-import pipeline
 import pytest
-import small_tables
 import trimesh
-from bop_datasets import write_dataset
+from factories import meshes_of
 from filelock import FileLock
-from frozen_archives import write_archive
 from hypothesis import settings
-from small_tables import meshes_of
 
 import nextview
 from nextview import runtime
@@ -34,8 +28,6 @@ from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
 from nextview.things import view_templates
 from nextview.things.memory import open_memory
-from nextview_lab.benchmark import table_runs
-from nextview_lab.data import room_drawing
 
 LONG = (
     "test_workflow.py",
@@ -120,9 +112,7 @@ def kept_things(shared):
             (learn_module, "teach", kept_results.of_teach),
             (learn_module, "features_of", kept_results.of_features),
             (learn_module, "show", kept_results.of_show),
-            (small_tables, "resting_poses", kept_results.of_mesh),
-            (table_runs, "resting_poses", kept_results.of_mesh),
-            (room_drawing, "resting_poses", kept_results.of_mesh),
+            (factories, "resting_poses", kept_results.of_mesh),
         ):
             function = getattr(module, name)
             kept = kept_results.Kept(function, folder, given)
@@ -149,20 +139,6 @@ def kept_networks():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def kept_operators():
-    """Read the operators that torch exports once in a process: that takes half of an export."""
-    if "torch" not in sys.modules:  # no test file imports it
-        yield
-        return
-    from torch.onnx._internal.exporter._registration import ONNXRegistry
-
-    kept = staticmethod(cache(ONNXRegistry.from_torchlib))
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(ONNXRegistry, "from_torchlib", kept)
-        yield
-
-
 @pytest.fixture
 def taught_afresh(monkeypatch):
     """Teach and test things as if for the first time, where a test asks for the same twice."""
@@ -176,8 +152,8 @@ def scans(shared) -> Path:
     """Three meshes in one folder, centimetres."""
 
     def make(folder: Path) -> None:
-        for name in pipeline.FURNITURE:
-            pipeline.write_off(folder / f"{name}.off", sample_mesh(name))
+        for name in factories.FURNITURE:
+            factories.write_off(folder / f"{name}.off", sample_mesh(name))
 
     return shared("scans", make)
 
@@ -195,23 +171,13 @@ def taught(shared, scans) -> Path:
 
 
 @pytest.fixture(scope="session")
-def shown(shared, scans, taught) -> Path:
-    """They, seen through a sensor: views.zarr, and what the models say of it, predictions.npz."""
-
-    def make(folder: Path) -> None:
-        pipeline.show_taught(scans, taught, folder)
-
-    return shared("shown", make)
-
-
-@pytest.fixture(scope="session")
 def knobs(shared) -> Path:
     """Three things in metres: a box, the same with a knob, and a can."""
 
     def make(folder: Path) -> None:
-        body = pipeline.box((0.08, 0.08, 0.1), (0, 0, 0.05))
+        body = factories.box((0.08, 0.08, 0.1), (0, 0, 0.05))
         body.export(folder / "plain.ply")
-        knob = pipeline.box((0.02, 0.02, 0.02), (0.05, 0, 0.06))
+        knob = factories.box((0.02, 0.02, 0.02), (0.05, 0, 0.06))
         trimesh.util.concatenate([body, knob]).export(folder / "knob.ply")
         trimesh.creation.cylinder(0.04, 0.12).export(folder / "can.ply")
 
@@ -239,7 +205,7 @@ def mixed_memory(shared, knobs_memory) -> Path:
         mine = folder / "mine"
         learn(mine, mine, remove=("can", "plain"), workers=0)
         (folder / "unsized").mkdir()
-        block = pipeline.box((3, 2, 1), (0, 0, 0.5))
+        block = factories.box((3, 2, 1), (0, 0, 0.5))
         block.export(folder / "unsized" / "block.ply")
         learn(folder / "unsized", mine, add=True, upright=True, workers=0)
 
@@ -274,34 +240,11 @@ def household(shared) -> Path:
 
 
 @pytest.fixture(scope="session")
-def bop(shared) -> Path:
-    """A dataset of two images in the layout of BOP."""
-    return shared("bop", write_dataset)
-
-
-@pytest.fixture(scope="session")
-def archive(shared) -> Path:
-    """A frozen archive of two episodes."""
-    return shared("archive", write_archive)
-
-
-@pytest.fixture(scope="session")
 def furniture(shared) -> Path:
     """Meshes of boxes: FURNITURE's 3 classes, 4 for training and 2 for tests of each,
     CLASS/SPLIT/CLASS_K.off.
     """
-    return shared("furniture", pipeline.write_furniture)
-
-
-@pytest.fixture(scope="session")
-def views(shared, furniture) -> Path:
-    """A store of ``furniture``: 18 objects, 40 views, 32 pixels, with depth-entropy."""
-    from nextview_lab.data.rendering import render
-
-    def make(folder: Path) -> None:
-        list(render(furniture, folder / "views.zarr", pipeline.SPHERE, 32, workers=0))
-
-    return shared("views", make) / "views.zarr"
+    return shared("furniture", factories.write_furniture)
 
 
 @pytest.fixture(scope="session")
@@ -311,16 +254,16 @@ def models(shared) -> Path:
     """
 
     def make(folder: Path) -> None:
-        card = pipeline.make_recogniser(
+        card = factories.make_recogniser(
             folder,
-            pipeline.FURNITURE,
+            factories.FURNITURE,
             size=32,
             azimuth_bins=8,
         )
         calibration = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
-        held_out = [f"{label}_{k}" for label in pipeline.FURNITURE for k in (2, 3)]
-        pipeline.change_card(card, calibration=calibration, held_out=held_out)
-        pipeline.make_map_network(folder, valleys=("table",))
+        held_out = [f"{label}_{k}" for label in factories.FURNITURE for k in (2, 3)]
+        factories.change_card(card, calibration=calibration, held_out=held_out)
+        factories.make_map_network(folder, valleys=("table",))
 
     return shared("models", make)
 
@@ -331,86 +274,3 @@ def tiny(models):
     recogniser = NetworkRecogniser(models / "tiny.json")
     recogniser.calibration = Calibration(0.8, 1.0, bin_correlation=1.5)
     return Models(recogniser, {"lem": MapNetwork(models / "tiny-lem.json")})
-
-
-@pytest.fixture(scope="session")
-def predictions(shared, views, models) -> Path:
-    """The predictions of ``models`` for all of ``views``, train and test."""
-    from nextview.recognition.model_card import read_card
-    from nextview_lab.data.predicting import predict
-
-    def make(folder: Path) -> None:
-        recogniser, lem = (
-            read_card(models / name) for name in ("tiny.json", "tiny-lem.json")
-        )
-        list(
-            predict(
-                views,
-                folder / "predictions.npz",
-                recogniser,
-                {"lem": lem},
-                workers=0,
-            )
-        )
-
-    return shared("predictions", make) / "predictions.npz"
-
-
-@pytest.fixture(scope="session")
-def results(shared) -> Path:
-    """A benchmark of ``some_predictions(40, seed=2)``: p.npz and the folder out.
-
-    Two objects are conflicting.
-    """
-    pytest.importorskip("pandas")
-    from dataclasses import replace
-
-    def make(folder: Path) -> None:
-        conflicting = np.isin(np.arange(40), (3, 8))
-        replace(pipeline.some_predictions(40, seed=2), conflicting=conflicting).save(
-            folder / "p.npz"
-        )
-        pipeline.benchmark(
-            folder / "p.npz",
-            folder / "out",
-            thresholds=(0.7, 0.9),
-            runs=3,
-            samples=200,
-        )
-
-    return shared("results", make)
-
-
-@pytest.fixture(scope="session")
-def cluttered(shared, furniture) -> Path:
-    """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each
-    level.
-    """
-    from nextview_lab.data.scene_drawing import draw_scenes
-
-    def make(folder: Path) -> None:
-        list(draw_scenes(furniture, folder / "scenes", scenes=1, seed=3, workers=0))
-
-    return shared("cluttered", make) / "scenes"
-
-
-@pytest.fixture(scope="session")
-def cluttered_views(shared, cluttered, furniture) -> Path:
-    """A store of ``cluttered``: 40 views, 48 pixels."""
-    from nextview_lab.data.rendering import RenderOptions, render
-
-    options = RenderOptions(meshes=furniture)
-
-    def make(folder: Path) -> None:
-        list(
-            render(
-                cluttered,
-                folder / "views.zarr",
-                pipeline.SPHERE,
-                48,
-                options,
-                workers=0,
-            )
-        )
-
-    return shared("cluttered_views", make) / "views.zarr"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from factories import refused
 from PIL import Image
-from pipeline import refused
 from programs import main
 from scipy.spatial.transform import Rotation
 

@@ -20,8 +20,9 @@ from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
-from pipeline import run_python, some_predictions
-from programs import COMMANDS, PROGRAMS, called, main
+from factories import run_python
+from pipeline import some_predictions
+from programs import COMMANDS, called, main
 
 from nextview import errors
 from nextview.checks import EXTRAS, extras
@@ -172,7 +173,7 @@ def test_help_is_a_word_too(words, capsys):
     assert capsys.readouterr().out.startswith("usage: nextview look ")
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+@pytest.mark.parametrize("program", ids=lambda program: program.name)
 def test_the_list_of_commands_imports_no_command(program):
     module = program.name.replace("-", "_")
     code = (
@@ -284,7 +285,7 @@ def test_what_a_newcomer_calls_a_command_leads_to_it(word, meant, capsys):
     assert f"did you mean {' or '.join(named)}?\n" in said
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+@pytest.mark.parametrize("program", ids=lambda program: program.name)
 def test_other_words_are_of_commands_and_no_command_themselves(program):
     assert program.commands.keys() >= program.other_words.keys()
     for words in program.other_words.values():
@@ -571,7 +572,7 @@ def test_help_needs_no_extra(name, helps):
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.name)
+@pytest.mark.parametrize("program", ids=lambda program: program.name)
 def test_a_shell_completes_the_whole_command(program, shell, capsys):
     pytest.importorskip("torch")
     with pytest.raises(SystemExit) as end:

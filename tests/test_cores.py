@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from factories import camera_over, meshes_of, view
 from programs import COMMANDS, called, main
-from small_tables import camera_over, meshes_of, view
 
 import nextview
 from nextview.cores import CORES, cores, limit_blas

@@ -8,8 +8,8 @@ import zlib
 
 import numpy as np
 import pytest
+from factories import box, cast, pose_at, refused
 from PIL import Image
-from pipeline import box, cast, pose_at, refused
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 from scipy.spatial.transform import Rotation
 
 import nextview

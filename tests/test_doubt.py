@@ -8,7 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from small_tables import camera_over, meshes_of, view
+from factories import (
+    PlacedThing,
+    SimulatedTable,
+    TableCamera,
+    camera_over,
+    meshes_of,
+    view,
+)
 
 import nextview
 from nextview.data.samples import sample_mesh
@@ -27,7 +34,6 @@ from nextview.session.view import View
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.doubt import unknown_turn
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 NAMES = ("chair", "table")
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from factories import ball_depth, rays
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import ball_depth, rays
 
 from nextview.data.samples import sample_mesh
 from nextview.geometry.observation import pinhole

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 import pytest
 import yaml
-from pipeline import run_python
+from factories import run_python
 from ros_messages import (
     CAMERA_INFO,
     DEPTH,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import refused, write_off
+from factories import SimulatedTable, TableCamera, poses_around, refused, write_off
 from scipy.special import logsumexp
 
 import nextview
@@ -33,7 +33,6 @@ from nextview.viewers.card import preview_card, walk_card
 from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
 from nextview_lab.benchmark.replay import make_specs, replay, truncate
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")

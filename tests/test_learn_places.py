@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from pipeline import SAMPLE_FILES
+from factories import SAMPLE_FILES
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, ModelError, ResultsError, UsageError

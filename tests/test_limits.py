@@ -6,7 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
-from pipeline import TABLE, box, cast, pose_at
+from factories import TABLE, box, cast, pose_at
 
 import nextview
 from nextview import Session, Stopping, ViewSphere

@@ -5,9 +5,9 @@ in one sentence.
 import numpy as np
 import onnx
 import pytest
+from factories import change_card, make_map_network, make_recogniser
 from msgspec.structs import replace
 from onnx import TensorProto, helper, numpy_helper
-from pipeline import change_card, make_map_network, make_recogniser
 
 from nextview.errors import ModelError
 from nextview.files import sha256_of

@@ -11,7 +11,8 @@ import matplotlib
 import numpy as np
 import pytest
 import trimesh
-from pipeline import benchmark, refused, some_predictions
+from factories import refused
+from pipeline import benchmark, some_predictions
 from programs import main
 
 import nextview

@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 import trimesh
+from factories import box, make_recogniser, meshed, refused
 from matplotlib.text import Text
-from pipeline import box, make_recogniser, meshed, refused
 from scipy.special import softmax
 
 import nextview

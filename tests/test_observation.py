@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import meshed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from pipeline import meshed
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError

@@ -3,9 +3,9 @@
 from itertools import pairwise
 
 import numpy as np
+from factories import ball_depth, rays
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import ball_depth, rays
 from scipy.spatial.transform import Rotation
 
 from nextview.geometry.observation import pinhole

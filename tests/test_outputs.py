@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factories import camera_over, meshes_of, refused, run_python, view
 from PIL import Image
-from pipeline import refused, run_python
 from programs import main
-from small_tables import camera_over, meshes_of, view
 
 from nextview.cli.commands import NEXTVIEW
 from nextview.geometry.mesh import load_mesh

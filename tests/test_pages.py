@@ -12,10 +12,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from factories import SAMPLE_FILES, camera_over, view
 from PIL import Image, ImageDraw, ImageFilter
-from pipeline import SAMPLE_FILES
 from programs import main
-from small_tables import camera_over, view
 
 import nextview
 from nextview.cli.commands import NEXTVIEW

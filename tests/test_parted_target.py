@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_tables import camera_over, meshes_of, view
+from factories import PlacedThing, SimulatedTable, camera_over, meshes_of, view
 
 import nextview
 from nextview.errors import ObservationError
@@ -10,7 +10,6 @@ from nextview.geometry.mesh import Mesh
 from nextview.segmentation.instances import Segmentation
 from nextview.sensing import ObservedObject
 from nextview.simulation.boxes import upright_boxes
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable
 
 
 def standing(mesh: Mesh, place) -> PlacedThing:

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from pipeline import run_python
+from factories import run_python
 
 LINES = """
 import math

@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import INTRINSICS, TABLE, box, cast, pose_at
 from matplotlib.contour import ContourSet
 from matplotlib.path import Path
-from pipeline import INTRINSICS, TABLE, box, cast, pose_at
 from programs import main
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug

@@ -8,12 +8,12 @@ import warnings
 
 import numpy as np
 import pytest
+from factories import SAMPLE_FILES, refused, run_python
 from fontTools.fontBuilder import FontBuilder
 from fontTools.pens.ttGlyphPen import TTGlyphPen
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.font_manager import fontManager
 from matplotlib.text import Text
-from pipeline import SAMPLE_FILES, refused, run_python
 from programs import main
 
 import nextview

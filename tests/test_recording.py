@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pipeline import INTRINSICS, box, cast, pose_at
+from factories import INTRINSICS, box, cast, pose_at
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 

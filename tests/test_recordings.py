@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import box, cast, meshed, pose_at, refused
 from PIL import Image
-from pipeline import box, cast, meshed, pose_at, refused
 from ros_messages import (
     CAMERA_INFO,
     DEPTH,

@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 import pytest
-from pipeline import box
+from factories import box
 from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, creation

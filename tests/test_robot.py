@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import TABLE, box, cast, pose_at
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pipeline import TABLE, box, cast, pose_at
 from scipy.spatial.transform import Rotation
 
 import nextview

@@ -17,7 +17,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
-from pipeline import TABLE, box, cast, pose_at
+from factories import TABLE, box, cast, pose_at
 from ros_messages import (
     SHAPE,
     STORE,

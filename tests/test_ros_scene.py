@@ -20,6 +20,7 @@ import pytest
 pytest.importorskip("rclpy")
 import nextview_ros.node
 import trimesh
+from factories import SimulatedTable, TableCamera, camera_over, leaning, view, without
 from geometry_msgs.msg import Point
 from nextview_msgs.action import LookUntilSettled
 from nextview_msgs.msg import Box
@@ -43,14 +44,12 @@ from rosgraph_msgs.msg import Clock
 from rosidl_runtime_py.utilities import get_message
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import Image
-from small_tables import camera_over, leaning, view, without
 from test_scene_changes import shifted
 
 import nextview
 from nextview.sensing import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.teaching.learn import learn
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"

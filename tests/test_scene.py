@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import SimulatedTable, TableCamera, camera_over, view, without
 from PIL import Image
 from programs import main
 from scipy.spatial import cKDTree
-from small_tables import camera_over, view, without
 
 import nextview
 from nextview.errors import ObservationError, SessionError, UsageError
@@ -19,7 +19,6 @@ from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.sensing.plausibility import check_sizes
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 
 def by_name(scene) -> dict:

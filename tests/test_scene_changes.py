@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from small_tables import camera_over, meshes_of, view, without
+from factories import SimulatedTable, TableCamera, camera_over, meshes_of, view, without
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import nextview
 from nextview.data.samples import sample_mesh
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 NAMES = ("cracker_box", "mustard_bottle", "tuna_fish_can", "scissors", "foam_brick")
 

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 import trimesh
-from small_tables import camera_over, meshes_of, view
+from factories import (
+    PlacedThing,
+    SimulatedTable,
+    TableCamera,
+    camera_over,
+    meshes_of,
+    view,
+)
 
 import nextview
 from nextview.cli.look import print_scene
@@ -11,7 +18,6 @@ from nextview.scene.state import MOST_VERIFIED
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 K = [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]
 FROM_ABOVE = np.diag([1.0, -1, -1, 1])

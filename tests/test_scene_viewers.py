@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from factories import camera_over, view, without
 from scipy.spatial import cKDTree
-from small_tables import camera_over, view, without
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 pytest.importorskip("viser", reason="the extra 'explore' is not installed")

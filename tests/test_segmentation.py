@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_tables import camera_over, view
+from factories import camera_over, view
 
 from nextview.errors import ModelError, ObservationError
 from nextview.scene.scene import Scene

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, SAMPLE_FILES, SHAPE, TABLE, box, cast, meshed, pose_at
+from factories import INTRINSICS, SAMPLE_FILES, SHAPE, TABLE, box, cast, meshed, pose_at
 from scipy.spatial.transform import Rotation
 
 from nextview import Observation, SimulatedCamera

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from pipeline import box, cast, meshed, pose_at, rays
+from factories import box, cast, meshed, pose_at, rays
 from scipy.stats import norm
 
 import nextview

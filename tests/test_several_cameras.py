@@ -10,8 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from factories import (
+    TABLE,
+    PlacedThing,
+    SimulatedTable,
+    TableCamera,
+    box,
+    camera_over,
+    meshes_of,
+    pose_at,
+    refused,
+    view,
+)
 from PIL import Image
-from pipeline import TABLE, box, pose_at, refused
 from programs import main
 from ros_messages import (
     CAMERA_INFO,
@@ -24,7 +35,6 @@ from ros_messages import (
     write_bag,
 )
 from scipy.spatial.transform import Rotation
-from small_tables import camera_over, meshes_of, view
 
 import nextview
 from nextview.captured.check import check_capture
@@ -37,7 +47,6 @@ from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.known_frames import KnownFrames
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from factories import ball_depth, box, cast, meshed, rays
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import ball_depth, box, cast, meshed, rays
 
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import SAMPLE_FILES, make_map_network, make_recogniser, run_python
+from factories import SAMPLE_FILES, make_map_network, make_recogniser, run_python
 from programs import main
 
 import nextview

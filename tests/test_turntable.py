@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from factories import write_off
 from PIL import Image
-from pipeline import write_off
 
 import nextview
 from nextview.captured.turntable import read_turntable

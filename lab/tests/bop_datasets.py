@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from factories import camera_over, meshes_of, view
 from PIL import Image
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
-from small_tables import camera_over, meshes_of, view
 
 NUMBERS = {"cracker_box": 2, "mug": 14}  # of the models
 IDS = tuple(f"{name}={number}" for name, number in NUMBERS.items())

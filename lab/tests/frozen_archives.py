@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from factories import camera_over, meshes_of, view
 from PIL import Image
-from small_tables import camera_over, meshes_of, view
 
 from nextview.files import write_record
 from nextview_lab.benchmark.frozen import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from small_tables import resting_of
+from factories import resting_of
 
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from pipeline import benchmark, refused
-from programs import main
+from lab_programs import main, refused
+from pipeline import benchmark
 
 from benchmarks.reproduction import page
 from nextview.recognition.belief import Calibration, RiskBounds, Stopping

@@ -14,11 +14,10 @@ from bop_datasets import (
     write_models,
     write_scene,
 )
+from factories import meshes_of
+from lab_programs import main, refused
 from PIL import Image
-from pipeline import refused
-from programs import main
 from scipy.spatial.transform import Rotation
-from small_tables import meshes_of
 
 from nextview.captured.folders import is_capture, read_capture
 from nextview.errors import NextviewError

@@ -10,8 +10,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from pipeline import refused, some_predictions
-from programs import main
+from lab_programs import main, refused
+from pipeline import some_predictions
 
 from nextview.files import sha256_of
 from nextview.recognition.model_card import ModelCard, read_card, write_card

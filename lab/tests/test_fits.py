@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import change_card, make_recogniser, some_predictions, train_predictions
+from factories import change_card, make_recogniser
+from pipeline import some_predictions, train_predictions
 from scipy.special import log_softmax, softmax
 from scipy.stats import binomtest
 

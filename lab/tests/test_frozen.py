@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from frozen_archives import ANSWERS_ALWAYS, as_command, edited
+from lab_programs import refused
 from PIL import Image
-from pipeline import refused
 
 pytest.importorskip("mujoco")
 

@@ -6,20 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from pipeline import (
-    make_map_network,
-    make_recogniser,
-    refused,
-    some_predictions,
-    train_predictions,
-)
+from factories import make_map_network, make_recogniser
+from lab_programs import refused
+from pipeline import some_predictions, train_predictions
 from scipy.special import log_softmax
 from test_fits import SMALL, telling
 from test_policies import SPHERE, state_of
 
 torch = pytest.importorskip("torch")
 
-from programs import main
+from lab_programs import main
 
 import nextview
 from nextview.data.samples import sample_mesh

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import SPHERE, refused, some_predictions
-from programs import main
+from lab_programs import main, refused
+from pipeline import SPHERE, some_predictions
 from scipy.special import softmax
 
 from nextview.errors import DatasetError

@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import factories
 import msgspec
 import numpy as np
-import pipeline
 import pytest
 import trimesh
 
@@ -39,8 +39,8 @@ def rooms(shared, furniture) -> Path:
 def tins(tmp_path_factory) -> Path:
     """A folder of a tin and a plank, in metres."""
     folder = tmp_path_factory.mktemp("tins")
-    pipeline.write_off(folder / "tin.off", trimesh.creation.cylinder(0.04, 0.11))
-    pipeline.write_off(folder / "plank.off", trimesh.creation.box((0.18, 0.06, 0.02)))
+    factories.write_off(folder / "tin.off", trimesh.creation.cylinder(0.04, 0.11))
+    factories.write_off(folder / "plank.off", trimesh.creation.box((0.18, 0.06, 0.02)))
     return folder
 
 
@@ -53,7 +53,7 @@ def built(folder: Path, meshes: Path) -> list[Room]:
 
 def room_with(folder: Path, mesh: trimesh.Trimesh, pose: np.ndarray, **changed) -> Room:
     """A thing in the middle of a room of 6 x 4 x 2.5 m, and a camera with a pose."""
-    path = pipeline.write_off(folder / "thing.off", mesh)
+    path = factories.write_off(folder / "thing.off", mesh)
     radius = np.linalg.norm(mesh.vertices - mesh.bounds.mean(0), axis=1).max()
     given = {
         "name": "thing@room-0",
@@ -115,7 +115,7 @@ def test_pixels_of_the_target_are_those_of_another_ray_caster(rooms, furniture):
     sensor = SENSORS["none"]
     frame, shown = RoomCamera(room, sensor).look(room.pose)
     things = [trimesh.Trimesh(*thing, process=False) for thing in room.things]
-    depth, which = pipeline.cast(things, room.pose, sensor.intrinsics, sensor.shape)
+    depth, which = factories.cast(things, room.pose, sensor.intrinsics, sensor.shape)
     assert (shown != (which == 0)).mean() < 1e-4
     np.testing.assert_allclose(frame.depth, depth, atol=0.001)
 
@@ -228,7 +228,7 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
         match=r"how large is a plank\? Give the files' --unit",
     ):
         list(draw_rooms(tins, tmp_path / "out", workers=0))
-    said = pipeline.refused(
+    said = factories.refused(
         capsys,
         "scenes",
         furniture,
@@ -238,7 +238,7 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
         "light",
     )
     assert "--levels and --held-out are for cluttered tables" in said
-    said = pipeline.refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
+    said = factories.refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
     assert "--unit is for --room" in said
     layout = RoomLayout.load(sorted(rooms.rglob("*.json"))[0])
     other = msgspec.structs.replace(layout.target, sha256="0" * 64)

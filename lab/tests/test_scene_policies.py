@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from pipeline import box, meshed, scene_predictions, some_predictions
+from factories import box, meshed
+from pipeline import scene_predictions, some_predictions
 from test_policies import state_of as state_at
 from test_scenes import GRID, scene_of
 

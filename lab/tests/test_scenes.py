@@ -4,8 +4,8 @@ seed, the same scene.
 
 from itertools import combinations
 
+import factories
 import numpy as np
-import pipeline
 import pytest
 import trimesh
 from matplotlib.path import Path as Outline
@@ -36,7 +36,7 @@ from nextview_lab.worlds.scene_cameras import (
 from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS, Block, SceneLayout
 
 GRID = ViewSphere.named("40")
-BALL = pipeline.meshed(trimesh.creation.icosphere(4))
+BALL = factories.meshed(trimesh.creation.icosphere(4))
 FRONT = GRID.poses[0]
 """From +x, level."""
 
@@ -106,8 +106,8 @@ def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
         for item in (scene.target, *scene.items)
     ]
     for view in (3, 14, 25, 36):
-        _, alone = pipeline.cast(things[:1], GRID.poses[view], k, (64, 64))
-        _, among = pipeline.cast(things, GRID.poses[view], k, (64, 64))
+        _, alone = factories.cast(things[:1], GRID.poses[view], k, (64, 64))
+        _, among = factories.cast(things, GRID.poses[view], k, (64, 64))
         assert layout.visible[view] == pytest.approx(
             (among == 0).sum() / (alone == 0).sum(),
             abs=0.03,
@@ -245,7 +245,7 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(
 
 @pytest.mark.parametrize("named", ["known", "mask", "box", "point"])
 def test_a_robot_sees_the_target_that_it_was_told_of(named):
-    crate = pipeline.meshed(pipeline.box([1, 1.2, 0.9]))
+    crate = factories.meshed(factories.box([1, 1.2, 0.9]))
     scene = scene_of(
         Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9),
         Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7),

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
-from programs import main
+from lab_programs import main
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import change_card, make_recogniser, refused, train_predictions
-from programs import main
+from factories import change_card, make_recogniser
+from lab_programs import main, refused
+from pipeline import train_predictions
 from scipy.stats import norm
 
 from nextview.errors import DatasetError

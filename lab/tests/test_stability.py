@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from factories import pose_at
 from labelled_worlds import FLOOR, LabelledCamera
-from pipeline import pose_at
 from scipy.spatial.transform import Rotation
 from test_verification import mesh_of, verifier_of
 

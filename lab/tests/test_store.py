@@ -5,7 +5,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from pipeline import SPHERE, refused
+from lab_programs import refused
+from pipeline import SPHERE
 
 from nextview.errors import DatasetError
 from nextview_lab.data.measures import measure

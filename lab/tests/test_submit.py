@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from factories import run_python
 from frozen_archives import ANSWERS_ALWAYS, AZIMUTHS, as_command, edited
+from lab_programs import main, refused
 from markdown_it import MarkdownIt
 from PIL import Image
-from pipeline import refused, run_python
-from programs import main
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import DatasetError, ResultsError

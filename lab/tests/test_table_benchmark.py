@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from programs import main
+from lab_programs import main
 
 from nextview.errors import ResultsError, UsageError
 from nextview_lab.benchmark import tables as stage

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import trimesh
+from lab_programs import main
 from msgspec.structs import replace as replace_record
-from programs import main
 
 from benchmarks import joined_things
 from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError

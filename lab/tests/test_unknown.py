@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, TABLE, box, cast, meshed, pose_at
-from programs import main
+from factories import INTRINSICS, TABLE, box, cast, meshed, pose_at
+from lab_programs import main
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest

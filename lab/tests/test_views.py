@@ -5,8 +5,8 @@ a time.
 import numpy as np
 import pandas as pd
 import pytest
-from pipeline import benchmark, refused, some_predictions
-from programs import main
+from lab_programs import main, refused
+from pipeline import benchmark, some_predictions
 
 from benchmarks.views import main as compare
 

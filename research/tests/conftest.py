@@ -12,10 +12,8 @@ import pytest
 from nextview.checks import plugins
 
 ROOT = Path(__file__).parents[2]
-PIPELINE = runpy.run_path(str(ROOT / "tests/conftest.py"))
-shared, furniture, views, archive = (
-    PIPELINE[name] for name in ("shared", "furniture", "views", "archive")
-)
+PIPELINE = runpy.run_path(str(ROOT / "lab/tests/conftest.py"))
+views, archive = (PIPELINE[name] for name in ("views", "archive"))
 
 
 @pytest.fixture(scope="package", autouse=True)

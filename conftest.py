@@ -1,0 +1,3 @@
+"""The tests of both packages share the fixtures of ``tests/fixtures.py``."""
+
+pytest_plugins = ("fixtures",)
