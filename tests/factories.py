@@ -1,7 +1,7 @@
 """What tests share: tiny furniture and networks, meshes before a pinhole camera, and simulated
 tables with a few things of the bundled memory.
 
-``fixtures.py`` makes fixtures from it.
+``shared_fixtures.py`` makes fixtures from it.
 """
 
 import hashlib

@@ -1,6 +1,6 @@
 """Fixtures of the laboratory: stores of views, predictions, results, drawn scenes, archives.
 
-What the tests of both packages share is in ``tests/fixtures.py``.
+What the tests of both packages share is in ``tests/shared_fixtures.py``.
 """
 
 import sys
