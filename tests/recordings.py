@@ -4,6 +4,7 @@ import json
 import struct
 
 import numpy as np
+import trimesh
 from factories import box, cast, pose_at
 from PIL import Image
 from ros_messages import (
@@ -252,3 +253,28 @@ LAYOUTS = {
     "ROS 2 bag": write_recording,
 }
 """How each is written into a folder that is there; what is to be read comes back."""
+
+
+def write_captured(mesh, folder, sphere, radius, table=False):
+    """A mesh of a radius in metres, upon z = 0, from the viewpoints of a sphere, and its masks."""
+    k = np.array([[525.0, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
+    below = radius * mesh.vertices[:, 2].min()
+    thing = trimesh.Trimesh(radius * mesh.vertices - (0, 0, below), mesh.faces)
+    shown = [thing, box((4 * radius, 4 * radius, 0.02), (0, 0, -0.01))][: 1 + table]
+    cameras = {}
+    for number, pose in enumerate(sphere.poses):
+        there = pose.copy()
+        there[:3, 3] = radius * pose[:3, 3] - (0, 0, below)
+        depth, which = cast(shown, there, k + HALF, (480, 640))
+        name = f"{number:06d}"
+        write_png(folder / f"depth/{name}.png", np.rint(10_000 * depth))
+        mask = 255 * ((which == 0) & (depth > 0))
+        write_png(folder / f"mask_visib/{name}_000000.png", mask, np.uint8)
+        back = np.linalg.inv(there)
+        cameras[str(number)] = {
+            "cam_K": k.ravel().tolist(),
+            "depth_scale": 0.1,
+            "cam_R_w2c": back[:3, :3].ravel().tolist(),
+            "cam_t_w2c": (1000 * back[:3, 3]).tolist(),
+        }
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))

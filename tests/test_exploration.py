@@ -8,12 +8,9 @@ import pytest
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, PolicyError, UsageError
+from nextview.errors import DatasetError, PolicyError
 from nextview.geometry.viewsphere import ViewSphere, angle_between
-from nextview.simulation.simulated import SimulatedCamera
 from nextview.viewers.exploration import Exploration, shown_objects
-from nextview_lab.data.rendering import render
-from nextview_lab.data.stored_views import objects_of
 
 SAMPLES, SPHERE = Path(__file__).parents[1] / "samples", ViewSphere.named("40")
 
@@ -119,26 +116,3 @@ def test_objects_of_files_and_folders(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no meshes"):
         shown_objects(tmp_path / "empty")
-
-
-def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
-    (tmp_path / "meshes" / "chair").mkdir(parents=True)
-    (tmp_path / "meshes" / "chair" / "broken.off").write_text("OFF\n")
-    shutil.copy(SAMPLES / "chair.off", tmp_path / "meshes" / "chair" / "seat.off")
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 112, workers=0))
-    (shown,) = objects_of(tmp_path / "views.zarr")
-    assert (shown.name, shown.label) == ("seat", "chair")
-    exploration = Exploration([shown], start=3, threads=1)
-    assert exploration.mesh is None
-    exploration.step()
-    view = exploration.walks[0].views[0]
-    expected = SimulatedCamera(sample_mesh("chair"), 112).observe(SPHERE.poses[3])
-    np.testing.assert_allclose(view.observation.depth, expected.depth, atol=1e-3)
-    np.testing.assert_array_equal(view.observation.pose, expected.pose)
-    nearby = exploration.walks[0].look(
-        exploration.pose_towards(SPHERE.directions[12] + (0, 0, 0.02))
-    )
-    # its own pose counts
-    np.testing.assert_array_equal(nearby.observation.pose, SPHERE.poses[12])
-    with pytest.raises(UsageError, match="seat has only stored views"):
-        exploration.use_sensor("kinect")

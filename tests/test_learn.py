@@ -4,7 +4,6 @@ recognises them then.
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
-from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
+from nextview.recognition.belief import Calibration, log_evidence_of, reorient
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
@@ -31,15 +30,9 @@ from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.viewers.card import preview_card, walk_card
 from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
-from nextview_lab.benchmark.replay import make_specs, replay, truncate
-from nextview_lab.data.predictions import Predictions
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_taught_things_are_recognised_through_a_sensor(taught, scans):
@@ -95,13 +88,6 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
         look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS)
     )
     np.testing.assert_array_equal(remembered_picture(bundled, 40, 1, 3), drawn.picture)
-
-
-def test_predictions_of_taught_things_replay_with_their_policy(taught, shown):
-    specs = make_specs(Predictions.load(shown / "predictions.npz"), 4, 0)
-    for policy in ("random-all", str(taught / "memory.json")):
-        ends = truncate(replay(policy, specs, 3, 0), Stopping(0.999, 3))
-        assert (ends.answer == specs.labels).mean() > 0.9
 
 
 def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(

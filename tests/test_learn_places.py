@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 from factories import SAMPLE_FILES
 
-from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
 from nextview.files import MARKER, new_folder, only_one
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.teaching import learn as module
 from nextview.teaching.learn import learn
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
-from nextview_lab.data.predicting import predict
-from nextview_lab.data.writing import write_capture
 
 
 @pytest.fixture
@@ -173,23 +169,6 @@ def test_foreign_files_next_to_the_output_are_kept(place, run):
     }
 
 
-def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
-    (tmp_path / ".p.npz.part").mkdir()
-    (tmp_path / ".p.npz.part/thesis.txt").write_text("mine")
-    list(
-        predict(
-            views,
-            tmp_path / "p.npz",
-            read_card(models / "tiny.json"),
-            {},
-            "test",
-            workers=0,
-        )
-    )
-    assert {path.name for path in tmp_path.iterdir()} == {".p.npz.part", "p.npz"}
-    assert (tmp_path / ".p.npz.part/thesis.txt").read_text() == "mine"
-
-
 def test_a_lock_file_of_another_program_is_respected(tmp_path):
     (tmp_path / ".mine.lock").write_text("poetry")
     with (
@@ -334,28 +313,3 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
                 (part / name).write_text("new")
         assert contents(out) == before
     assert not any((tmp_path / "away").iterdir())
-
-
-@pytest.mark.parametrize(
-    "image",
-    ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"],
-)
-def test_capture_rejects_a_folder_with_conflicting_images(
-    tmp_path,
-    image,
-):
-    sphere = ViewSphere((30.0,), 3)
-    (tmp_path / image).parent.mkdir()
-    (tmp_path / image).write_bytes(b"mine")
-    with pytest.raises(ResultsError, match="would be taken for one of the new views"):
-        list(
-            write_capture(
-                sample_mesh("chair"),
-                tmp_path,
-                sphere,
-                0.4,
-                masks=False,
-                overwrite=True,
-            )
-        )
-    assert contents(tmp_path) == {image: b"mine"}

@@ -4,7 +4,6 @@ their origin.
 
 import itertools
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,13 +11,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.errors import MeshError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
 from nextview.geometry.mesh_parts import mesh_doubts, thickness
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.teaching import thing_views
-from nextview_lab.data.rendering import RenderOptions, render
-from nextview_lab.data.store import ViewStore
 
 NOISE = np.random.default_rng(0)
 
@@ -255,72 +251,6 @@ def test_a_building_in_a_country_s_coordinates_has_its_shape(tmp_path, exact):
 
 
 # The option everywhere
-
-
-def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
-    scans = tmp_path / "scans" / "eggs"
-    scans.mkdir(parents=True)
-    saved(scans / "one.ply", joined(thing(), disc(0.4)))
-    radii = []
-    for largest in (False, True):
-        options = RenderOptions(largest_part=largest)
-        done = dict(
-            render(
-                scans.parent,
-                tmp_path / f"{largest}.zarr",
-                ViewSphere.named("12"),
-                32,
-                options,
-                workers=0,
-            )
-        )
-        assert list(done.values()) == [None]
-        radii.append(
-            float(ViewStore.open(tmp_path / f"{largest}.zarr").array("radius")[0])
-        )
-    assert radii[0] / radii[1] == pytest.approx(0.4 / 0.065, rel=0.2)
-    with pytest.raises(DatasetError, match="begun with other largest_part"):
-        list(
-            render(
-                scans.parent,
-                tmp_path / "False.zarr",
-                ViewSphere.named("12"),
-                32,
-                options,
-                workers=0,
-            )
-        )
-    with pytest.raises(UsageError, match="scenes are rendered as they are"):
-        list(
-            render(
-                scans.parent,
-                tmp_path / "x.zarr",
-                ViewSphere.named("12"),
-                32,
-                replace(options, meshes=scans),
-            )
-        )
-
-
-def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("nextview_lab.data.rendering.ODD_MESHES", 2)
-    scans = tmp_path / "scans" / "eggs"
-    scans.mkdir(parents=True)
-    saved(scans / "plain.ply", thing())
-    for name in ("a", "b", "c"):
-        saved(scans / f"{name}.ply", joined(thing(), disc(0.4)))
-    done = dict(
-        render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0)
-    )
-    assert set(done.values()) == {None}
-    said = [record.getMessage() for record in caplog.records]
-    assert [line.partition(":")[0] for line in said[:2]] == [
-        str(scans / "a.ply"),
-        str(scans / "b.ply"),
-    ]
-    assert all("times as large" in line for line in said[:2])
-    assert said[2].startswith("and 1 more meshes look odd")
-    assert len(said) == 3
 
 
 def test_recognise_warns_and_takes_the_largest_part(tmp_path):

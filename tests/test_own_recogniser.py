@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import write_captured
 from scipy.spatial import cKDTree
 
 import nextview
@@ -21,7 +22,6 @@ from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.data.writing import write_capture
 
 NAMES = ("chair", "monitor", "table")
 
@@ -375,7 +375,7 @@ def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(
     """The background is of the other colour, which must not reach the recogniser."""
     folder = tmp_path / "captured"
     sphere = nextview.ViewSphere.named("12")
-    list(write_capture(sample_mesh("chair"), folder, sphere, 0.5, table=table))
+    write_captured(sample_mesh("chair"), folder, sphere, 0.5, table=table)
     other = (10, 40, 180) if answer == "red" else (200, 30, 20)
     (folder / "rgb").mkdir(exist_ok=True)
     for mask in folder.glob("mask_visib/*.png"):

@@ -30,8 +30,6 @@ from nextview.policies.policy_card import (
     write_policy_card,
 )
 from nextview.policies.registry import POLICIES, make_policy
-from nextview.recognition.belief import Calibration
-from nextview_lab.benchmark.oracle import OracleGain, OracleValley
 
 SPHERE = ViewSphere.named("40")
 RING = ViewSphere.named("12")
@@ -106,19 +104,6 @@ def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
 def policies(sphere, rng):
     by_map = ("lem", "lem-peak", "lcm", "lem-sphere-peak")
     yield from (make_policy(name, sphere, (1,)) for name in (*POLICIES, *by_map))
-    labels, objects = rng.integers(0, 2, 50), np.arange(50)
-    yield OracleValley(sphere, labels, (1,), "lem")
-    log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
-    yield OracleGain(sphere, log_evidence, 2, labels, objects)
-    yield OracleGain(
-        sphere,
-        log_evidence,
-        2,
-        labels,
-        objects,
-        "global",
-        calibration=Calibration(bin_correlation=0.1),
-    )
     for scope in ("global", "local"):
         yield FixedSequence(
             sphere,

@@ -13,12 +13,10 @@ from scipy.stats import norm
 import nextview
 from nextview import SimulatedCamera, ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
-from nextview_lab.data.rendering import Deform, RenderOptions, render, rotations
-from nextview_lab.data.store import ViewStore
 
 SPHERE, FEW = ViewSphere.named("40"), ViewSphere((20.0,), 3)
 BALL = meshed(trimesh.creation.icosphere(4))
@@ -363,37 +361,6 @@ def test_recognise_through_a_sensor_of_a_name_or_an_object():
         system.recognise(SimulatedCamera(mesh), sensor="kinect")
 
 
-def rendered(furniture, store, sensor=None, workers=0):
-    return render(
-        furniture,
-        store,
-        FEW,
-        workers=workers,
-        options=RenderOptions(split="test", sensor=sensor),
-    )
-
-
-def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp_path):
-    whole, resumed, clean = (
-        tmp_path / f"{name}.zarr" for name in ("whole", "resumed", "clean")
-    )
-    list(rendered(furniture, whole, "wrist:2"))
-    begun = rendered(furniture, resumed, "wrist:2")
-    next(begun)
-    begun.close()
-    assert int(ViewStore.open(resumed).done.sum()) == 1
-    for other in ("wrist", None):
-        with pytest.raises(DatasetError, match="begun with other sensor"):
-            list(rendered(furniture, resumed, other))
-    list(rendered(furniture, resumed, "wrist:2", workers=2))
-    a, b = ViewStore.open(whole), ViewStore.open(resumed)
-    assert b.group.attrs["sensor"] == sensor_named("wrist:2").to_dict()
-    for name in ("image", "depth", "points", "measures/depth_entropy"):
-        np.testing.assert_array_equal(a.group[name][:], b.group[name][:], err_msg=name)
-    list(rendered(furniture, clean))
-    assert "sensor" not in ViewStore.open(clean).group.attrs
-
-
 @pytest.mark.parametrize("name", ["none", "stereo", "kinect"])
 @pytest.mark.parametrize("radius", [0.02, 0.08, 0.3, 1.1])
 def test_a_mesh_of_known_unit_is_simulated_at_true_size(name, radius):
@@ -431,49 +398,3 @@ def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says
         SensedCamera(ball, "mix", rng(31)).sensor
         == SensedCamera(BALL, "mix", rng(31)).sensor
     )
-
-
-def test_another_seed_of_the_noise_shows_the_same_turns_with_other_errors(
-    furniture,
-    tmp_path,
-):
-    stores = []
-    for seed in (None, 1):
-        options = RenderOptions(
-            split="test",
-            sensor="wrist",
-            deform=Deform(rotated=True),
-            noise_seed=seed,
-        )
-        path = tmp_path / f"{seed}.zarr"
-        list(render(furniture, path, FEW, workers=0, options=options))
-        stores.append(ViewStore.open(path))
-
-    np.testing.assert_array_equal(*map(rotations, stores))
-    first, again = (store.depth(0) for store in stores)
-    assert not np.array_equal(first, again)
-
-
-def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(
-    furniture,
-    tmp_path,
-):
-    store = tmp_path / "sized.zarr"
-
-    def sized(unit, sensor="wrist"):
-        options = RenderOptions(
-            split="test",
-            sensor=sensor,
-            unit=unit,
-            deform=Deform(stretch=0.1),
-        )
-        return list(render(furniture, store, FEW, workers=0, options=options))
-
-    sized("cm")
-    small = ViewStore.open(store).group["depth"][:]
-    for other in ("mm", None):
-        with pytest.raises(DatasetError, match="begun with other unit"):
-            sized(other)
-    store.rename(tmp_path / "small.zarr")
-    sized("m")
-    assert (ViewStore.open(store).group["depth"][:] != small).any()

@@ -18,11 +18,12 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.teaching.learn import learn
-from nextview_lab.worlds.scene import square
 
 RADIUS, N, SHAPE = 0.3, 12, (240, 320)
 # first pixel's corner at 0
 K = np.array([[262.5, 0, 160], [0, 262.5, 120], [0, 0, 1]])
+FLAT = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+GROUND = (3 * RADIUS * FLAT, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
 POSE = look_at_origin(np.radians(35), np.radians(20), 4.2 * RADIUS)
 POSE[2, 3] += 0.4 * RADIUS
 
@@ -44,7 +45,7 @@ def write_frames(folder, angles, coarser=1):
     for i, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-        depth, which = RayCaster([(turned, mesh.faces), square(3 * RADIUS, 0.0)]).cast(
+        depth, which = RayCaster([(turned, mesh.faces), GROUND]).cast(
             POSE[:3, 3],
             rays,
         )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from recordings import write_captured
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +52,6 @@ from nextview.things.weighing import (
     JudgedEpisode,
     fit_weights,
 )
-from nextview_lab.data.writing import write_capture
 
 SIDE = 40
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees
@@ -903,15 +903,7 @@ def captured(tmp_path_factory):
         ((0.004, 0.06, 0.05), (0.03, 0.0, 0.04)),
     )
     folder = tmp_path_factory.mktemp("captured") / "block"
-    list(
-        write_capture(
-            mesh,
-            folder,
-            ViewSphere((15.0, 50.0), 6),
-            mesh.metres,
-            table=True,
-        )
-    )
+    write_captured(mesh, folder, ViewSphere((15.0, 50.0), 6), mesh.metres, table=True)
     return mesh, folder
 
 

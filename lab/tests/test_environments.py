@@ -212,7 +212,7 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(
-        str(Path(__file__).parents[1] / "docs/environments.md"),
+        str(Path(__file__).parents[2] / "docs/environments.md"),
         module_relative=False,
     )
     assert tried > 12

@@ -25,7 +25,7 @@ from nextview_lab.benchmark.frozen import FrozenArchive, SealedTruth, seal
 from nextview_lab.benchmark.standings import leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, submit
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
 SURROUNDINGS = {**os.environ, "OMP_NUM_THREADS": "1"}
 # what OpenBLAS, NumPy and the C library do on a processor without AVX2

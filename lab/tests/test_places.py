@@ -23,7 +23,7 @@ from benchmarks.staged_things import (
     stable_ups,
 )
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCANS = Path(os.environ.get("NEXTVIEW_DATA", ".")) / "YCB"
 NAME = "mustard_bottle"
 with_scans = pytest.mark.skipif(

@@ -255,7 +255,7 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
 def run(*arguments: object) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, "-m", "benchmarks.room", *map(str, arguments)],
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
     )

@@ -27,7 +27,7 @@ from nextview_lab.benchmark.standings import KnownShape, leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, submit
 from nextview_lab.cli.submit import print_leaderboard
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 BLIND = SubmitOptions("fixed", max_views=2)
 
 

@@ -16,7 +16,7 @@ from nextview.policies.learned_tables import cells_from
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 
 NAME = "nextview/RecogniseThings-v0"
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -295,7 +295,7 @@ def test_a_rate_that_no_p_value_is_below_is_refused_with_the_least_one(capsys):
     assert replace(system, unknown=1.01 * least).unknown == 1.01 * least
     assert replace(system, unknown=0.0).unknown == 0
 
-    mesh = Path(__file__).parents[1] / "samples" / "chair.off"
+    mesh = Path(__file__).parents[2] / "samples" / "chair.off"
     with pytest.raises(SystemExit):
         main(["recognise", str(mesh), "--unknown", str(0.9 * least)])
     told = " ".join(capsys.readouterr().err.split())

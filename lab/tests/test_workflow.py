@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-WORKFLOW = Path(__file__).parent.parent / "workflow"
+WORKFLOW = Path(__file__).parents[2] / "workflow"
 BUNDLED = WORKFLOW.parent / "src" / "nextview"
 
 

@@ -25,7 +25,7 @@ from nextview_lab.cli.commands import LABORATORY
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.writing import write_capture
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SAMPLE = str(ROOT / "samples/chair.off")
 COMMANDS = {**NEXTVIEW.commands, **LABORATORY.commands}
 FITS = {name for name in COMMANDS if name.startswith("fit ")}

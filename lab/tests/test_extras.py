@@ -24,12 +24,6 @@ from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 from research.extras import EXTRAS as EXTRAS_OF_RESEARCH
 
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "lab/src").rglob("*.py")])
-SCRIPTS = [
-    path
-    for folder in ("benchmarks", "examples", "research", "workflow")
-    for path in sorted((ROOT / folder).glob("*.py"))
-    if '__name__ == "__main__"' in path.read_text()
-]
 
 
 def project(folder: str) -> dict:
@@ -197,80 +191,3 @@ def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
             if line.endswith(f": pip install '{project}[{extra}]'")
         ]
         assert len(named) == 1, line
-
-
-RUN_EACH = """
-import os, runpy, sys, tempfile
-
-# Once, before each is run in a process of its own.
-import matplotlib.figure, rich.progress, scipy.optimize, scipy.stats, trimesh, tyro
-import nextview_lab.data.rendering, nextview_lab.data.store
-import nextview.session.system, nextview.things.recogniser
-
-options, scripts = sys.argv[1], sys.argv[2:]
-sys.path.insert(0, os.getcwd())
-for script in scripts:
-    with tempfile.TemporaryFile("w+") as said:
-        child = os.fork()
-        if child == 0:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-            sys.argv = [script, *options.split()]
-            sys.path.insert(0, os.path.dirname(script))
-            status = 0
-            package, _, name = script.removesuffix(".py").partition("/")
-            try:
-                if package in ("benchmarks", "research"):
-                    runpy.run_module(f"{package}.{name}", None, "__main__", True)
-                else:
-                    runpy.run_path(script, run_name="__main__")
-            except SystemExit as ended:
-                status = ended.code or 0
-            except BaseException:
-                import traceback
-                traceback.print_exc()
-                status = 1
-            sys.stdout.flush()
-            os._exit(status if isinstance(status, int) else 1)
-        _, ended = os.waitpid(child, 0)
-        said.seek(0)
-        print(script, os.waitstatus_to_exitcode(ended), repr(said.read()), flush=True)
-"""
-
-
-def runs(base: Path, options: str, scripts: list[str]) -> dict[str, tuple[int, str]]:
-    """Exit status and output of scripts, by their names."""
-    lines = in_base(base, RUN_EACH, options, *scripts).splitlines()
-    ended = {line.split(" ", 2)[0]: line.split(" ", 2)[1:] for line in lines}
-    return {
-        name: (int(status), ast.literal_eval(said))
-        for name, (status, said) in ended.items()
-    }
-
-
-def test_the_help_of_every_script_shows_in_the_base_installation(base):
-    scripts = [str(path.relative_to(ROOT)) for path in SCRIPTS]
-    ended = runs(base, "--help", scripts)
-    assert ended.keys() == set(scripts)
-    for name, (status, said) in ended.items():
-        assert status == 0, (name, said)
-        assert "usage: " in said, name
-    assert "pip install 'nextview-lab[benchmark]'" in ended["benchmarks/scenes.py"][1]
-    assert "pip install './research[film]'" in ended["research/film.py"][1]
-
-
-def test_a_script_without_its_extra_prints_installation_advice(base):
-    needing = {
-        "benchmarks/scenes.py": "nextview-lab[benchmark]",
-        "research/example_maps.py": "nextview-lab[benchmark]",
-        "research/film.py": "./research[film]",
-        "research/measure_study.py": "nextview-lab[benchmark]",
-        "research/point_pairs.py": "./research[ppf]",
-        "research/thing_features.py": "nextview-lab[train]",
-        "research/train_agent.py": "./research[rl]",
-        "research/train_grid.py": "nextview-lab[train]",
-    }
-    for name, (status, said) in runs(base, "", list(needing)).items():
-        assert status == 2, (name, said)
-        assert said.endswith(f": pip install '{needing[name]}'\n")
-        assert said.count("\n") == 1

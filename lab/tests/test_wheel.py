@@ -20,7 +20,7 @@ from linked_environment import asked_for, empty_environment, link
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PROJECTS = {"nextview": ROOT, "nextview-lab": ROOT / "lab"}
 
 
