@@ -256,13 +256,6 @@ def test_the_image_of_a_standing_camera_can_be_chosen(
     assert "tf moves its camera" in refused(capsys, "look", str(moving), "--at", "last")
 
 
-def test_images_before_and_after_tf_are_left_out(tmp_path):
-    said = [*tf_of_an_arm(duration=1.0), *images_at([-0.3, 0.5, 1.01, 1.4])]
-    capture = read_capture(write_bag(tmp_path / "bag", said))
-    assert len(capture.frames) == 2
-    assert "2 images have no pose in tf and are left out" in capture.notes
-
-
 def test_no_pose_is_made_up_in_a_gap_of_tf():
     tree = TransformTree()
     for time in (0.0, 0.1, 2.0):

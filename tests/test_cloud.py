@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chisquare
 
 from nextview.geometry.depth import CLOUD_POINTS, visible_points
 from nextview.geometry.observation import pinhole
@@ -81,21 +80,6 @@ def test_pixels_are_drawn_without_replacement_and_repeat_evenly_when_few(visible
     assert np.ptp(times) <= 1
 
 
-def test_every_visible_pixel_has_the_same_chance():
-    depth, intrinsics = np.full((48, 48), 3.0, np.float32), pinhole(48, 3.0)
-    drawn = np.zeros((4, 4))
-    for seed in range(60):
-        row, column = pixels_of(
-            visible_points(depth, POSES[0], intrinsics, seed),
-            POSES[0],
-            intrinsics,
-        ).T
-        np.add.at(drawn, (row // 12, column // 12), 1)
-    # Without replacement the counts vary less than in chisquare's model: a p-value near 0 would
-    # still tell of a bias.
-    assert chisquare(drawn.ravel()).pvalue > 1e-3
-
-
 # What the map networks are given
 
 
@@ -126,16 +110,3 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
         look_at_origin([elevation], [azimuth]),
     )
     np.testing.assert_allclose(found, ahead, atol=1e-5)
-
-
-def test_the_camera_stands_at_azimuth_zero():
-    # A marker towards the camera has the largest x, one on the camera's right the largest y, one
-    # above the largest z.
-    for azimuth in np.linspace(0, 6, 7):
-        pose = look_at_origin(0.0, azimuth)
-        towards, right, up = -pose[:3, 2], pose[:3, 0], -pose[:3, 1]
-        cloud = cloud_input(
-            np.stack([towards, right, up])[None].astype(np.float32),
-            pose[None],
-        )[0]
-        assert cloud.argmax(0).tolist() == [0, 1, 2]

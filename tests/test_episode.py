@@ -12,9 +12,9 @@ from scipy.special import softmax
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import RandomAll, Unidirectional, ViewList
+from nextview.policies.baselines import RandomAll, Unidirectional
 from nextview.policies.maps import MapPeak
-from nextview.recognition.belief import PLAIN_SUM, Calibration, FixedLength, Stopping
+from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping
 from nextview.session.episode import Episodes, run_episodes
 
 SPHERE = ViewSphere.named("40")
@@ -274,20 +274,3 @@ def test_a_look_that_fails_is_not_taken_in():
     step = episodes.update(observation)
     assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
     assert step.next_views.tolist() == [4]
-
-
-def test_an_episode_of_fixed_length_goes_on_however_sure_it_is():
-    sure = Evidence(np.tile([900.0, 0.0, 0.0], (4, 1)))  # the belief is exactly 1
-    views = np.array([[3, 1, 2], [0, 7, 4], [5, 6, 1], [2, 0, 3]])
-    sphere = ViewSphere.named("40")
-    done = run_episodes(
-        lambda episodes, _: sure.select(np.isin(np.arange(4), episodes)),
-        sphere,
-        ViewList(views),
-        views[:, 0],
-        FixedLength(max_views=3),
-        np.random.default_rng(0),
-    )
-    np.testing.assert_array_equal(done.outcome.views, views)
-    assert done.steps[0].belief.max() == 1
-    assert not done.outcome.confident.any()

@@ -130,13 +130,3 @@ def test_records_come_back_and_what_is_none_is_one_sentence(tmp_path):
     for name, words in (("pipe", "is no file"), ("none", "no such file")):
         with pytest.raises(ModelError, match=words):
             files.read_record(tmp_path / name, Record, "a card")
-
-
-def test_bytes_are_those_of_the_hash(tmp_path):
-    (tmp_path / "weights").write_bytes(b"abc")
-    # FIPS 180-2, appendix B.1
-    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert files.sha256_of(tmp_path / "weights") == known
-    assert files.checked_bytes(tmp_path / "weights", known) == b"abc"
-    with pytest.raises(ModelError, match="SHA-256 differs"):
-        files.checked_bytes(tmp_path / "weights", known[::-1])

@@ -85,10 +85,6 @@ def test_the_middle_of_a_box_is_the_best_place(proposed):
     assert ends[0] < ends[1]
 
 
-def test_what_is_too_wide_has_no_grasp():
-    assert propose_grasps(box_mesh(np.array([0.09, 0.1, 0.12])), GRIPPER) == ()
-
-
 def test_a_wedge_steeper_than_the_friction_has_no_grasp_on_its_slopes():
     corners = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0, 0.03, 0.0]])  # of 67 degrees
     wedge = trimesh.Trimesh(
@@ -314,22 +310,6 @@ def test_the_arm_is_asked_for_the_best_grasps_only(lonely):
     assert scene.grasps(names["grasps"], names["GRIPPER"], lambda pose: False) == []
 
 
-def test_grasps_in_millimetres_are_refused(lonely):
-    names, scene, *_ = lonely
-    in_millimetres = {}
-    for name, some in names["grasps"].items():
-        poses = [one.pose.copy() for one in some]
-        for pose in poses:
-            pose[:3, 3] *= 1000
-        in_millimetres[name] = [
-            replace(one, pose=pose) for one, pose in zip(some, poses, strict=True)
-        ]
-    with pytest.raises(
-        UsageError, match=r"no finger touches it: are their .* millimetres"
-    ):
-        scene.grasps(in_millimetres, names["GRIPPER"])
-
-
 def test_a_neighbour_and_a_larger_clearance_leave_fewer_grasps(lonely, parts):
     names, scene, found, robot = lonely
     near = scene.grasps(names["grasps"], names["GRIPPER"], clearance=0.006)
@@ -375,9 +355,3 @@ def test_an_uncertain_object_offers_no_grasp(lonely):
     assert free_grasps(scene.objects, scene.tops, *own)
     assert free_grasps(unsure, scene.tops, *own) == []
     assert nextview.Scene(names["system"]).grasps(*own) == []
-
-
-def test_grasps_of_a_thing_that_is_not_taught_are_refused(lonely):
-    names, scene, _, _ = lonely
-    with pytest.raises(UsageError, match=r"grasps of flang, .* taught things.*flange"):
-        scene.grasps({"flang": names["grasps"]["flange"]}, names["GRIPPER"])

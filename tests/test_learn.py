@@ -3,7 +3,6 @@ recognises them then.
 """
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +12,9 @@ from scipy.special import logsumexp
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.errors import NextviewError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
-from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
 from nextview.recognition.belief import Calibration, log_evidence_of, reorient
@@ -24,12 +22,9 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.learn import learn
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
-from nextview.viewers.card import preview_card, walk_card
-from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")
@@ -43,51 +38,6 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
         result = system.recognise(scans / f"{name}.off", sensor="wrist", seed=1)
         assert (result.answer, result.confident) == (name, True)
         np.testing.assert_allclose(result.views[-1].belief.sum(), 1)
-
-
-def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans):
-    exploration = Exploration(
-        shown_objects(scans / "chair.off"),
-        models=taught,
-        start=11,
-        threads=1,
-    )
-    walk = exploration.walks[0]
-    assert walk.rivals is None
-    walk.step()
-    rivals, belief = walk.rivals, walk.views[0].belief
-    np.testing.assert_array_equal(rivals.classes, np.argsort(-belief)[:2])
-    view = 33
-    assert FORTY.azimuth[view] == pytest.approx(
-        2 * np.pi / AZIMUTHS * rivals.azimuths[0, view]
-    )
-    (name, picture), (other, _) = walk.remembered(rivals, view)
-    assert (name, other) == tuple(walk.system.classes[c] for c in rivals.classes)
-    pose = look_at_origin(np.radians(RINGS[rivals.rings[view]]), FORTY.azimuth[view])
-    seen = SimulatedCamera(load_mesh(scans / "chair.off"), 64).observe(pose)
-    np.testing.assert_array_equal(picture, seen.picture)
-    shown = walk_card(walk)
-    assert f"as view {walk.next_view} would show them" in shown
-    assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
-    assert f"The two likeliest, as view {view} would show them" in preview_card(
-        seen,
-        walk,
-    )
-    # its meshes are not here, but their surfaces
-    bundled = nextview.load(models="ycb", threads=1).models.recogniser
-    thing = bundled.memory.thing[40]
-    surface = bundled.memory.surfaces.surface(
-        thing,
-        bundled.card.memory.things[thing].name,
-    )
-    standing = rotated(
-        make_mesh(surface.vertices, surface.faces),
-        bundled.memory.rotations[40].astype(float),
-    )
-    drawn = SimulatedCamera(standing, 64).observe(
-        look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS)
-    )
-    np.testing.assert_array_equal(remembered_picture(bundled, 40, 1, 3), drawn.picture)
 
 
 def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
@@ -169,46 +119,6 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 
-def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(
-    tmp_path,
-    scans,
-    capsys,
-):
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert "holds no mesh" in refused(
-        capsys,
-        "learn",
-        str(empty),
-        str(tmp_path / "out"),
-    )
-    (empty / "view.png").write_bytes(b"")
-    assert "holds no mesh" in refused(
-        capsys,
-        "learn",
-        str(empty),
-        str(tmp_path / "out"),
-    )
-    mixed = tmp_path / "mixed"
-    mixed.mkdir()
-    for name in ("chair", "seat"):
-        shutil.copy(scans / "chair.off", mixed / f"{name}.off")
-    (mixed / "broken.off").write_text("OFF\n3 1 0\n0 0 0\n")
-    small = load_mesh(scans / "chair.off")
-    write_off(mixed / "small.off", replace(small, vertices=small.vertices / 1000))
-    how = {"unit": "cm", "upright": True, "workers": 0}
-    with pytest.raises(
-        DatasetError,
-        match=r"small\.off: is .* times smaller than most others; is it in another unit",
-    ):
-        learn(mixed, tmp_path / "out", **how)
-    found = learn(mixed, tmp_path / "out", any_size=True, **how)
-    assert found.things == 3
-    assert any("chair and seat look the same" in note for note in found.notes)
-    assert [phrase for phrase in found.left_out if "broken.off" in phrase]
-    assert "broken" in str(found)
-
-
 def test_what_lies_too_flat_for_depth_is_told_when_it_is_taught(tmp_path):
     scans = tmp_path / "scans"
     scans.mkdir()
@@ -233,24 +143,6 @@ def test_what_lies_too_flat_for_depth_is_told_when_it_is_taught(tmp_path):
         scene = nextview.Scene(system)
         scene.update(camera.frame(pose))
         assert len(scene.objects) == count
-
-
-def test_classes_of_several_things_and_one_alone(tmp_path, scans):
-    folder = tmp_path / "classes"
-    for name, stretch in (("chair", 0.8), ("chair", 1.2), ("monitor", 1.0)):
-        mesh = sample_mesh(name)
-        write_off(
-            folder / name / f"{name}_{stretch}.off",
-            make_mesh(mesh.vertices * (1, stretch, 1), mesh.faces),
-        )
-    found = learn(folder, tmp_path / "two", upright=True, workers=0)
-    assert (found.things, found.classes) == (3, 2)
-    assert found.accuracy[2] > 0.9  # by the other things of the class
-    assert read_card(tmp_path / "two/memory.json").calibration.hypotheses == (
-        0,
-        0,
-        1,
-    )
 
 
 def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():

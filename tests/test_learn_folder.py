@@ -15,7 +15,6 @@ from programs import main
 
 import nextview.teaching.learn as teaching
 from nextview import learn
-from nextview.data.progress import silently
 from nextview.errors import DatasetError, UsageError
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
@@ -81,18 +80,6 @@ def test_frames_meshes_and_classes_are_found_together(tmp_path):
     )
 
 
-def test_what_is_for_tests_is_not_taught(tmp_path):
-    scans_in(tmp_path, "cup/train/a.ply", "cup/test/b.ply", "box.ply")
-    found = find_things(tmp_path)
-    assert [thing.name for thing in found.things] == ["box", "a"]
-    assert found.left_out == ["cup/test/b.ply: of the split test"]
-    with pytest.raises(
-        DatasetError,
-        match=r"holds no mesh .*; left out: a\.step: of a format that is not read",
-    ):
-        find_things(scans_in(tmp_path / "drawings", "a.step"))
-
-
 @pytest.mark.parametrize(
     ("places", "inside"),
     [
@@ -112,25 +99,6 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
     assert len({thing.label for thing in find_things(root / inside).things}) > 1
     assert len({thing.label for thing in find_things(root, one_class=True).things}) == 1
     assert learn(root, tmp_path / "mine", one_class=True, workers=0).classes == 1
-
-
-def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickly):
-    learn(
-        scans_in(tmp_path / "first", "box.ply", "tin.ply"),
-        tmp_path / "mine",
-        workers=0,
-    )
-    learned = learn(
-        scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"),
-        tmp_path / "mine",
-        add=True,
-        workers=0,
-    )
-    assert (learned.things, learned.classes) == (4, 3)
-    assert [
-        thing.label
-        for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things
-    ] == ["cup"]
 
 
 @pytest.mark.parametrize(
@@ -166,48 +134,6 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
             **({"workers": 0} | {option: value}),
         )
     assert not (tmp_path / "mine").exists()
-
-
-@pytest.mark.parametrize(
-    ("folder", "out"),
-    [(".", "mine"), ("../things", "."), ("../things", "../things/mine")],
-)
-def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
-    tmp_path,
-    monkeypatch,
-    capsys,
-    quickly,
-    folder,
-    out,
-):
-    scans_in(tmp_path / "things", "box.ply", "tin.ply")
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path / ("things" if folder == "." else "empty"))
-    for again in ([], ["--overwrite"]):
-        main(["learn", folder, out, "--workers", "0", *again])
-        assert read_card(Path(out) / "memory.json").classes == ("box", "tin")
-    printed = " ".join("".join(capsys.readouterr()).split())
-    assert f"in {folder}: 2 meshes" in printed
-    assert ("mine: is where the result goes" in printed) == (out != ".")
-
-
-def test_from_python_it_tells_how_far_it_is_and_how_a_memory_is_replaced(
-    tmp_path,
-    capsys,
-    quickly,
-):
-    root = scans_in(tmp_path / "things", "box.ply", "tin.ply")
-    out = tmp_path / "mine"
-    learn(root, out, workers=0)
-    assert "teaching things: 2 to do\n" in capsys.readouterr().err
-    with pytest.raises(UsageError, match=r"add=True adds others, overwrite=True"):
-        learn(root, out, workers=0)
-    assert capsys.readouterr().err == ""
-
-    (root / "tin.ply").unlink()
-    learn(root, out, workers=0, overwrite=True, track=silently)
-    assert capsys.readouterr().err == ""
-    assert read_card(out / "memory.json").classes == ("box",)
 
 
 @pytest.mark.skipif(

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from factories import SAMPLE_FILES
 
-from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
+from nextview.errors import DatasetError, ModelError, ResultsError
 from nextview.files import MARKER, new_folder, only_one
-from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.teaching import learn as module
 from nextview.teaching.learn import learn
@@ -119,33 +118,6 @@ def test_an_output_path_that_is_a_link_is_rejected_early(
 
 
 @pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("layout", ["now", "earlier"])
-def test_linked_weights_are_replaced_and_the_link_target_is_kept(
-    place,
-    run,
-    layout,
-):
-    weights = read_card(place / "mine/memory.json").path
-    if layout == "earlier":
-        weights = weights.rename(place / "mine/memory.safetensors")
-    target = link_away(weights, place)
-    content = target.read_bytes()
-    assert known(place / "mine") == ["ball", "box"]
-    RUNS[run](place)
-    assert known(place / "mine") == AFTER[run]
-    assert not weights.is_symlink()
-    assert target.read_bytes() == content
-
-
-def test_the_very_same_memory_again_keeps_its_file_though_that_is_a_link(place):
-    weights = read_card(place / "mine/memory.json").path
-    target = link_away(weights, place)
-    learn(place / "first", place / "mine", overwrite=True, workers=0)
-    assert weights.readlink() == target
-    assert known(place / "mine") == ["ball", "box"]
-
-
-@pytest.mark.parametrize("run", RUNS)
 def test_foreign_files_next_to_the_output_are_kept(place, run):
     marked = json.dumps({"output": "other", "key": "things"})
     foreign = {
@@ -167,19 +139,6 @@ def test_foreign_files_next_to_the_output_are_kept(place, run):
     assert {name: now.get(name) for name in foreign} == {
         name: text.encode() for name, text in foreign.items()
     }
-
-
-def test_a_lock_file_of_another_program_is_respected(tmp_path):
-    (tmp_path / ".mine.lock").write_text("poetry")
-    with (
-        pytest.raises(
-            DatasetError,
-            match=r"cannot be written while \S+/\.mine\.lock is there",
-        ),
-        only_one(tmp_path / "mine"),
-    ):
-        pass
-    assert (tmp_path / ".mine.lock").read_text() == "poetry"
 
 
 def test_concurrent_runs_are_rejected_without_loss_of_data(
@@ -223,15 +182,6 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
     assert contents(place / "mine") == before
     assert not looked_at
     assert {path.name for path in place.iterdir()} == {"first", "more", "mine"}
-
-
-def test_an_empty_memory_is_not_written(place):
-    with pytest.raises(
-        UsageError,
-        match="no thing would be left; delete the folder instead",
-    ):
-        learn(place / "mine", place / "mine", remove=("box", "ball"), workers=0)
-    assert known(place / "mine") == ["ball", "box"]
 
 
 CHANGES = {

@@ -5,7 +5,6 @@ one sentence.
 import json
 import re
 import shutil
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +16,8 @@ from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
-from nextview.recognition.model_card import find_models, read_card
-from nextview.things.memory import open_memory, taught_meshes
+from nextview.recognition.model_card import read_card
+from nextview.things.memory import open_memory
 from nextview.things.recogniser import open_recogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
@@ -176,32 +175,6 @@ def test_every_array_is_checked(models, name, how, change):
     with pytest.raises(
         ModelError,
         match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+",
-    ):
-        open_memory(models / "memory.json")
-
-
-@pytest.mark.parametrize("name", ARRAYS)
-def test_every_array_has_to_be_there(models, name):
-    rewrite(models, lambda arrays: arrays.pop(name))
-    with pytest.raises(
-        ModelError,
-        match=rf"memory\.safetensors: not a memory \(it holds no {name}\)",
-    ):
-        open_memory(models / "memory.json")
-
-
-def test_a_memory_of_an_earlier_version_is_rejected_with_advice(
-    models,
-):
-    rewrite(
-        models,
-        lambda arrays: [
-            arrays.pop(name) for name in ("places", "faces", "counts", "boxes")
-        ],
-    )
-    with pytest.raises(
-        ModelError,
-        match=r"memory\.safetensors: is of an earlier version; teach it again",
     ):
         open_memory(models / "memory.json")
 
@@ -391,79 +364,6 @@ class Missing(dict):
         return self.get(key)
 
 
-def fields_of(value, path=()):
-    """The paths of all fields of a card, of long lists the first and the last."""
-    if path:
-        yield path
-    if isinstance(value, dict):
-        for key, inside in value.items():
-            yield from fields_of(inside, (*path, key))
-    elif isinstance(value, list):
-        for index in {0, len(value) - 1} if value else ():
-            yield from fields_of(value[index], (*path, index))
-
-
-def holder(about, path):
-    for key in path[:-1]:
-        about = about[key]
-    return about
-
-
-VALUES = {
-    "null": lambda value: None,
-    "text": lambda value: "\x00",
-    "number": lambda value: -1,
-    "large": lambda value: 10**30,
-    "not a number": lambda value: np.nan,
-    "list": lambda value: [],
-    "object": lambda value: {},
-    "shorter": lambda value: (
-        value[:-1] if isinstance(value, list | str) and value else {}
-    ),
-    "longer": lambda value: (
-        [*value, value[-1]] if isinstance(value, list) and value else [[]]
-    ),
-}
-
-
-@pytest.mark.parametrize("how", ["dropped", *VALUES])
-def test_any_other_field_is_refused_by_name_or_the_memory_works(
-    models,
-    features,
-    monkeypatch,
-    how,
-):
-    monkeypatch.setattr("nextview.things.memory.Features", lambda threads: features)
-    card = models / "memory.json"
-    original = json.loads(card.read_text())
-    refused = 0
-    for path in fields_of(original):
-        about = deepcopy(original)
-        where = holder(about, path)
-        if how == "dropped":
-            del where[path[-1]]
-        else:
-            where[path[-1]] = VALUES[how](where[path[-1]])
-        card.write_text(json.dumps(about))
-        sentence = None
-        try:
-            recogniser = open_recogniser(find_models(models).recogniser)
-        except ModelError as error:
-            sentence = str(error)
-        if sentence is not None:
-            assert re.match(r"\S+/mine\S*: .+", sentence), (path, sentence)
-            refused += 1
-            continue
-        seen = recogniser.memory.held_out[:, 0].astype(np.float32)
-        evidence = recogniser.evidence(seen, recogniser.memory.held_out_views[:, 0, 0])
-        assert np.isfinite(evidence.logits).all(), path
-        assert np.isfinite(evidence.azimuth_bins).all(), path
-        if recogniser.novelty is not None:
-            score = recogniser.novelty.of_belief(np.zeros(2), 1)
-            assert 0 <= recogniser.novelty.of_views([score]) <= 1, path
-    assert refused > 20
-
-
 def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
     knobs_memory,
     knobs,
@@ -480,23 +380,6 @@ def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
         step = np.ptp(in_file, axis=0).max() / 65535
         np.testing.assert_allclose(surface.vertices, in_file, atol=step)
         np.testing.assert_array_equal(surface.faces, mesh.faces)
-
-
-def test_things_of_known_geometry_hold_no_features(knobs_memory):
-    card, memory = open_memory(knobs_memory / "memory.json")
-    assert card.memory.features_sha256 is None
-    assert not memory.has_features
-    assert memory.views.size == memory.held_out.size == 0
-
-
-def test_removing_from_a_memory_without_features_shows_nothing_and_says_so(
-    knobs_memory, tmp_path
-):
-    mine = shutil.copytree(knobs_memory, tmp_path / "mine")
-    learned = nextview.learn(mine, mine, remove=("can",), workers=0)
-    assert learned.accuracy == ()
-    assert str(learned).splitlines()[0] == "2 things learned"
-    assert (mine / "learned.png").stat().st_size > 0
 
 
 def test_a_card_says_whether_there_are_features(knobs_memory, mixed_memory, tmp_path):
@@ -530,48 +413,12 @@ def test_things_get_features_when_one_is_added_that_needs_them(
     assert memory.surfaces.counts[1].tolist() == before.surfaces.counts[knob].tolist()
 
 
-def test_things_of_unknown_size_hold_no_geometry(taught):
-    assert TaughtThings.of(open_recogniser(taught / "memory.json")) is None
-
-
-def test_a_size_that_is_no_number_is_damage_and_not_an_unknown_size(taught, tmp_path):
-    """Also of things without geometry, whose unit of length nobody said."""
-    models = shutil.copytree(taught, tmp_path / "mine")
-    _, memory = open_memory(models / "memory.json")
-    assert np.isnan(memory.radii).all()
-    rewrite(models, lambda arrays: None)
-    assert np.isnan(open_memory(models / "memory.json")[1].radii).all()
-    rewrite(
-        models,
-        lambda arrays: arrays.update(radii=with_value(arrays["radii"], np.nan)),
-    )
-    with pytest.raises(ModelError, match="its radii are not all numbers"):
-        open_memory(models / "memory.json")
-
-
 def test_weights_and_residuals_are_those_on_the_card(models):
     card = changed_card(models, set_at("memory/verification", VERIFIED))
     things = TaughtThings.of(open_recogniser(card))
     assert things.verifier.weights == replace(EvidenceWeights(), geometry=20.0)
     np.testing.assert_array_equal(things.residuals.usual, VERIFIED["usual"][1:])
     assert things.residuals.p_value(0.1, 0, 1) == pytest.approx(2 / 3)
-
-
-@pytest.mark.parametrize(
-    ("weights", "sentence"),
-    [
-        ({"colour": 1.0}, "colour"),
-        ({"doubt": 2.0}, "doubt"),
-        ({"correlation": 1.5}, "correlation"),
-    ],
-)
-def test_invalid_weights_are_rejected(models, weights, sentence):
-    card = changed_card(
-        models,
-        set_at("memory/verification", VERIFIED | {"weights": weights}),
-    )
-    with pytest.raises(ModelError, match=rf"mine/memory\.json: .*{sentence}"):
-        TaughtThings.of(open_recogniser(card))
 
 
 def square(size, origin, name="square"):
@@ -602,16 +449,3 @@ def test_stored_surfaces_come_back_as_they_were(many):
             atol=np.ptp(points) / 65535,
         )
         np.testing.assert_array_equal(again.faces, surface.faces)
-
-
-def test_the_surfaces_of_things_are_meshes_in_metres(knobs_memory):
-    path = knobs_memory / "memory.json"
-    card, memory = open_memory(path)
-    name = card.memory.things[-1].name
-    surface = memory.surfaces.surface(len(card.memory.things) - 1, name)
-    (mesh,) = taught_meshes(path, [name])
-    assert mesh.name == name
-    extent = np.ptp(mesh.vertices, axis=0) * mesh.radius
-    np.testing.assert_allclose(extent, np.ptp(surface.vertices, axis=0), atol=1e-6)
-    with pytest.raises(ModelError, match="knows no mugg; did you mean 'mug'"):
-        taught_meshes("ycb", ["mugg"])

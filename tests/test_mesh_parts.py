@@ -10,10 +10,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-import nextview
-from nextview.errors import MeshError, UsageError
+from nextview.errors import MeshError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
-from nextview.geometry.mesh_parts import mesh_doubts, thickness
+from nextview.geometry.mesh_parts import mesh_doubts
 from nextview.teaching import thing_views
 
 NOISE = np.random.default_rng(0)
@@ -132,15 +131,6 @@ def test_a_base_plate_is_asked_about_however_the_scan_is_turned():
         assert len(set(doubts)) == 1  # also how many times as large it is
 
 
-@pytest.mark.parametrize("points", [4, 40])
-def test_the_thickness_of_points_is_that_of_the_thinnest_slab(points):
-    cloud = np.random.default_rng(points).normal(size=(points, 2)) * (3, 1)
-    angles = np.linspace(0, np.pi, 20_000)
-    slabs = np.ptp(cloud @ np.stack([np.cos(angles), np.sin(angles)]), axis=0)
-    assert thickness(cloud) == pytest.approx(slabs.min(), rel=1e-3)
-    assert thickness(np.stack([cloud[:, 0], cloud[:, 0]], 1)) == pytest.approx(0)
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -171,32 +161,6 @@ def test_the_thickness_of_points_is_that_of_the_thinnest_slab(points):
 )
 def test_nothing_is_asked_about_an_object(shape):
     assert mesh_doubts(np.asarray(shape.vertices), np.asarray(shape.faces)) == ()
-
-
-def test_a_plate_alone_is_its_own_largest_part(tmp_path):
-    path = saved(
-        tmp_path / "plate.ply",
-        joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0))),
-    )
-    assert len(load_mesh(path, largest_part=True).faces) == len(disc(0.2).faces)
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"],
-)
-def test_a_broken_file_is_refused_with_the_option_too(tmp_path, content):
-    (tmp_path / "broken.obj").write_text(content)
-    with pytest.raises(MeshError, match=r"broken\.obj: .*vert"):
-        load_mesh(tmp_path / "broken.obj", largest_part=True)
-
-
-def test_a_mesh_of_one_part_is_the_same_with_the_option(tmp_path):
-    path = saved(tmp_path / "egg.ply", thing())
-    plain = load_mesh(path)
-    taken = load_mesh(path, largest_part=True)
-    np.testing.assert_array_equal(taken.vertices, plain.vertices)
-    assert taken.notes == ()
 
 
 @pytest.mark.parametrize(("unit", "radius"), [("m", 70), ("mm", 0.5)])
@@ -234,41 +198,7 @@ def test_a_scan_far_from_its_origin_in_single_precision(tmp_path, kind, offset, 
         )
 
 
-@pytest.mark.parametrize(
-    "exact",
-    [True, False],
-    ids=["whole metres", "double precision"],
-)
-def test_a_building_in_a_country_s_coordinates_has_its_shape(tmp_path, exact):
-    house = trimesh.creation.box((8, 6, 4)).apply_translation(
-        (0 if exact else 0.123, 0, 0)
-    )
-    house.vertices += (4_400_004, 5_300_003, 2)
-    text = "".join("v {!r} {!r} {!r}\n".format(*map(float, p)) for p in house.vertices)
-    text += "".join("f {} {} {}\n".format(*(face + 1)) for face in house.faces)
-    (tmp_path / "house.obj").write_text(text)
-    assert load_mesh(tmp_path / "house.obj").radius == pytest.approx(np.sqrt(116) / 2)
-
-
 # The option everywhere
-
-
-def test_recognise_warns_and_takes_the_largest_part(tmp_path):
-    path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
-    with pytest.warns(UserWarning, match=r"scan\.ply: it has 2 parts"):
-        whole = nextview.recognise(path, start=9)
-    with pytest.warns(
-        UserWarning,
-        match=r"scan\.ply: the largest of its 2 parts was taken",
-    ):
-        part = nextview.recognise(path, start=9, largest_part=True)
-    alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
-    first = [result.views[0].observation.depth for result in (part, alone, whole)]
-    assert (
-        ((first[0] > 0) != (first[1] > 0)).mean()
-        < 0.01
-        < ((first[0] > 0) != (first[2] > 0)).mean()
-    )
 
 
 def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
@@ -287,16 +217,3 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))
     assert radii[0] > 5 * radii[1]
-
-
-def test_the_largest_part_of_what_is_no_mesh_file_is_refused(tmp_path):
-    mesh = make_mesh(thing().vertices, thing().faces)
-    for what in (mesh, tmp_path):
-        with pytest.raises(UsageError, match="taken of a mesh file"):
-            nextview.recognise(what, largest_part=True)
-
-
-def test_a_plane_is_looked_for_among_faces_without_area():
-    points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.0)])
-    faces = np.array([[0, 1, 1]] * 200_001 + [[0, 1, 2], [1, 2, 3]])
-    assert mesh_doubts(points, faces) == ()

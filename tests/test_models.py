@@ -16,7 +16,6 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import (
     bundled_cards,
-    find_card,
     read_card,
     write_card,
 )
@@ -33,16 +32,6 @@ def test_cards_are_read_as_they_were_written(tmp_path):
             card,
             path=tmp_path / f"card{card.path.suffix}",
         )
-
-
-def test_a_model_that_is_not_there():
-    with pytest.raises(
-        ModelError,
-        match="no bundled model is called 'resnet'; there are features, lcm-",
-    ):
-        find_card("resnet")
-    with pytest.raises(ModelError, match=r"gone\.json: no such file"):
-        find_card("gone.json")
 
 
 def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that_is_opened(

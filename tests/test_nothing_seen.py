@@ -5,8 +5,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-import trimesh
-from factories import box, meshed, refused
 from matplotlib.text import Text
 from scipy.special import softmax
 
@@ -154,31 +152,3 @@ def test_nothing_seen_is_no_answer(tiny):
     )
     drawn = result.plot(title="air")
     assert any("nothing is seen" in text.get_text() for text in drawn.findobj(Text))
-
-
-# Meshes and the command line
-
-
-@pytest.mark.parametrize("gap", [20, 300])
-def test_two_boxes_far_apart_are_nothing(gap):
-    """Most of their bounding sphere is empty; the networks would name what they see of it a
-    table, confidently.
-    """
-    found = nextview.recognise(
-        meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))),
-        start=9,
-    )
-    assert (found.answer, found.confident) == (None, False)
-
-
-@pytest.mark.parametrize("json_too", [[], ["--json"]])
-def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
-    path = tmp_path / "specks.off"
-    specks = [
-        trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x))
-        for x in (-1, 1)
-    ]
-    trimesh.util.concatenate(specks).export(path)
-    said = refused(capsys, "recognise", path, "--threshold", "0", *json_too)
-    assert "specks.off: there is no answer" in said
-    assert "any of 5 views" in said

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nextview.errors import UsageError
 from nextview.geometry.viewsphere import (
     VISITED_ANGLE,
     Directions,
@@ -64,45 +63,6 @@ def test_a_fibonacci_hemisphere_is_even():
     assert angles.min(1).max() < 1.1 * even
     heights = np.sort(directions[:, 2])  # equal areas: heights are uniform (Archimedes)
     np.testing.assert_allclose(heights, (np.arange(200) + 0.5) / 200)
-
-
-@given(
-    st.lists(st.tuples(st.floats(-90, 90), st.floats(0, 360)), min_size=1, max_size=12),
-    st.floats(0.5, 9),
-)
-def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
-    elevation, azimuth = np.radians(np.array(angles)).T
-    poses = look_at_origin(elevation, azimuth, distance)
-    for layout in (
-        viewpoints_of(poses),
-        viewpoints_of(poses[:, :3, 3]),
-        Directions(poses[:, :3, 3]),
-    ):
-        assert len(layout) == len(angles)
-        np.testing.assert_allclose(
-            layout.poses[:, :3, 3],
-            3 * poses[:, :3, 3] / distance,
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(layout.poses[:, :3, 2], poses[:, :3, 2], atol=1e-9)
-        cosines = np.einsum("id,jd->ij", layout.directions, layout.directions)
-        np.testing.assert_allclose(np.cos(layout.arc), cosines, atol=1e-9)
-
-
-def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
-    np.testing.assert_allclose(
-        Directions(SPHERE.directions).travel,
-        SPHERE.travel,
-        atol=1e-9,
-    )
-    assert SPHERE.travel_between(
-        direction(27, 350),
-        direction(36, 10),
-    ) == pytest.approx(np.hypot(0.5, 20 / 45))
-    assert viewpoints_of("12").travel_between(
-        direction(45, 5),
-        direction(45, 350),
-    ) == pytest.approx(0.5)
 
 
 # Policies off their grid
@@ -276,15 +236,3 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
         assert not episodes.outcome.confident[0]
         paths.append(path)
     assert paths[0] == paths[1]
-
-
-@pytest.mark.parametrize(
-    "layout",
-    ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))],
-)
-def test_more_views_than_their_distances_fit_into_memory_are_refused(layout):
-    with pytest.raises(
-        UsageError,
-        match="the number of viewpoints is a whole number from 1 to 5000",
-    ):
-        viewpoints_of(layout)

@@ -18,7 +18,6 @@ from nextview.captured.folders import read_capture
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.policies.base import Evidence
-from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.simulated import SimulatedCamera
@@ -88,16 +87,6 @@ def test_a_geometric_matcher_of_ones_own_judges_all_views(name):
     seen = [view.observation for view in result.views]
     np.testing.assert_allclose(result.views[-1].belief, NearestPoints().belief(seen))
     assert (result.pose, result.why_no_pose) == (None, "")
-
-
-def test_what_views_speak_for_adds_up():
-    system = nextview.load(recogniser=Filled(), threads=1, threshold=1.0, max_views=2)
-    result = system.recognise(sample_mesh("table"), seed=0)
-    logits = Filled()([view.observation for view in result.views]).sum(0)
-    np.testing.assert_allclose(
-        result.views[-1].belief,
-        np.exp(logits) / np.exp(logits).sum(),
-    )
 
 
 def test_poses_of_ones_own_arrive_in_the_result():
@@ -330,22 +319,6 @@ def test_what_it_says_is_checked(given, sentence):
 def test_what_is_no_recogniser_is_refused_at_the_door(given, error, sentence):
     with pytest.raises(error, match=sentence):
         nextview.load(recogniser=given, threads=1)
-
-
-def test_it_is_named_as_module_and_name_too(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    call = "def __call__(self, seen): return [[1, 0]] * len(seen)"
-    code = f"class Thing:\n    classes = ('a', 'b')\n    {call}\n"
-    (tmp_path / "recogniser_of_mine.py").write_text(code)
-    system = nextview.load(recogniser="recogniser_of_mine:Thing", threads=1)
-    assert system.recognise(sample_mesh("chair")).answer == "a"
-    with pytest.raises(ModelError, match="cannot tell unknown objects"):
-        nextview.load(recogniser="recogniser_of_mine:Thing", unknown=0.1)
-
-
-def test_the_packages_own_kinds_are_taken_as_they_are():
-    recogniser = nextview.load(threads=1).models.recogniser
-    assert own_recogniser(recogniser) is recogniser
 
 
 class Painted:

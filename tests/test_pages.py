@@ -162,18 +162,6 @@ def test_an_output_is_compared_with_the_page_and_updated(tmp_path, monkeypatch, 
         assert page.read_text() == begin + (becomes or shown) + after
 
 
-def test_each_picture_of_the_pages_has_a_command_or_a_reason():
-    made = [
-        name
-        for names in documented_commands.PICTURES.values()
-        for name in names.split()
-    ]
-    listed = [*made, *documented_commands.NOT_DRAWN]
-    kept = sorted(path.name for path in documented_commands.IMAGES.iterdir())
-    assert sorted(listed) == kept
-    assert documented_commands.pictures_on(documented_commands.PAGES) == set(kept)
-
-
 def test_each_page_names_what_its_commands_need():
     needed = set()
     for page in documented_commands.PAGES:

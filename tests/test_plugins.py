@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import nextview
-from nextview import checks
 from nextview.data.samples import sample_mesh
 from nextview.errors import PolicyError, UsageError
 from nextview.scene.grasps import FreeGrasp, within_reach
@@ -83,11 +82,6 @@ def test_the_whole_traceback_is_shown_where_it_is_asked_for(monkeypatch, capsys)
     assert "raise self.raises  " in capsys.readouterr().err
 
 
-def test_ctrl_c_is_not_taken_for_an_error_of_a_plugin():
-    with pytest.raises(KeyboardInterrupt), checks.plugin_errors(PolicyError):
-        raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize("said", [None, "yes", np.nan])
 def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(
     said,
@@ -105,25 +99,6 @@ def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_
         setattr(session, name, None)
     session.update(camera.observe(session.pose))
     assert len(session.views) == 1
-
-
-def test_what_a_callable_of_a_program_raises_is_named_and_kept():
-    """Whoever handed it in may be waiting for that very error: it is the cause."""
-    camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
-    session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
-    for name, asked_for in (
-        ("reachable", "whether a view can be reached"),
-        ("travel_cost", "what a move costs"),
-    ):
-        setattr(session, name, lambda *poses: {}["the arm is off"])
-        sentence = (
-            f"asked {asked_for}, the function raised .*arm is off.* at test_plugins"
-        )
-        with pytest.raises(UsageError, match=sentence) as raised:
-            session.update(camera.observe(session.pose))
-        assert isinstance(raised.value.__cause__, KeyError)
-        assert session.views == []
-        setattr(session, name, None)
 
 
 def test_what_a_segmentation_or_the_arm_raises_is_named():

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from factories import INTRINSICS, box, cast, pose_at
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 
@@ -11,7 +10,6 @@ from rerun.chunk import RrdReader
 import nextview
 from nextview.data.samples import sample_mesh
 from nextview.geometry.observation import Observation
-from nextview.sensing import Frame
 from nextview.session.system import simulated
 from nextview.viewers.recording import Recorder
 
@@ -109,28 +107,6 @@ def test_candidates_values_and_choices(made):
             np.testing.assert_array_equal(np.array(tensor["buffer"]), expected.ravel())
     (last,) = recording.at("log", "TextLog:text", len(result.views)).tolist()
     assert last == f"done: {result!r}"
-
-
-def test_frames_that_move_the_object_are_written_anew(tmp_path):
-    path = tmp_path / "frames.rrd"
-    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(distance=0.9)
-    session.observers.append(Recorder(path))
-    thing = [box((0.2, 0.3, 0.2), (0, 0, 0.1)), box((2, 2, 0.02), (0, 0, -0.01))]
-    seen = []
-    for azimuth in (0, 60, 140):
-        pose = pose_at(40, azimuth, 0.9, (0, 0, 0.1))
-        depth, _ = cast(thing, pose)
-        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
-        seen.append([view.observation for view in session.views])
-    recording = Recording(path)
-    moved = [step for step in (2, 3) if seen[step - 1][0] is not seen[step - 2][0]]
-    assert moved  # else this tests nothing
-    assert recording.steps("world/seen/1", "Points3D:positions") == [1, *moved]
-    for step in moved:
-        points = np.array(
-            recording.at("world/seen/1", "Points3D:positions", step).tolist()
-        )
-        np.testing.assert_allclose(points, seen[step - 1][0].points, atol=1e-6)
 
 
 def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tmp_path):

@@ -130,19 +130,6 @@ def test_a_region_is_empty_where_its_ground_is_seen(ycb, low, high, said):
     assert scene.target is not None
 
 
-def test_the_report_says_what_is_empty_and_what_is_not(ycb, capsys):
-    scene = nextview.Scene(ycb)
-    scene.update(from_above(np.full((480, 640), 0.8)))
-    print_scene(scene, "table")
-    assert "nothing stands on the plane" in capsys.readouterr().out
-    scene = nextview.Scene(ycb, region=around(0.15))
-    scene.update(sunk_bin(parts=True))
-    print_scene(scene, "bin")
-    said = " ".join(capsys.readouterr().out.split())
-    assert "neither ground nor an object" in said
-    assert "nothing stands" not in said
-
-
 def test_an_object_that_lost_its_name_is_not_settled(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"]])
     scene = nextview.Scene(ycb)

@@ -83,19 +83,6 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(distance):
     )
 
 
-def test_errors_of_neighbours_are_correlated_within_the_grain():
-    sensor = replace(SENSORS["none"], noise=0.001, grain=1.8)
-    depth, _ = plane(sensor, 1.0)
-    error = sensor.measure(depth, rng(5))[0].astype(float) - depth
-    for k in range(1, 7):
-        for a, b in ((error[k:], error[:-k]), (error[:, k:], error[:, :-k])):
-            assert (a * b).mean() / error.var() == pytest.approx(
-                np.exp(-(k**2) / (4 * 1.8**2)),
-                abs=0.03,
-            )
-    assert error.std() == pytest.approx(0.001, rel=0.05)
-
-
 def edge(sensor: Sensor, near: float = 0.8, far: float = 1.2) -> np.ndarray:
     """The left half is near, the right half far."""
     depth = np.full(sensor.shape, far, np.float32)
@@ -122,20 +109,6 @@ def test_edges_move_by_the_published_pixels_and_planes_stay():
         rtol=1e-3,
     )
     assert (source != np.arange(source.size).reshape(source.shape)).mean() > 0.5
-
-
-@pytest.mark.parametrize("tilt", [0, 60, 78, 84])
-@pytest.mark.parametrize("grain", [0.0, 1.8])
-def test_grazing_pixels_are_lost(tilt, grain):
-    sensor = replace(SENSORS["none"], grazing=0.3, grain=grain)
-    depth, angle = plane(sensor, 1.0, tilt)
-    some = depth > 0
-    some[:, :1] = some[:, -1:] = False
-    lost = (sensor.measure(depth, rng(9))[0] == 0)[some].mean()
-    assert lost == pytest.approx(
-        np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(),
-        abs=0.01 if grain == 0 else 0.03,
-    )
 
 
 @pytest.mark.parametrize("baseline", [0.05, 0.075])
@@ -198,40 +171,6 @@ def test_no_strength_no_error_to_the_bit(name):
     ]
     np.testing.assert_array_equal(views[0].depth, views[1].depth)
     np.testing.assert_array_equal(views[0].pose, views[1].pose)
-
-
-OF_FRAMES = ("centre", "size", "tilt", "table", "crop", "boxes", "turned", "moved")
-
-
-@pytest.mark.parametrize("error", [error for error in ERRORS if error not in OF_FRAMES])
-def test_stronger_is_noisier(error):
-    strength = (
-        getattr(SENSORS["kinect"], error) or getattr(SENSORS["stereo"], error) or 0.002
-    )
-    sensor = replace(SENSORS["none"], **{error: strength})
-    depth, _ = plane(sensor, 1.0, 74)
-    depth[200:280, 300:380] = np.minimum(depth[200:280, 300:380], 0.7)
-    wrong = []
-    for strength in (0, 0.5, 1, 2):
-        measured, _ = sensor.scaled(strength).measure(depth, rng(16))
-        wrong.append(np.minimum(np.abs(measured - depth), 0.5).sum())
-    assert wrong[0] == 0
-    assert all(np.diff(wrong) > 0)
-
-
-def test_a_sensor_without_errors_sees_the_ball_and_not_the_table():
-    camera = SensedCamera(BALL, "none", rng(17))
-    frame = camera.frame(SPHERE.poses[20])
-    rows, columns = np.nonzero(frame.mask)
-    on = np.linalg.norm(frame.positions(rows, columns), axis=1)
-    np.testing.assert_allclose(on, 0.12, rtol=0.01)
-    rows, columns = np.nonzero((frame.depth > 0) & ~frame.mask)
-    np.testing.assert_allclose(frame.positions(rows, columns)[:, 2], -0.12, atol=1e-4)
-    clean = SimulatedCamera(BALL).observe(SPHERE.poses[20])
-    seen = camera.observe(SPHERE.poses[20])
-    assert ((seen.depth > 0) != (clean.depth > 0)).mean() < 0.02
-    both = (seen.depth > 0) & (clean.depth > 0)
-    assert np.median(np.abs(seen.depth - clean.depth)[both]) < 0.005
 
 
 def test_errors_of_the_object_frame_have_their_strength():
@@ -380,21 +319,3 @@ def test_a_mesh_of_known_unit_is_simulated_at_true_size(name, radius):
         abs=0.03 * camera.sensor.distance,
     )
     assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
-
-
-def test_a_thing_of_a_millimetre_is_not_visible():
-    speck = make_mesh(BALL.vertices, BALL.faces, unit="mm")
-    camera = SensedCamera(speck, "wrist", rng(30))
-    assert not camera.observe(SPHERE.poses[0]).seen
-
-
-def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says():
-    ball = replace(BALL, unit="m")
-    assert SensedCamera(BALL, "wrist", rng(31)).sensor == SENSORS["wrist"]
-    assert (
-        SensedCamera(ball, "wrist", rng(31), true_size=False).sensor == SENSORS["wrist"]
-    )
-    assert (
-        SensedCamera(ball, "mix", rng(31)).sensor
-        == SensedCamera(BALL, "mix", rng(31)).sensor
-    )

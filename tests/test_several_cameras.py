@@ -3,7 +3,6 @@ folders of several cameras, and what a standing camera changes.
 """
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -50,7 +49,6 @@ from nextview.simulation.sensor import SENSORS
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))
-import documented_commands
 
 SENSOR = SENSORS["stereo"]
 RAYS = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
@@ -268,20 +266,6 @@ def test_a_folder_of_several_cameras_is_read(rig):
     assert refused_frames == {}
 
 
-def test_check_tells_the_error_of_a_camera(rig, capsys):
-    folder, _ = rig
-    main(["check", str(folder)])
-    said = " ".join(capsys.readouterr().err.split())
-    assert "8 frames contradict each other nowhere" in said
-    _, told = said.split("camera right is ")
-    millimetres, degrees = (
-        told.split(" mm and ")[0],
-        told.split(" mm and ")[1].split()[0],
-    )
-    assert float(millimetres) == pytest.approx(4, abs=1)
-    assert float(degrees) == pytest.approx(0.6, abs=0.15)
-
-
 def test_a_pose_in_another_world_is_refused(rig, tmp_path):
     _, moments = rig
     turned = trimesh.transformations.rotation_matrix(0.5, (1, 0, 0))
@@ -466,16 +450,3 @@ def test_a_session_takes_frames_of_both_cameras_until_it_ends(pair):
     )
     assert len(quick.update([left, right])) == 1
     assert quick.done
-
-
-def test_the_examples_of_the_page_run(capsys):
-    page = "docs/several_cameras.md"
-    names: dict = {}
-    exec(documented_commands.BEFORE[page], names)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
-    for block in blocks:
-        exec(block, names)
-    assert {thing.name for thing in names["scene"].objects} == {"mug", "mustard_bottle"}
-    assert len(names["look"].gone) == 1
-    assert names["look"].moved == ()
-    assert "camera right is" in capsys.readouterr().out

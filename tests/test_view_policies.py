@@ -11,7 +11,6 @@ import nextview
 from nextview.errors import PolicyError
 from nextview.scene.view_policies import NamedPolicy
 
-
 MINE = """
 import numpy as np
 

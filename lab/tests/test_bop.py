@@ -11,16 +11,11 @@ from bop_datasets import (
     IDS,
     NUMBERS,
     VIEWS,
-    write_models,
-    write_scene,
 )
-from factories import meshes_of
 from lab_programs import main, refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.folders import is_capture, read_capture
-from nextview.errors import NextviewError
 from nextview_lab.benchmark.bop import BopOptions, look_for_models
 from nextview_lab.benchmark.bop_dataset import BopModelInfo, ContinuousSymmetry
 from nextview_lab.benchmark.pose_recall import (
@@ -165,22 +160,6 @@ def test_an_interrupted_run_goes_on(own, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_an_image_without_depth_is_left_out_and_what_is_in_it_is_missed(
-    own, tmp_path, capsys
-):
-    (own / "test/000001/depth/000003.png").unlink()
-    out = tmp_path / "out.csv"
-    main(["bop", str(own), str(out), "--models", "ycb", "--ids", *IDS])
-    said = capsys.readouterr()
-    assert "left out: 000001/000003: " in said.err
-    assert "no such file" in said.err
-    assert {line["im_id"] for line in read_results(out)} == {7}
-    (row,) = [
-        row.split() for row in said.out.splitlines() if row.split()[:1] == ["all"]
-    ]
-    assert row == ["all", "4", "0.500", "0.500", "0.500"]
-
-
 def test_without_the_truth_nothing_is_compared(own, tmp_path, capsys):
     (own / "test/000001/scene_gt.json").unlink()
     out = tmp_path / "out.csv"
@@ -212,126 +191,6 @@ def test_what_is_hidden_counts_neither_way(own, tmp_path):
     hits = look_for_models(own, tmp_path / "out.csv", HOW).hits
     assert hits[hidden["obj_id"]].objects == 0
     assert [one.objects for one in hits.values()].count(2) == 1
-
-
-def test_models_are_taught_once_where_no_memory_is_named(tmp_path):
-    """A dataset of one model: what is taught is kept beside the results, and used again."""
-    dataset = tmp_path / "bop"
-    meshes = meshes_of(("mug",))
-    write_models(dataset / "models", meshes)
-    write_scene(dataset / "test/000001", meshes)
-    targets = [{"scene_id": 1, "im_id": VIEWS[0][0]}]
-    (dataset / "test_targets_bop24.json").write_text(json.dumps(targets))
-
-    out = tmp_path / "out.csv"
-    run = look_for_models(dataset, out)
-    assert (run.learned.things, run.not_known) == (1, ())
-    (line,) = read_results(out)
-    assert line["obj_id"] == NUMBERS["mug"]
-    assert surface_error(dataset, line) < 10
-    card = tmp_path / "out-memory/memory.json"
-    before = card.read_bytes(), card.stat().st_mtime_ns
-    assert look_for_models(dataset, out, overwrite=True).learned is None
-    assert (card.read_bytes(), card.stat().st_mtime_ns) == before
-
-    # the same names are not the same models, and another camera is not the same memory
-    with pytest.raises(
-        NextviewError, match="taught for the sensor wrist, not for kinect"
-    ):
-        look_for_models(dataset, out, BopOptions(sensor="kinect"), overwrite=True)
-    path = dataset / "models/obj_000014.ply"
-    model = trimesh.load(path)
-    model.apply_scale((1, 1, 1.2))
-    model.export(path)
-    with pytest.raises(
-        NextviewError, match=r"another file than \S+obj_000014.ply is now"
-    ):
-        look_for_models(dataset, out, overwrite=True)
-    assert read_results(out)[0]["obj_id"] == NUMBERS["mug"]
-
-
-def test_objects_without_a_model_are_listed_and_do_not_count(own, tmp_path, capsys):
-    path = own / SCENE / "scene_gt.json"
-    objects = json.loads(path.read_text())
-    for image, number in (("3", 77), ("7", 77), ("7", 41)):
-        objects[image].insert(0, {**objects[image][0], "obj_id": number})
-    path.write_text(json.dumps(objects))
-    out = tmp_path / "out.csv"
-    main(["bop", str(own), str(out), "--models", "ycb", "--ids", *IDS])
-    said = capsys.readouterr()
-    assert (
-        "object 41 has no model and does not count: it is in the images 1 time"
-        in said.err
-    )
-    assert (
-        "object 77 has no model and does not count: it is in the images 2 times"
-        in said.err
-    )
-    (row,) = [row for row in said.out.splitlines() if row.split()[:1] == ["all"]]
-    assert row.split()[:2] == ["all", "4"]
-
-
-def test_round_models_without_symmetries_are_told(own, tmp_path, capsys):
-    """The scan of a can stands for model 14; models_info.json then gets its axis."""
-    ids = ("--ids", "cracker_box=2", "tomato_soup_can=14", "--frames", "1")
-    main(["bop", str(own), str(tmp_path / "a.csv"), "--models", "ycb", *ids])
-    assert "has no symmetries_continuous of round models (14)" in " ".join(
-        capsys.readouterr().err.split()
-    )
-    info = json.loads((own / INFO).read_text())
-    info["14"]["symmetries_continuous"] = [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]
-    (own / INFO).write_text(json.dumps(info))
-    main(["bop", str(own), str(tmp_path / "b.csv"), "--models", "ycb", *ids])
-    assert "round models" not in capsys.readouterr().err
-
-
-def of_camera(dataset: Path, *cameras: str) -> None:
-    """Give the files of the scene to cameras, as BOP's datasets of several sensors name them."""
-    scene = dataset / SCENE
-    for camera in cameras:
-        for kind in ("scene_camera", "scene_gt"):
-            shutil.copy(scene / f"{kind}.json", scene / f"{kind}_{camera}.json")
-        shutil.copytree(scene / "depth", scene / f"depth_{camera}")
-    for kind in ("scene_camera", "scene_gt"):
-        (scene / f"{kind}.json").unlink()
-    shutil.rmtree(scene / "depth")
-
-
-def test_files_of_one_of_several_cameras_are_read(own, tmp_path, capsys):
-    of_camera(own, "photoneo")
-    shutil.copy(
-        own / SCENE / "scene_camera_photoneo.json",
-        own / SCENE / "scene_camera_cam1.json",
-    )
-    run = look_for_models(own, tmp_path / "out.csv", HOW)
-    assert {line["im_id"] for line in read_results(run.out)} == {3, 7}
-    assert sum(one.objects for one in run.hits.values()) == 4
-
-    capture = read_capture(own / SCENE)
-    assert [frame.name for frame in capture.frames] == ["000003", "000007"]
-    assert is_capture(own / SCENE)
-
-    shutil.copytree(own / SCENE / "depth_photoneo", own / SCENE / "depth_cam1")
-    out = tmp_path / "new.csv"
-    options = ("--models", "ycb", "--ids", *IDS)
-    found = refused(capsys, "bop", own, out, *options)
-    assert "--camera names one of cam1, photoneo" in found
-    found = refused(capsys, "bop", own, out, *options, "--camera", "xyz")
-    assert "no scene_camera_xyz.json; there are cam1, photoneo" in found
-    one = BopOptions(models="ycb", ids=IDS, camera="cam1", frames=1)
-    assert look_for_models(own, out, one).images == 1
-    both = read_capture(own / SCENE)
-    assert both.cameras == ("cam1", "photoneo")
-    assert [len(together) for together in both.moments] == [2, 2]
-
-
-def test_cameras_without_depth_are_told(own, tmp_path, capsys):
-    of_camera(own, "gray1", "gray2")
-    for camera in ("gray1", "gray2"):
-        shutil.rmtree(own / SCENE / f"depth_{camera}")
-    found = refused(capsys, "bop", own, tmp_path / "new.csv")
-    assert "none of its cameras (gray1, gray2) has depth images (depth_gray1/" in found
-    assert "none of its cameras (gray1, gray2)" in refused(capsys, "look", own / SCENE)
 
 
 # What users do wrong
@@ -413,27 +272,6 @@ def test_a_mistake_is_told_in_one_sentence(mistake, own, tmp_path, capsys):
     assert said in found
     assert not out.exists()
     assert not list(tmp_path.glob(".*"))
-
-
-def test_results_that_are_there_are_kept(own, tmp_path, capsys):
-    out = tmp_path / "out.csv"
-    out.write_text("mine")
-    options = ("--models", "ycb", "--ids", *IDS)
-    assert "exists; give another name" in refused(capsys, "bop", own, out, *options)
-    assert out.read_text() == "mine"
-    assert "no such folder" in refused(capsys, "bop", own / "x", tmp_path / "new.csv")
-    assert "ends in .csv" in refused(capsys, "bop", own, tmp_path / "new.txt")
-
-
-def test_a_camera_without_a_pose_is_told(own, tmp_path):
-    path = own / SCENE / "scene_camera.json"
-    cameras = json.loads(path.read_text())
-    for camera in cameras.values():
-        del camera["cam_R_w2c"]
-    path.write_text(json.dumps(cameras))
-    how = BopOptions(models="ycb", ids=IDS, camera_poses=True)
-    with pytest.raises(NextviewError, match="lacks the camera's pose"):
-        look_for_models(own, tmp_path / "out.csv", how)
 
 
 # Errors of poses, against what is computed by hand

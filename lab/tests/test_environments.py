@@ -16,7 +16,6 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env
 
 import nextview_lab.benchmark.environments  # noqa: F401
-from nextview.errors import DatasetError
 from nextview.policies.baselines import Spread
 from nextview.policies.learned_tables import cells_to
 from nextview.recognition.belief import Calibration, Stopping
@@ -174,38 +173,6 @@ def test_an_episode_is_the_loop_of_a_robot():
         assert ended or len(expected.steps) == 1
         if len(expected.steps) > 1:
             assert np.isclose(info["travel"], expected.outcome.travel[0])
-
-
-@pytest.mark.filterwarnings("error")
-def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
-    from nextview.session.session import Session
-    from nextview.session.system import load, simulated
-
-    options = {"depth": True, "size": 112, "inputs": ("belief", "place", "lem-sphere")}
-    env = gymnasium.make("nextview/RecogniseMesh-v0", **options)
-    check_env(env.unwrapped, skip_render_check=True)
-    observation, _ = env.reset(seed=1)
-    assert observation["depth"].shape == (112, 112)
-    assert observation["depth"].max() > 2
-    # The beliefs are those of a session that takes the same views.
-    from nextview.data.samples import SAMPLE_MESHES, sample_mesh
-
-    plain = gymnasium.make("nextview/RecogniseMesh-v0", inputs=("belief",), max_views=2)
-    observation, _ = plain.reset(options={"object": 0, "start": 3})
-    system = load(policy="spread", max_views=2)
-    camera = simulated(sample_mesh(next(iter(SAMPLE_MESHES))))
-    session: Session = system.session(start=3)
-    np.testing.assert_allclose(
-        observation[:10],
-        session.update(camera.observe(session.pose)).belief,
-        atol=1e-5,
-    )
-    with pytest.raises(DatasetError, match="no such folder"):
-        gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path / "none"))
-    (tmp_path / "spoon/train").mkdir(parents=True)
-    (tmp_path / "spoon/train/box.off").write_text("OFF\n")
-    with pytest.raises(DatasetError, match="knows no class 'spoon'"):
-        gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path))
 
 
 def test_the_examples_of_the_page_run(tmp_path, monkeypatch):

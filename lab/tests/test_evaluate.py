@@ -14,30 +14,6 @@ from scipy.stats import bootstrap
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration
 from nextview_lab.benchmark.evaluation import evaluate, fused_views
-from nextview_lab.benchmark.published import (
-    published_map,
-    published_recognisers,
-    read_table,
-)
-
-TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
-
-
-def test_published_scores_are_shown_only_for_their_own_setting():
-    assert published_recognisers(TEN, 40)[0] == ("ResNet34", 32, 0.871)
-    assert published_recognisers(TEN[::-1], 12) == [("ResNet18", 32, 0.8901)]
-    assert (
-        published_recognisers(TEN, 7) == published_recognisers(("cat", "dog"), 40) == []
-    )
-    assert published_map("lcm", "class_d_le_1", TEN) == 0.2332
-    assert published_map("lcm", "d_le_1", TEN, "bed") is None
-    assert (
-        published_map("lem", "regret", TEN)
-        is published_map("lem", "d0", ("cat", "dog"))
-        is None
-    )
-    assert published_map("gain", "d0", TEN) is None
-
 
 RING = ViewSphere((45.0,), 3)
 
@@ -90,25 +66,6 @@ def test_accuracy_by_hand():
     assert of[3, "", "accuracy"] == (3 / 4, 4)
     assert of[3, "", "class_clean_accuracy"] == (1 / 2, 3)
     assert table["published"].isna().all()
-
-
-def test_accuracy_without_size_is_reported():
-    p = by_hand()
-    of_size = np.where(np.eye(2)[p.labels] > 0, 0, -99).astype(np.float32)
-    sized = replace(p, logits=p.logits + of_size[:, None], of_size=of_size)
-    known, shape = (
-        evaluate(x, 50, np.random.default_rng(0)).accuracy for x in (sized, p)
-    )
-    for row in shape.query(
-        "measure == 'accuracy' or measure == 'class_accuracy'"
-    ).itertuples():
-        before = row.measure.removesuffix("accuracy")
-        here = {"n_views": row.n_views, "label": row.label}
-        assert (
-            score(known, **here, measure=f"{before}shape_accuracy").value == row.value
-        )
-        assert score(known, **here, measure=row.measure).value == 1
-    assert "shape_accuracy" not in set(shape["measure"])
 
 
 def test_confusion_and_calibration_by_hand():
@@ -225,18 +182,3 @@ def test_map_scores_by_hand():
     assert of_class.value == pytest.approx(0, abs=1e-12)
     mean = score(found.maps, map="lem", by="mean map", label="", measure="mse")
     assert mean.value == pytest.approx(((4 / 9) ** 2 + (1 / 9) ** 2 + (5 / 9) ** 2) / 3)
-
-
-def test_lcm_leaves_out_objects_that_are_never_recognised():
-    found = evaluate(by_hand(), 50, np.random.default_rng(0))
-    assert found.left_out == {
-        "lcm": "without the objects that are recognised from no view: 1 of 4"
-    }
-    lcm = found.maps[found.maps["map"] == "lcm"]
-    assert set(lcm["label"]) == {"", "a"}
-    # confidences 0.9 where right: (.9, .9, .9), (.9, 0, 0), (.9, .9, 0); each cell stands in every
-    # column once
-    off = [1.63] * 3 + [0.81 + 1] * 2 + [0.01] + [1.62 + 1, 0.81 + 0.01, 0.81 + 0.01]
-    assert score(lcm, by="network", label="", measure="mse").value == pytest.approx(
-        sum(off) / 27
-    )

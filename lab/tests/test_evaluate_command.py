@@ -2,8 +2,6 @@
 
 import csv
 import json
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +12,8 @@ from lab_programs import main, refused
 from pipeline import some_predictions
 
 from nextview.files import sha256_of
-from nextview.recognition.model_card import ModelCard, read_card, write_card
+from nextview.recognition.model_card import ModelCard, write_card
 from nextview.recognition.network_input import InputSpec
-from nextview_lab.benchmark import evaluation_page
-from nextview_lab.data.predictions import Predictions
 
 TABLES = ("accuracy", "fusion", "confusion", "reliability", "maps")
 
@@ -47,69 +43,6 @@ def test_the_folder_holds_tables_settings_and_a_page(made):
     assert all(len(table(made, name)) > 1 for name in TABLES)
     assert (made / "out" / "evaluate.html").read_text().count("data:image/svg+xml") == 4
     assert sorted(path.name for path in made.iterdir() if "part" in path.name) == []
-
-
-def test_the_page_shows_the_numbers_of_the_tables(made):
-    text = (made / "out" / "evaluate.html").read_text()
-    of = {
-        (int(row["n_views"]), row["label"], row["measure"]): float(row["value"])
-        for row in table(made, "accuracy")
-    }
-    cells = re.findall(
-        r"<td>([\d.]+)",
-        re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0],
-    )
-    shown = [
-        (n_views, "pillar", measure)
-        for n_views in (1, 40)
-        for measure in ("accuracy", "clean_accuracy")
-    ]
-    assert cells == ["10", *(f"{of[key]:.3f}" for key in shown)]
-    mse = next(
-        float(row["value"])
-        for row in table(made, "maps")
-        if (row["map"], row["label"]) == ("lem", "box")
-    )
-    section = text[text.index('id="lem"') : text.index('id="lcm"')]
-    assert (
-        f"<td>{mse:.4f}"
-        in re.search(r'<tr><th scope="row">box</th>.*?</tr>', section)[0]
-    )
-
-
-def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys):
-    replace(Predictions.load(made / "p.npz"), models={}).save(tmp_path / "p.npz")
-    more = ["--samples", "50", "--figures", str(tmp_path / "fig")]
-    main(["evaluate", str(tmp_path / "p.npz"), str(tmp_path / "out"), *more])
-    written = {path.name for path in (tmp_path / "fig").iterdir()}
-    assert written >= {f"fusion.{kind}" for kind in ("pdf", "svg", "csv", "tex")}
-    assert table(tmp_path, "accuracy") == table(made, "accuracy")
-
-
-def test_a_card_that_changed_while_it_was_judged_keeps_the_change(
-    predictions,
-    models,
-    tmp_path,
-    monkeypatch,
-):
-    for path in models.iterdir():
-        shutil.copy(path, tmp_path)
-    card = tmp_path / "tiny.json"
-    judge = evaluation_page.evaluate
-
-    def slowly(*given):
-        write_card(card, msgspec.structs.replace(read_card(card), note="changed"))
-        return judge(*given)
-
-    monkeypatch.setattr(evaluation_page, "evaluate", slowly)
-    settings = evaluation_page.EvaluationSettings(
-        "test",
-        cards=(str(card),),
-        samples=10,
-    )
-    evaluation_page.write_evaluation(predictions, tmp_path / "out", settings)
-    after = read_card(card)
-    assert (after.note, list(after.scores)) == ("changed", ["test (6 objects)"])
 
 
 def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(

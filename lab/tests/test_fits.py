@@ -1,9 +1,7 @@
 """What is fitted to predictions, against generated evidence whose answer is known."""
 
 import json
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,22 +10,13 @@ from pipeline import some_predictions, train_predictions
 from scipy.special import log_softmax, softmax
 from scipy.stats import binomtest
 
-from nextview import SimulatedCamera
-from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
-from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
-from nextview.policies.registry import make_policy
+from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
-from nextview.recognition.novelty import values_of
-from nextview.teaching.view_features import embeddings
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.splits import divide
-from nextview_lab.errors import PredictionsError
-from nextview_lab.training import card_fits as calibration
 from nextview_lab.training.card_fits import (
     error_bound,
     fit_calibration,
@@ -36,11 +25,10 @@ from nextview_lab.training.card_fits import (
     loss,
     valley_gains,
 )
-from nextview_lab.training.fitting_set import blind_walks, card_to_fit
-from nextview_lab.training.unknown import fit_novelty, fit_unknown
+from nextview_lab.training.fitting_set import blind_walks
+from nextview_lab.training.unknown import fit_novelty
 from research.fit_policies import (
     fit_class_table,
-    fit_policies,
     fit_ring,
     fit_sequence,
     fitting_set,
@@ -225,15 +213,6 @@ def test_a_shape_that_was_copied_counts_once():
     )
 
 
-def test_it_is_fitted_to_the_objects_that_validate():
-    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
-    _, validation = divide(p.labels, p.depth_entropy, 0.2, 3)
-    data = fitting_set(p, 0.2, 3)
-    np.testing.assert_array_equal(data.logits, p.logits[validation])
-    assert np.bincount(data.labels).tolist() == [4, 4, 4]
-    assert len(fitting_set(p, 1.0, 3)) == 60
-
-
 # Tables
 
 
@@ -378,109 +357,6 @@ def test_a_calibration_goes_into_the_card_and_is_used(
     assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(
-    training_predictions,
-):
-    card, path = training_predictions
-    named = fit_calibration(path, card).calibration
-    unnamed = replace(Predictions.load(path), models={})
-    unnamed.save(path, overwrite=True)
-    assert fit_calibration(path, card).calibration == named
-    replace(unnamed, classes=("ball", "box", "cone")).save(path, overwrite=True)
-    with pytest.raises(PredictionsError, match="another recogniser"):
-        fit_calibration(path, card)
-
-
-def test_a_calibration_by_a_bad_sensor_trusts_views_less(
-    training_predictions,
-    tmp_path,
-):
-    card, path = training_predictions
-    p = Predictions.load(path)
-    change_card(card, held_out=list(p.names[:60]))
-    clean = fit_calibration(path, card).calibration
-    # the same objects, in another order
-    order = np.random.default_rng(1).permutation(90)
-    noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
-    sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of_objects(order)
-    sensed.save(tmp_path / "sensed.npz")
-    fitted = fit_calibration(path, card, sensed=(tmp_path / "sensed.npz",)).calibration
-    assert fitted.temperature > 1.5 * clean.temperature
-    assert json.loads(card.read_text())["fitted_to"]["calibration"].startswith(
-        "60 objects"
-    )
-    sensed.of_objects(np.arange(50)).save(tmp_path / "few.npz")
-    with pytest.raises(PredictionsError, match="lacks"):
-        fit_calibration(path, card, sensed=(tmp_path / "few.npz",))
-
-
-def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(
-    training_predictions,
-    monkeypatch,
-):
-    card, path = training_predictions
-    whole, p = json.loads(card.read_text()), Predictions.load(path)
-
-    def fit_slowly(*given, **options):
-        with (
-            pytest.raises(DatasetError, match="another run is writing it"),
-            card_to_fit(card),
-        ):
-            pass
-        change_card(card, note="changed")
-        return fit_temperature(*given, **options)
-
-    monkeypatch.setattr(calibration, "fit_temperature", fit_slowly)
-    with pytest.raises(ModelError, match="was changed while this ran"):
-        fit_calibration(path, card)
-    for spoilt, sentence in [
-        (replace(p, splits=np.array(["test"] * 90)), "test split"),
-        (replace(p, models={"recogniser": ("other", "f" * 64)}), "another recogniser"),
-    ]:
-        spoilt.save(path, overwrite=True)
-        with pytest.raises(PredictionsError, match=sentence):
-            fit_calibration(path, card)
-    assert json.loads(card.read_text()) == whole | {"note": "changed"}
-
-
-def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_path):
-    _, path = training_predictions
-    made = fit_policies(path, tmp_path / "learned", length=3)
-    assert sorted(c.stem for c in made.cards) == [
-        "class-table",
-        "class-table-local",
-        "class-table-near",
-        "fixed-ring",
-        "fixed-ring-local",
-        "fixed-sequence",
-        "fixed-sequence-local",
-        "fixed-sequence-near",
-    ]
-    data = fitting_set(Predictions.load(path), 0.1, 0)
-    fitted = fit_temperature(data, np.random.default_rng([0, 0]), walks=1 + 8000 // 9)
-    values = fit_class_table(data, 5, 20.0, fitted, np.random.default_rng(0))
-    for card in made.cards:
-        policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
-        if isinstance(policy, ClassTable):
-            travel_weight = 0.01 if card.stem.endswith("near") else 0.0
-            for ring, azimuth in [(0, 0), (2, 5)]:
-                view = 8 * ring + azimuth
-                paid = (
-                    values[:, ring, cells_to(SPHERE)[view]]
-                    - travel_weight * SPHERE.travel[view]
-                )
-                here = policy.values[:, ring, cells_to(SPHERE)[view]]
-                np.testing.assert_allclose(here, paid, atol=1e-5)
-    foreign = tmp_path / "learned/fixed-ring-local.json"
-    for card in made.cards:
-        card.unlink()
-    foreign.write_text("of somebody else")
-    with pytest.raises(ResultsError, match="exists"):
-        fit_policies(path, tmp_path / "learned", length=3)
-    assert [p.name for p in foreign.parent.iterdir()] == [foreign.name]
-    assert foreign.read_text() == "of somebody else"
-
-
 def test_valley_classes_are_those_that_gain_by_the_valley():
     logits = np.zeros((2, 40, 2))
     high = SPHERE.ring == 4
@@ -526,38 +402,3 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
             usual, novel = (score.p_value(scores, n) < 0.05 for scores in novelty)
             assert usual.mean() == pytest.approx(0.05, abs=0.03)
             assert novel.mean() > 0.8
-
-
-def test_a_recogniser_learns_to_notice_unknown_objects(
-    furniture,
-    models,
-    tmp_path,
-    caplog,
-):
-    card = Path(shutil.copy(models / "tiny.json", tmp_path))
-    shutil.copy(models / "tiny.onnx", tmp_path)
-    assert NetworkRecogniser(card).novelty is None
-    meshes = Path(shutil.copytree(furniture, tmp_path / "meshes"))
-    broken = min(meshes.glob("*/train/*.off"))
-    broken.write_text("OFF\n3 1 0\n0 0 0\n")
-    with pytest.raises(UsageError, match="no sensor is called 'foo'"):
-        fit_unknown(meshes, card, sensor="foo", workers=0)
-
-    fitted = fit_unknown(meshes, card, workers=0)
-    assert (fitted.objects, fitted.held_out, fitted.left_out) == (5, 6, 1)
-    (said,) = [record.getMessage() for record in caplog.records]
-    assert said.startswith(f"left out: {broken}: not a readable OFF mesh")
-    taught, about = NetworkRecogniser(card), read_card(card).fitted_to["novelty"]
-    assert "calibrated on 6 others" in about
-    views = [
-        SimulatedCamera(sample_mesh("chair")).observe(pose) for pose in SPHERE.poses[:3]
-    ]
-    evidence = taught(views)
-    np.testing.assert_allclose(
-        values_of(evidence.novelty),
-        taught.novelty.scores(embeddings(views), True),
-        atol=1e-5,
-    )
-    sensed = taught([replace(view, exact=False) for view in views])
-    np.testing.assert_array_equal(sensed.logits, evidence.logits)
-    assert set(values_of(sensed.novelty)).isdisjoint(values_of(evidence.novelty))

@@ -10,7 +10,6 @@ import sys
 import time
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
-from functools import wraps
 from itertools import pairwise
 
 import pytest
@@ -18,7 +17,7 @@ from factories import run_python
 from lab_programs import COMMANDS, called, main
 
 from nextview.checks import EXTRAS
-from nextview.cli.call_with_arguments import call, entry, find
+from nextview.cli.call_with_arguments import entry, find
 from nextview.cli.option_names import option_names
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
@@ -52,24 +51,6 @@ def test_every_command_explains_itself(name, capsys):
 def example_of(name):
     """The command line in the help of a command, with its program."""
     return f"{name.partition(' ')[0]} {COMMANDS[name].example}"
-
-
-@pytest.mark.parametrize("name", OF_LAB)
-def test_the_example_of_a_help_is_a_command_line(name, monkeypatch):
-    pytest.importorskip("torch")
-    command = COMMANDS[name]
-    module, _, function = command.function.partition(":")
-    called = []
-
-    @wraps(find(command.function))
-    def run(*arguments, **options):
-        called.append((arguments, options))
-
-    monkeypatch.setattr(f"{module}.{function}", run)
-    words = example_of(name).split()
-    assert " ".join(words[: len(name.split())]) == name
-    call(name, command, words[len(name.split()) :], None)
-    assert len(called) == 1
 
 
 @pytest.mark.parametrize("name", OF_LAB)
@@ -140,24 +121,6 @@ def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, furniture):
     assert interrupted([*LAB_COMMAND, *command], begun) == (130, again)
     main(command)
     assert ViewStore.open(store).done.all()
-
-
-@pytest.mark.parametrize(
-    ("package", "arguments", "extra"),
-    [
-        ("torch", ["train", "recogniser", "s", "run"], "train"),
-        ("pandas", ["benchmark", "classes", "p.npz"], "benchmark"),
-    ],
-)
-def test_a_missing_extra_is_named_with_its_install_command(package, arguments, extra):
-    code = (
-        f"import sys; sys.modules[{package!r}] = None; from nextview_lab.cli.main import main;"
-        f" main({arguments!r})"
-    )
-    done = run_python(code)
-    assert done.returncode == 2
-    assert f"pip install 'nextview-lab[{extra}]'" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 MISSING = [

@@ -5,7 +5,6 @@ with the same answers.
 import os
 import pickle
 import sys
-from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
@@ -15,24 +14,12 @@ torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
 from nextview_lab.training.architectures import (
-    InvertedBottleneck,
-    LiteNet,
     PointNet,
     ResNet,
 )
 from nextview_lab.training.export import export_onnx
 from nextview_lab.training.runs import start_from
 
-LITE0 = (
-    (16, 3, 1),
-    (24, 3, 2),
-    (40, 5, 2),
-    (80, 3, 3),
-    (112, 5, 3),
-    (192, 5, 4),
-    (320, 3, 1),
-)
-"""Width, kernel and blocks of the stages of EfficientNet-Lite0."""
 BLOCKS = {
     18: (2, 2, 2, 2),
     34: (3, 4, 6, 3),
@@ -122,29 +109,6 @@ def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
     assert all(torch.equal(ours[name], value) for name, value in state.items())
 
 
-@pytest.mark.parametrize("channels", [1, 4])
-def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_last_layer(
-    tmp_path,
-    channels,
-):
-    state = checkpoint(tmp_path / "rgb.pth", classes=5)
-    rgb, ours = ResNet(18, 5, 3), ResNet(18, 10, channels)
-    before = ours.fc.weight.clone()
-    for network in (rgb, ours):
-        start_from(network, tmp_path / "rgb.pth")
-    assert torch.equal(ours.fc.weight, before)
-    assert torch.equal(ours.layer3[0].conv1.weight, state["layer3.0.conv1.weight"])
-    grey = torch.rand(2, 1, 32, 32)
-    with torch.no_grad():
-        expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
-        assert torch.allclose(
-            ours.conv1(grey.expand(-1, channels, -1, -1)),
-            expected,
-            rtol=1e-4,
-            atol=1e-5,
-        )
-
-
 class Bomb:
     """Unpickled, it makes a folder."""
 
@@ -202,100 +166,6 @@ def test_broken_and_foreign_files_are_refused_and_nothing_is_executed(tmp_path, 
     assert all(
         torch.equal(before[name], value) for name, value in network.state_dict().items()
     )
-
-
-def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
-    """Random weights under the names that published checkpoints use, from the network's plan in
-    words.
-    """
-    rng, state = torch.Generator().manual_seed(seed), {}
-
-    def convolution(name, *shape):
-        state[f"{name}.weight"] = (
-            torch.randn(shape, generator=rng) / (shape[1] * shape[2] * shape[3]) ** 0.5
-        )
-
-    def norm(name, width):
-        for part in ("weight", "bias", "running_mean"):
-            state[f"{name}.{part}"] = torch.randn(width, generator=rng) / 10 + (
-                part == "weight"
-            )
-        state[f"{name}.running_var"] = torch.rand(width, generator=rng) + 0.5
-        state[f"{name}.num_batches_tracked"] = torch.tensor(7)
-
-    convolution("_conv_stem", 32, 3, 3, 3)
-    norm("_bn0", 32)
-    inputs, index = 32, 0
-    for widths, kernel, repeats in LITE0:
-        for _ in range(repeats):
-            block, wide = f"_blocks.{index}", inputs * (6 if index else 1)
-            if index:
-                convolution(f"{block}._expand_conv", wide, inputs, 1, 1)
-                norm(f"{block}._bn0", wide)
-            convolution(f"{block}._depthwise_conv", wide, 1, kernel, kernel)
-            norm(f"{block}._bn1", wide)
-            convolution(f"{block}._project_conv", widths, wide, 1, 1)
-            norm(f"{block}._bn2", widths)
-            inputs, index = widths, index + 1
-    convolution("_conv_head", 1280, inputs, 1, 1)
-    norm("_bn1", 1280)
-    state["_fc.weight"] = torch.randn(classes, 1280, generator=rng) / 1280**0.5
-    state["_fc.bias"] = torch.randn(classes, generator=rng)
-    torch.save(state, path)
-    return state
-
-
-def test_it_is_as_large_as_published():
-    """4.7 million parameters and 407 million multiplications (TensorFlow's EfficientNet-Lite,
-    2020).
-    """
-    network, products = LiteNet(1000, 3).eval(), []
-    for part in network.modules():
-        if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
-            weights = part.weight.numel()
-            part.register_forward_hook(
-                lambda _, __, out, weights=weights: products.append(
-                    weights * out[0, 0].numel()
-                )
-            )
-    network(torch.zeros(1, 3, 224, 224))
-    assert sum(p.numel() for p in network.parameters()) == pytest.approx(
-        4.7e6,
-        rel=0.02,
-    )
-    assert sum(products) == pytest.approx(407e6, rel=0.06)
-
-
-def test_a_published_checkpoint_loads_whole(tmp_path):
-    state = lite_checkpoint(tmp_path / "lite.pth")
-    network = LiteNet(1000, 3)
-    start_from(network, tmp_path / "lite.pth")
-    ours = network.state_dict()
-    assert len(ours) == len(state)
-    assert torch.equal(ours["stem.weight"], state["_conv_stem.weight"])
-    assert torch.equal(
-        ours["stages.15.depthwise.weight"],
-        state["_blocks.15._depthwise_conv.weight"],
-    )
-    assert torch.equal(
-        ours["stages.3.norm2.running_var"],
-        state["_blocks.3._bn2.running_var"],
-    )
-    assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
-    assert torch.equal(ours["fc.weight"], state["_fc.weight"])
-
-
-def test_blocks_are_skipped_for_some_images_in_training_alone():
-    block = InvertedBottleneck(4, 6, 4, 3, 1, skip=0.25)
-    x = torch.rand(1, 4, 5, 5).expand(4000, -1, -1, -1)
-    whole = (block(x) - x).detach()
-    done = whole.flatten(1).abs().amax(1) > 0
-    assert done.float().mean().item() == pytest.approx(0.75, abs=0.03)
-    block.skip = 0.0
-    assert torch.allclose(whole[done] * 0.75, (block(x) - x)[done], atol=1e-6)
-    block.skip = 0.25
-    block.eval()
-    assert (block(x) - x).flatten(1).abs().amax(1).min() > 0
 
 
 def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():

@@ -270,25 +270,6 @@ def test_a_package_that_an_output_needs_is_missed_before_an_input_is_read(
     assert f"needs the package {package}" in refused(capsys, *line.split())
 
 
-def test_the_demo_draws_over_its_own_picture_and_no_other(
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
-    monkeypatch.chdir(tmp_path)
-    picture = tmp_path / "nextview_demo.png"
-    picture.write_bytes(b"of an earlier run")
-    main(["demo-episode"])
-    assert "wrote nextview_demo.png" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["nextview_demo.png"]
-    with Image.open(picture) as drawn:
-        assert min(drawn.size) > 300
-    mine = tmp_path / "mine.png"
-    mine.write_bytes(b"mine")
-    assert "mine.png: exists" in refused(capsys, "demo-episode", "--figure", mine)
-    assert mine.read_bytes() == b"mine"
-
-
 @pytest.mark.parametrize("name", WRITES)
 def test_what_exists_is_refused_and_overwritten_on_demand_only(
     name,

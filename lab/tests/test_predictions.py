@@ -4,7 +4,6 @@ is damaged.
 
 import io
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,24 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lab_programs import main, refused
-from pipeline import SPHERE, some_predictions
-from scipy.special import softmax
+from pipeline import some_predictions
 
-from nextview.errors import DatasetError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
-from nextview.recognition.network_input import InputSpec, from_store
 from nextview_lab.data.predicting import predict
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.rendering import render
 from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import PredictionsError
-
-SPEC = InputSpec("geometry", 32)
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path):
@@ -171,87 +163,6 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
     # depth as rendered.
     lem = MapNetwork(models / "tiny-lem.json")([observation])["lem"][0]
     np.testing.assert_allclose(found.maps["lem"][i, v], lem, atol=5e-4)
-
-
-def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(
-    views,
-    models,
-    predictions,
-):
-    made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
-    recogniser = NetworkRecogniser(models / "tiny.json")
-    logits = np.stack(
-        [recogniser.from_inputs(from_store(SPEC, store, i)).logits for i in range(18)]
-    )
-    own = Predictions.from_logits(views, logits, made.classes)
-    np.testing.assert_allclose(own.logits, made.logits, atol=1e-5)
-    assert own.models == {}
-    for name in ("names", "classes", "sphere", "store"):
-        assert getattr(own, name) == getattr(made, name)
-    for name in ("labels", "splits", "conflicting", "depth_entropy"):
-        np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
-    tested = Predictions.from_logits(
-        store,
-        logits[made.splits == "test"],
-        made.classes,
-        "test",
-    )
-    assert tested.names == made.of_split("test").names
-    with pytest.raises(
-        PredictionsError,
-        match="logits of these predictions has the shape",
-    ):
-        Predictions.from_logits(views, logits, made.classes, "test")
-    with pytest.raises(DatasetError, match="does not know the class"):
-        Predictions.from_logits(views, logits, ("a", "b", "c"))
-    with pytest.raises(PredictionsError, match="these are probabilities"):
-        Predictions.from_logits(views, softmax(logits, 2), made.classes)
-
-
-def test_the_same_mesh_under_two_labels_is_marked_across_splits(
-    furniture,
-    models,
-    tmp_path,
-):
-    for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
-        path = tmp_path / f"meshes/{place}.off"
-        path.parent.mkdir(parents=True)
-        shutil.copy(
-            furniture
-            / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off",
-            path,
-        )
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
-    list(
-        predict(
-            tmp_path / "views.zarr",
-            tmp_path / "p.npz",
-            cards(models)[0],
-            {},
-            "test",
-            workers=0,
-        )
-    )
-    found = Predictions.load(tmp_path / "p.npz")
-    assert dict(zip(found.names, found.conflicting, strict=True)) == {
-        "chair_4": True,
-        "monitor_4": False,
-    }
-
-
-def test_maps_of_other_viewpoints_are_left_out_or_refused_before_any_work(
-    furniture, models, tmp_path, capsys
-):
-    """One ring of 12 views; the networks of the tests are of the 40."""
-    store, out = tmp_path / "views.zarr", tmp_path / "p.npz"
-    meshes = Path(shutil.copytree(furniture / "chair/test", tmp_path / "m/chair/test"))
-    list(render(meshes.parents[1], store, ViewSphere.named("12"), 32, workers=0))
-    begin = ["predict", str(store), str(out), "--models", str(models), "--workers", "0"]
-    assert "of other views than the 12" in refused(capsys, *begin, "--maps", "lem")
-    assert not list(tmp_path.glob(".p.npz*"))
-    main(begin)
-    assert "lem" in capsys.readouterr().err
-    assert Predictions.load(out).maps == {}
 
 
 KILLED = """

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.data.pool import WorkerDied, each
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview_lab.data.rendering import render
@@ -148,15 +147,6 @@ def test_broken_meshes_are_recorded_and_tried_again(meshes, tmp_path):
     ]  # a later run says it again
 
 
-def test_identical_meshes_are_known_by_their_bytes(meshes, tmp_path):
-    shutil.copy(meshes / "chair/train/chair_1.off", meshes / "chair/train/twin.off")
-    list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
-    store = ViewStore.open(tmp_path / "views.zarr")
-    assert [{store.names[i] for i in group} for group in store.duplicates] == [
-        {"chair_1", "twin"}
-    ]
-
-
 def test_a_box_is_stored_as_it_is_seen(tmp_path):
     """The nearest face of a box, straight ahead: its depth, its points and its silhouette are
     known.
@@ -186,18 +176,6 @@ def test_a_box_is_stored_as_it_is_seen(tmp_path):
         assert np.count_nonzero(depth[view]) == pytest.approx(pixels, rel=0.03)
     np.testing.assert_array_equal(image > 0, depth > 0)
     assert (np.abs(points) <= half + 2e-4).all()
-
-
-def die_on_three(item: int) -> int:
-    if item == 3:
-        os._exit(9)
-    return item * item
-
-
-def test_an_item_that_kills_its_process_is_the_only_one_lost():
-    results = dict(each(die_on_three, range(8), workers=2))
-    assert isinstance(results.pop(3), WorkerDied)
-    assert results == {i: i * i for i in range(8) if i != 3}
 
 
 KILLER = """

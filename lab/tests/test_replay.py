@@ -2,7 +2,7 @@
 promise.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -12,7 +12,6 @@ from scipy.special import log_softmax, softmax
 
 from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration, Stopping
@@ -93,11 +92,6 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
     )
 
 
-def uncertain(seen, threshold):
-    """A user's stopping rule."""
-    return (seen.entropy < threshold) | (seen.n_views > 3) & (seen.margin > 0.2)
-
-
 @pytest.mark.parametrize("threshold", [0.2, 0.6])
 def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(
     specs,
@@ -172,45 +166,6 @@ def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike
         truncate(replay("lem", specs, 9, 0), rule)
 
 
-def test_episodes_of_one_system_do_not_share_what_a_rule_compares(specs):
-    """Two episodes side by side stop as each does alone."""
-    p, rule = specs.predictions, own_stopping(settled, 0.2, 9)
-    policy = make_policy("lem", p.sphere, specs.valley_classes("lem"))
-    together = run_episodes(
-        evidence_of(p, specs.objects[:6]),
-        p.sphere,
-        policy,
-        specs.starts[:6],
-        rule,
-        np.random.default_rng(0),
-    ).outcome
-    for k in range(6):
-        alone = run_episodes(
-            evidence_of(p, specs.objects[k : k + 1]),
-            p.sphere,
-            policy,
-            specs.starts[k : k + 1],
-            rule,
-            np.random.default_rng(0),
-        ).outcome
-        assert alone.n_views[0] == together.n_views[k]
-
-
-def test_errors_of_a_stopping_rule_are_one_sentence():
-    belief = np.full((4, 3), 1 / 3)
-    for rule, words in [
-        ("test_replay:nothing", "cannot be made"),
-        ("entropy", "MODULE:NAME"),
-        (
-            lambda seen, threshold: seen.belief > threshold,
-            r"bool of the shape \(4,\), not bool of \(4, 3\)",
-        ),
-        (lambda seen, threshold: 1 / 0, "raised ZeroDivisionError"),
-    ]:
-        with pytest.raises(UsageError, match=words):
-            own_stopping(rule, 0.5, 5).reached(belief, 1)
-
-
 @pytest.mark.parametrize("knows_bins", [False, True])
 def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_bins):
     calibration, likely = Calibration(0.8, 0.5), None
@@ -246,34 +201,6 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_
             assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
 
 
-def test_each_map_has_the_valley_classes_of_its_own_card():
-    p = some_predictions(6)
-    lcm = {
-        "maps": p.maps | {"lcm": p.maps["lem"]},
-        "valley_classes": {"lem": p.classes[:1], "lcm": p.classes[1:2]},
-    }
-    specs = make_specs(replace(p, **lcm), 2, 0)
-    assert (specs.valley_classes("lem"), specs.valley_classes("lcm")) == ((0,), (1,))
-    peak, valley = (
-        replay(name, specs, 2, 0).views[:, 1]
-        for name in ("lcm-peak", "lcm-oracle-valley")
-    )
-    assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
-
-
-def test_a_true_map_is_found_by_the_name_of_its_measure(specs):
-    found = [
-        replay(f"true-{name}-peak", specs, max_views=4, seed=0).views
-        for name in ("depth_entropy", "lem")
-    ]
-    np.testing.assert_array_equal(*found)
-    with pytest.raises(
-        EntryError,
-        match="no true map is called 'true-depth_entrop'; there are true-lem, ",
-    ):
-        replay("true-depth_entrop", specs, max_views=4, seed=0)
-
-
 def test_fixed_views_are_the_ones_their_name_says(specs):
     p = specs.predictions
     sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][
@@ -307,24 +234,6 @@ def test_fixed_views_are_the_ones_their_name_says(specs):
             softmax(total.astype(float), axis=1).max(1),
             rtol=1e-5,
         )
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A user's policy: the next view by number."""
-
-    sphere: ViewSphere
-    needs: tuple[str, ...] = ()
-
-    def next_views(self, state, rng):
-        return (state.current + 1) % len(self.sphere)
-
-
-class Raises(Asked):
-    def next_views(self, state, rng):
-        if (state.episodes == 11).any():
-            raise RuntimeError("no idea")
-        return super().next_views(state, rng)
 
 
 @pytest.mark.parametrize(
@@ -376,30 +285,6 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
     for name in default_entries(with_lcm):
         replay(name, with_lcm, 2, 0)
-
-
-class ToItsBack:
-    """Goes round the ring to where the side opposite to that which the recogniser calls 0 is
-    likely to be seen.
-    """
-
-    needs = ("azimuth_bins",)
-
-    def __init__(self, sphere):
-        self.sphere = sphere
-
-    def next_views(self, state, rng):
-        n, rows = self.sphere.azimuths, np.arange(len(state.current))
-        # (B, azimuth bins)
-        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(1)
-        to = (
-            self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)
-        ) % n
-        views = self.sphere.ring[state.current][:, None] * n + to
-        return views[
-            rows,
-            np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1),
-        ]
 
 
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(

@@ -6,14 +6,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from pipeline import benchmark, scene_predictions, some_predictions, store_of
+from pipeline import benchmark, some_predictions, store_of
 
 from nextview.errors import ResultsError
 from nextview_lab.benchmark.classes import load
-from nextview_lab.benchmark.leaderboard import level_differences
-from nextview_lab.benchmark.published import ACCURACY, read_table
 from nextview_lab.benchmark.report import pictures_of, report
-from nextview_lab.cli.benchmark_tables import print_leaderboard
 
 
 @pytest.fixture(scope="module")
@@ -111,72 +108,3 @@ def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
             made / "views.zarr",
         )
     assert (made / "out" / "report.html").read_text().count("data:image/webp") > 8
-
-
-# Scenes
-
-POLICIES = ("random-all", "visibility", "oracle-gain-all")
-
-
-@pytest.fixture(scope="module")
-def scenes(cluttered_views, tmp_path_factory):
-    """Results of six scenes and ten classes."""
-    folder = tmp_path_factory.mktemp("scenes")
-    scene_predictions(cluttered_views, read_table(ACCURACY[10])).save(folder / "p.npz")
-    settings = {"thresholds": (0.9, 0.97), "runs": 3, "max_views": 4, "samples": 50}
-    found = benchmark(folder / "p.npz", folder / "out", policies=POLICIES, **settings)
-    report(found.folder)
-    return found
-
-
-def test_the_page_of_scenes_compares_by_clutter_and_prints_nothing_published(scenes):
-    text = (scenes.folder / "report.html").read_text()
-    after = scenes.tables.measures.query("views > 0")
-    assert len(after["set"].unique()) == 3
-    for level in after["set"].unique():
-        shown = f"{level.capitalize()}, 2 scenes: accuracy after a fixed number"
-        assert text.count(shown) == 2  # and label
-    for wrong in (
-        ">published ",
-        "as published",
-        "as figures 15",
-        "of the thesis",
-        "oracle-valley",
-    ):
-        assert wrong not in text
-    assert scenes.tables.measures["published"].isna().all()
-    assert not re.search(r"[>(: ]-0\.0[ <)]", text)
-    assert text.count("data:image/webp") > 3
-
-
-def test_the_page_shows_levels_and_the_terminal_says_what_differs(scenes, capsys):
-    text = (scenes.folder / "report.html").read_text()
-    heavy = text[text.index("Heavy clutter, 2 scenes") :]
-    cells = re.findall(
-        r"<td>([\d.]+)",
-        re.search(r'<tr><th scope="row">visibility.*?</tr>', heavy)[0],
-    )
-    of = scenes.tables.measures.query(
-        "set == 'heavy clutter' and policy == 'visibility' and measure == 'accuracy'"
-    )
-    assert len(of)
-    assert {f"{accuracy:.3f}" for accuracy in of["value"]} <= {*cells}
-    print_leaderboard(scenes)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert level_differences(scenes.tables, "random") is None  # of two scenes a level
-
-
-def test_the_terminal_says_which_policies_differ_by_clutter(scenes, capsys):
-    tests = scenes.tables.tests.copy()
-    at_levels = (tests["policy"] == "visibility") & (tests["set"] != "all")
-    tests.loc[at_levels, "p_holm"] = 0.001
-    found = replace(scenes, tables=replace(scenes.tables, tests=tests))
-    print_leaderboard(found)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    sentence = level_differences(found.tables, "random")
-    assert sentence.startswith(
-        "With no threshold, significantly different from random: visibility by "
-    )
-    assert sentence in " ".join(" ".join(lines).split())

@@ -7,28 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from factories import box, meshed
-from pipeline import scene_predictions, some_predictions
+from pipeline import scene_predictions
 from test_policies import state_of as state_at
 from test_scenes import GRID, scene_of
 
-import nextview
 from benchmarks.scenes import Believed
 from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.gain import (
-    INPUTS,
-    VISIBILITY,
-    Gain,
-    features,
-    mirrored,
-    mirrored_features,
-)
 from nextview.policies.registry import make_policy
-from nextview.recognition.belief import FixedLength
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
-from nextview.session.session import Session
 from nextview_lab.benchmark import statistics
 from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.published import ACCURACY, read_table
@@ -36,8 +24,7 @@ from nextview_lab.benchmark.replay import make_specs, replay
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.scene_views import SceneSight, scene_intrinsics, scene_views
 from nextview_lab.data.store import ViewStore
-from nextview_lab.errors import EntryError, PredictionsError
-from nextview_lab.worlds.robot_camera import RobotCamera
+from nextview_lab.errors import EntryError
 from nextview_lab.worlds.scene_cameras import SHOWS_TARGET, OccludedCamera, SceneCamera
 from nextview_lab.worlds.scene_layout import Block
 from research.plan import plan
@@ -145,53 +132,10 @@ def test_the_product_avoids_occluded_views():
     np.testing.assert_allclose(values, 0)
 
 
-# Learned
-
-
-@pytest.mark.parametrize("frame", ["camera", "object"])
-def test_networks_receive_the_visibility_of_each_cell(frame):
-    rng = np.random.default_rng(0)
-    state = replace(state_of(rng.random(40)), current=np.array([11]))
-    whole = features(
-        GRID,
-        state,
-        (*INPUTS[:3], "lem-sphere", "azimuth_bin", VISIBILITY),
-        frame,
-    )
-    without = features(GRID, state, (*INPUTS[:3], "lem-sphere", "azimuth_bin"), frame)
-    np.testing.assert_array_equal(whole[:, :-40], without)
-    alone = features(GRID, state, (VISIBILITY,), "camera")[0]
-    assert alone[8] == state.visibility[0, 11]  # straight ahead on its own ring
-    assert alone[9] == state.visibility[0, 12]
-    np.testing.assert_array_equal(np.sort(alone), np.sort(state.visibility[0]))
-    np.testing.assert_array_equal(
-        mirrored_features(GRID, 10, (VISIBILITY,)),
-        mirrored(GRID),
-    )
-    policy = Gain(GRID, 10, lambda seen: seen, (VISIBILITY,))
-    assert policy.needs == (VISIBILITY,)
-    np.testing.assert_allclose(policy.gains(state), state.visibility, atol=1e-6)
-
-
 # In scenes
 
 
 OWN = "test_scene_policies:FirstFree"
-
-
-class FirstFree:
-    """A policy that wants to see scenes, and makes nothing of them."""
-
-    needs = ("observations",)
-
-    def __init__(self, sphere):
-        pass
-
-    def next_views(self, state, rng):
-        assert all(
-            seen.scene is not None for views in state.observations for seen in views
-        )
-        return state.free.argmax(1)
 
 
 @pytest.fixture(scope="module")
@@ -237,16 +181,6 @@ def test_no_policy_goes_where_no_camera_can(predictions, cluttered_views):
         replay("orbit-40", specs, 4, 0)
 
 
-def test_visibility_sees_more_than_random_in_scenes(predictions):
-    specs = make_specs(predictions, 4, 0)
-    share = ViewStore.open(predictions.store).measure("visible_share")
-    names = ("random-all", "visibility", "true-visible_share-all")
-    random, visibility, best = (
-        share[specs.objects, replay(n, specs, 2, 0).views[:, 1]].mean() for n in names
-    )
-    assert random + 0.1 < visibility <= best
-
-
 def test_views_without_the_target_are_no_evidence(predictions):
     hidden = ~predictions.seen
     assert hidden.any()
@@ -255,45 +189,6 @@ def test_views_without_the_target_are_no_evidence(predictions):
     of_size = np.full((len(predictions), 10), np.float32(0.3))
     sized = replace(predictions, logits=predictions.logits + 0.3, of_size=of_size)
     np.testing.assert_array_equal(sized.seen, predictions.seen)
-
-
-def test_gain_learns_to_use_visibility_in_scenes(predictions, tmp_path):
-    from nextview_lab.training.gain_training import train_gain
-    from nextview_lab.training.recipes import GainRecipe
-
-    train = np.array(["train"] * len(predictions))
-    replace(predictions, splits=train).save(tmp_path / "p.npz")
-    recipe = GainRecipe(
-        ("belief", "place", "visibility"),
-        "camera",
-        epochs=1,
-        episodes=1,
-        networks_per_fold=1,
-    )
-    made = train_gain(
-        tmp_path / "p.npz",
-        tmp_path / "in-scenes.json",
-        recipe=recipe,
-        folds=2,
-        travel_weight=0.01,
-    )
-    assert made.objects == len(predictions)
-    assert make_policy(str(made.card), GRID, classes=predictions.classes).needs == (
-        "visibility",
-    )
-    specs = make_specs(predictions, 1, 0)
-    assert specs.scenes.reachable[
-        specs.objects[:, None],
-        replay(str(made.card), specs, 4, 0).views,
-    ].all()
-    replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
-    with pytest.raises(PredictionsError, match="contains no scenes"):
-        train_gain(
-            tmp_path / "alone.npz",
-            tmp_path / "alone.json",
-            recipe=recipe,
-            folds=2,
-        )
 
 
 # Replay
@@ -354,31 +249,3 @@ def test_the_script_agrees_with_the_beliefs_of_replay(predictions):
         rtol=1e-6,
     )
     assert (found.loss[~found.right] >= np.log(2)).all()
-
-
-# Live
-
-
-@pytest.mark.parametrize("named", ["box", "mask"])
-def test_a_robot_sees_around_a_box(named):
-    crate = meshed(box([1, 1.2, 0.9]))
-    scene = scene_of(Block(1.9, 0.0, 0.0, 0.3, 1.1, 1.6), target=crate)
-    truth = np.array(
-        [OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses]
-    )
-    assert truth[0] < 0.6 < truth[3]
-    camera = RobotCamera(scene, named=named)
-    system = nextview.load(policy="visibility")
-    session = Session(
-        system.models,
-        system.policy,
-        system.sphere,
-        0,
-        FixedLength(max_views=3),
-        object=camera.object,
-    )
-    session.reachable = camera.reachable
-    while not session.done:
-        session.update(camera.observe(session.pose))
-    assert session.views[0].observation.scene is not None
-    assert truth[[view.index for view in session.views[1:]]].min() > 0.9

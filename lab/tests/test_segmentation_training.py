@@ -4,18 +4,15 @@ import csv
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
-import trimesh
 from lab_programs import main
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from nextview.errors import DatasetError, ModelError, UsageError
+from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.model_card import find_card
@@ -24,17 +21,14 @@ from nextview.segmentation.network import (
     AFFINITY_STEPS,
     load_network,
     new_card,
-    read_segmentation_card,
     write_segmentation_card,
 )
 from nextview_lab.data.labelled_frames import (
     Example,
     LabelledFrames,
-    WorldMeshes,
     draw_frames,
     frame_files,
     output_scores,
-    solids_of,
 )
 from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, World, photograph, slab
 
@@ -178,52 +172,6 @@ def test_an_interrupted_drawing_resumes_with_the_same_frames(tmp_path, drawn):
     assert not np.array_equal(whole[0]["depth"], whole[1]["depth"])
 
 
-def test_a_damaged_file_of_frames_is_named(tmp_path):
-    (tmp_path / "00000.npz").write_bytes(b"PK\x03\x04 not whole")
-    with pytest.raises(
-        DatasetError, match=r"00000\.npz: is missing or damaged; delete"
-    ):
-        LabelledFrames.load([tmp_path / "00000.npz"])
-
-
-@pytest.fixture
-def meshes(tmp_path):
-    """Two folders: furniture in splits, and toys."""
-    for name, size in (
-        ("furniture/chair/train/a", [2, 3, 4]),
-        ("furniture/chair/train/b", [3, 1, 2]),
-        ("furniture/chair/test/c", [1, 1, 1]),
-        *((f"toys/duck/{number}", [1, 2, number + 1]) for number in range(40)),
-    ):
-        path = tmp_path / f"{name}.off"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        trimesh.creation.box(size).apply_translation([7, 8, 9]).export(path)
-    (tmp_path / "furniture/chair/train/bad.off").write_text("OFF\n1 1 0\n")
-    return tmp_path
-
-
-def test_furniture_is_as_large_as_in_life_and_stands_on_the_ground(meshes):
-    found = WorldMeshes.of(None, meshes / "furniture")
-    solids = solids_of(found.furniture, 5, np.random.default_rng(0))
-    assert len(solids) == 2  # neither the damaged one nor that of the test split
-    for vertices, _ in solids:
-        assert 0.78 <= np.ptp(vertices[:, 2]) <= 1.0
-        assert np.allclose(
-            [*(vertices.min(0) + vertices.max(0))[:2], vertices[:, 2].min()], 0
-        )
-
-    with pytest.raises(UsageError, match="toys: how large is a duck"):
-        WorldMeshes.of(None, meshes / "toys")
-
-
-def test_meshes_for_validation_are_not_learned_from(meshes):
-    found = WorldMeshes.of(meshes / "toys", meshes / "furniture")
-    kept, held_out = found.divided(0.25, seed=1)
-    assert sorted(kept.names + held_out.names) == sorted(found.names)
-    assert 4 <= len(held_out.names) <= 18
-    assert found.divided(0.25, seed=1) == (kept, held_out)
-
-
 def test_scores_of_outputs_that_are_right_and_wrong(drawn):
     frames = LabelledFrames.load([file.path for file in drawn])
     examples = [frames.example(index, None) for index in range(len(frames))]
@@ -259,7 +207,6 @@ from nextview_lab.training.recipes import Hardware, SegmentationRecipe
 from nextview_lab.training.runs import load_run
 from nextview_lab.training.segmentation_training import (
     fit_segmentation,
-    train_segmentation,
 )
 
 RECIPE = SegmentationRecipe(
@@ -326,13 +273,6 @@ def test_a_stopped_training_ends_with_the_weights_of_one_that_was_not(
     assert losses(tmp_path) == losses(run)
 
 
-def test_a_folder_takes_only_the_recipe_and_the_meshes_of_its_run(run, meshes):
-    with pytest.raises(ModelError, match=r"another recipe \(width was 4, not 8\)"):
-        train_segmentation(run, recipe=replace(RECIPE, width=8))
-    with pytest.raises(ModelError, match="other objects"):
-        train_segmentation(run, meshes / "toys", recipe=RECIPE)
-
-
 @pytest.fixture(scope="module")
 def exported(run):
     pytest.importorskip("onnx")
@@ -351,15 +291,6 @@ def test_the_file_answers_as_the_network(run, exported, shape):
     assert answer.shape == (15, *shape)
     assert answer.dtype == np.float32
     assert np.abs(answer - expected[:, : shape[0], : shape[1]]).max() < 0.01
-
-
-def test_the_card_says_where_the_network_comes_from(exported):
-    card = read_segmentation_card(exported)
-    assert card.recipe == msgspec.to_builtins(RECIPE)
-    assert card.sha256 == sha256_of(exported.with_suffix(".onnx"))
-    (judged, scores), *others = card.scores.items()
-    assert (judged, others) == ("validation (2 simulated frames)", [])
-    assert 0.2 < scores["class_accuracy"] <= 1
 
 
 def other_recogniser(card):

@@ -1,6 +1,5 @@
 """A store knows when it is damaged or lacks a part, and says so in one sentence."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -101,43 +100,6 @@ def test_a_damaged_object_ends_the_command_that_reads_it(
         "--workers",
         0,
     )
-
-
-@pytest.mark.parametrize("name", RENDERED_ARRAYS)
-def test_check_and_render_say_which_array_is_missing(store, furniture, capsys, name):
-    shutil.rmtree(store / name)
-    for command in (
-        ["nextview-lab", "check", store],
-        ["render", furniture, store, "--size", 32],
-    ):
-        assert f"the array {name} is missing" in refused(
-            capsys,
-            *command,
-            "--workers",
-            0,
-        )
-
-
-def test_a_store_that_called_rotated_objects_turned_is_read(store):
-    file = store / "zarr.json"
-    text = json.loads(file.read_text())
-    text["attributes"] |= {"turn": True, "checksum": "of old"}
-    file.write_text(json.dumps(text))
-    assert ViewStore.open(store).attributes.rotated
-    assert found(store) == {}
-
-
-def test_a_store_without_its_root_or_another_folder_is_left_alone(
-    store,
-    furniture,
-    tmp_path,
-):
-    (store / "zarr.json").unlink()
-    with pytest.raises(DatasetError, match="there is no view store"):
-        ViewStore.open(store)
-    for overwrite in (False, True):
-        with pytest.raises(DatasetError, match="exists and is not a view store"):
-            list(render(furniture, store, SPHERE, 32, workers=0, overwrite=overwrite))
 
 
 def test_other_settings_and_meshes_are_refused_or_replace_the_store(

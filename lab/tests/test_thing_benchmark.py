@@ -1,34 +1,27 @@
 """The benchmark of next views of taught things: scans to tables, replays, statistics."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
-import pandas as pd
 import pytest
 import trimesh
 from lab_programs import main
 from msgspec.structs import replace as replace_record
 
-from benchmarks import joined_things
-from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
+from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import UNITS, load_mesh
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.poses import PoseCandidate
-from nextview.recognition.protocol import JointBelief
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview_lab.benchmark import things as stage
-from nextview_lab.benchmark.confusable import Alikeness, how_alike
-from nextview_lab.benchmark.results import compared_markdown, latex
+from nextview_lab.benchmark.confusable import Alikeness
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     VISIBLE_SHARES,
-    KeptArrays,
     Setting,
     ThingEpisode,
     hiding_boxes,
@@ -181,37 +174,6 @@ def scaled(scans, unit, folder):
     return folder
 
 
-@pytest.mark.long  # two benchmarks
-def test_scans_in_millimetres_are_named_and_found_as_those_in_metres(
-    knobs,
-    settings,
-    tmp_path,
-):
-    # one of the policies knows the truth: the pose counts in its choice, and is measured
-    settings = replace(settings, policies=("random", "ceiling"), sensor="none")
-    expected = tmp_path / "expected"
-    benchmark_things(knobs, expected, settings, workers=0)
-    scans = scaled(knobs, "mm", tmp_path / "mm")
-    out = tmp_path / "out"
-    benchmark_things(scans, out, replace(settings, unit="mm"), workers=0)
-    files = sorted((expected / "runs").iterdir())
-    assert len(files) == 3
-    for file in files:
-        there, here = (
-            read_record(one, EpisodeRuns, "runs", ResultsError).runs
-            for one in (file, out / "runs" / file.name)
-        )
-        for policy in settings.policies:
-            then, now = there[policy][0], here[policy][0]
-            # rounding decides between later views that are worth the same
-            assert now.views[0] == then.views[0]
-            assert now.right == then.right
-            assert now.confidence == pytest.approx(then.confidence, abs=1e-3)
-            assert now.pose_error == pytest.approx(then.pose_error, abs=1.0)
-            # By 500 points that lie some millimetres apart, it is found where it stands.
-            assert max(error for error in now.pose_error if error is not None) < 6
-
-
 def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
     knobs,
     settings,
@@ -255,65 +217,6 @@ def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
     assert again.pose_error(views) < 8
 
 
-def test_what_does_not_fit_is_refused_in_one_sentence(
-    knobs,
-    results,
-    settings,
-    tmp_path,
-):
-    with pytest.raises(ResultsError, match=r"of another seed \(0, not 1\)"):
-        benchmark_things(knobs, results, replace(settings, seed=1), workers=0)
-    with pytest.raises(ResultsError, match="of another occlusion"):
-        benchmark_things(knobs, results, replace(settings, occlusion="half"), workers=0)
-    with pytest.raises(UsageError, match="no policy is called spreed"):
-        benchmark_things(
-            knobs,
-            results,
-            replace(settings, policies=("spreed",)),
-            workers=0,
-        )
-    with pytest.raises(UsageError, match="ascend"):
-        benchmark_things(knobs, results, replace(settings, views=(2, 1)), workers=0)
-    (tmp_path / "letters").mkdir()
-    (tmp_path / "letters/mine.txt").write_text("mine")
-    with pytest.raises(ResultsError, match=r"holds mine\.txt, and no results"):
-        benchmark_things(knobs, tmp_path / "letters", settings, workers=0)
-    (tmp_path / "scans").mkdir()
-    shutil.copy(knobs / "can.ply", tmp_path / "scans")
-    (tmp_path / "scans/can.ply").rename(tmp_path / "scans/pot.ply")
-    with pytest.raises(NextviewError, match="holds no scan of anything that"):
-        benchmark_things(tmp_path / "scans", tmp_path / "new", settings, workers=0)
-    folder = results / "episodes/0000_00"
-    whole = (folder / "000000.npz").read_bytes()
-    for damaged in (b"", b"PK\x03\x04 no archive", whole[:-100]):
-        (folder / "000000.npz").write_bytes(damaged)
-        with pytest.raises(
-            ResultsError,
-            match=r"000000\.npz: is damaged .* remove its folder",
-        ):
-            KeptArrays(folder)
-    (folder / "000000.npz").write_bytes(whole[:400] + bytes(400) + whole[800:])
-    kept = KeptArrays(folder)
-    with pytest.raises(ResultsError, match="is damaged"):
-        [kept[name] for name in kept._packed]
-
-
-def test_some_of_the_things_are_shown_and_all_may_be_believed(
-    knobs,
-    knobs_memory,
-    settings,
-    tmp_path,
-):
-    (tmp_path / "scans").mkdir()
-    shutil.copy(knobs / "plain.ply", tmp_path / "scans")
-    few = replace(settings, policies=("random",))
-    tables = benchmark_things(tmp_path / "scans", tmp_path / "out", few, workers=0)
-    assert tables.episodes == 1
-    assert tables.things["thing"].tolist() == ["plain"]
-    assert tables.things["most_alike"].tolist() == ["knob"]
-    assert set(tables.measures["set"]) == {"all"}
-
-
 def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
     episode = episode_of(knobs_memory, knobs, 0, occlusion="none")
     standing = episode.stage.standing
@@ -327,15 +230,6 @@ def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
         )
         shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
         assert low - 0.08 < np.mean(shares) < high + 0.08
-
-
-def test_the_thing_that_is_most_alike_is_the_one_with_a_knob(knobs_memory):
-    alike = how_alike(opened(str(knobs_memory)).verifier.caster.surfaces)
-    number = {name: k for k, name in enumerate(alike.names)}
-    assert alike.nearest[number["plain"]] == "knob"
-    assert alike.nearest[number["knob"]] == "plain"
-    assert alike.confusable.sum() == 1
-    assert not alike.confusable[number["can"]]
 
 
 # Policies
@@ -372,28 +266,6 @@ def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
     assert int(after[0]) not in taken
 
 
-class Told:
-    """An episode in which a second view is worth so much; beside it whether the name is right."""
-
-    def __init__(self, told):
-        self.told = told
-
-    def belief_in_truth(self, views):
-        return self.told.get(views[-1], (0.1, False))[0]
-
-    def named_right(self, views):
-        return self.told.get(views[-1], (0.1, False))[1]
-
-
-def test_the_ceiling_goes_where_the_truth_is_named_then_where_it_is_believed_most():
-    at = state_at(1)
-    rng = np.random.default_rng(0)
-    assert TruthCeiling(Told({7: (0.9, True)})).next_views(at, rng)[0] == 7
-    # 0.45 beside a rival of 0.5 names the wrong thing, 0.4 beside two of 0.3 the right one
-    named = Told({7: (0.45, False), 9: (0.4, True), 11: (0.35, True)})
-    assert TruthCeiling(named).next_views(at, rng)[0] == 9
-
-
 @pytest.mark.long  # a whole benchmark
 def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
     knobs,
@@ -412,33 +284,6 @@ def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
 
 
 # A recogniser of a user's own
-
-
-class AlwaysCan:
-    """Believes in the can whatever it sees; its classes are not in alphabetical order."""
-
-    classes = ("plain", "can", "knob")
-
-    def belief(self, observations):
-        return np.array([0.01, 0.98, 0.01])
-
-
-class AsRemembered:
-    """What the memory says, by the protocol of a recogniser of one's own."""
-
-    memory = ""  # path, set by the test
-
-    def __init__(self):
-        self.known = opened(self.memory)
-        self.classes = self.known.names
-
-    def belief(self, observations):
-        found = self.known(observations)
-        poses = tuple(
-            PoseCandidate(self.classes[k], int(k), pose, 1 / len(found.things))
-            for k, pose in zip(found.things, found.poses, strict=True)
-        )
-        return JointBelief(found.belief, poses)
 
 
 def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
@@ -465,54 +310,7 @@ def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
         benchmark_things(knobs, tmp_path / "new", settings, workers=0)
 
 
-def test_what_the_memory_says_counts_the_same_as_a_recogniser_of_ones_own(
-    knobs,
-    knobs_memory,
-    made,
-    settings,
-    tmp_path,
-    monkeypatch,
-):
-    monkeypatch.setattr(AsRemembered, "memory", str(knobs_memory))
-    own = replace(
-        settings,
-        models=None,
-        recogniser=f"{__name__}:AsRemembered",
-        policies=("random",),
-    )
-    benchmark_things(knobs, tmp_path / "out", own, workers=0)
-    files = sorted((made / "runs").iterdir())
-    assert len(files) == 3
-    for file in files:
-        then, now = (
-            read_record(one, EpisodeRuns, "runs", ResultsError).runs["random"][0]
-            for one in (file, tmp_path / "out" / "runs" / file.name)
-        )
-        assert now.views == then.views
-        assert now.right == then.right
-        assert now.confidence == pytest.approx(then.confidence, abs=1e-3)
-        # without the displacement of the camera, which the pose of a candidate leaves out
-        assert now.pose_error == pytest.approx(then.pose_error, abs=3)
-
-
 # The best blind rule
-
-
-def test_the_best_blind_rule_is_the_one_with_most_right_after_the_first_view():
-    def told(rights):
-        runs = {}
-        for rule, right in zip(BLIND_RULES, rights, strict=True):
-            runs |= runs_of("a", right, [0.5] * 3, [0, 1, 2], policy=rule).runs
-        return EpisodeRuns("a", 0, runs)
-
-    no, yes = [False] * 3, [True] * 3
-    last, first = [False, False, True], [True, False, False]
-    settings = replace(SETTINGS, views=(1, 2, 3), choose_seed=8)
-    rule, sentence = stage.best_blind([told([no, last, first, yes, last])], settings)
-    assert rule == "fixed"
-    assert "is fixed: in other episodes, of seed 8" in sentence
-    assert "random 0.000, spread 0.500, furthest 0.000, fixed 1.000" in sentence
-    assert stage.best_blind([told([no] * 5)], settings)[0] == "random"
 
 
 def test_policies_are_compared_with_the_best_blind_rule_of_other_episodes(
@@ -564,23 +362,6 @@ def both(thing, random, other):
     for policy, given in (("random", random), ("spread", other)):
         runs |= runs_of(thing, *given, policy=policy).runs
     return EpisodeRuns(thing, 0, runs)
-
-
-def test_what_is_explained_badly_is_not_sure_as_in_a_session():
-    episode = runs_of(
-        "a_x",
-        [False, True, True],
-        [0.99, 0.99, 0.99],
-        [0, 4, 1],
-        p_value=[0.05, 0.3, 0.01],
-    )
-    alike = Alikeness(("a_x",), ("a_x",), np.array([np.inf]))
-    how = ThingSettings(views=(1, 2, 3), threshold=0.97, families=False, samples=100)
-    measures = summarise_things([episode], alike, how).measures
-    values = measures.set_index("measure")["value"]
-    assert values["views until confident"] == 2
-    assert values["confident"] == 1
-    assert values["wrong, of the confident"] == 0
 
 
 def test_measures_are_those_of_a_hand_count():
@@ -670,135 +451,3 @@ def test_p_values_of_families_are_those_of_a_brute_force():
         apart = abs(far(swapped[:, 1]) - far(swapped[:, 0]))
         count += apart >= abs(row["difference"]) - 1e-9
     assert row["p"] == pytest.approx(count / 2**8)
-
-
-def test_so_few_things_that_nothing_can_be_significant_are_warned_of(tmp_path):
-    def of(count):
-        names = tuple(f"t{k:02d}" for k in range(count))
-        alike = Alikeness(names, names, np.arange(float(count)))
-        lost = ([False, False], [0.5, 0.6], [0, 1])
-        won = ([False, True], [0.5, 0.99], [0, 1])
-        how = ThingSettings(views=(1, 2), threshold=0.97, families=False, samples=100)
-        return summarise_things([both(name, lost, won) for name in names], alike, how)
-
-    few = of(6)
-    accuracy = few.tests.query("set == 'all' and measure == 'accuracy'").iloc[0]
-    # All six are better, and 2 of 64 choices of signs are as clear.
-    assert accuracy["p"] == pytest.approx(2 / 64)
-    assert accuracy["p_holm"] > 0.05
-    said = compared_markdown(few)
-    assert "all: Too few to tell: no p-value of 6 is below 0.031, and " in said
-    assert "confusable half: Too few to tell: no p-value of 3 is below 0.25" in said
-
-    many = of(24)
-    assert (many.tests["p_holm"].dropna() < 0.05).any()
-    assert "Too few" not in compared_markdown(many)
-
-
-def test_the_policies_are_compared_with_the_one_that_was_asked_for(
-    knobs,
-    results,
-    settings,
-    capsys,
-):
-    line = ["benchmark", "things", knobs, results, "--models", settings.models]
-    line += ["--views", 1, 2, "--policies", "random", "--reference", "geometry"]
-    main([str(word) for word in [*line, "--repeats", 1, "--workers", 0]])
-    assert "* differs from geometry" in capsys.readouterr().out
-    text = (results / "tables.md").read_text()
-    assert "### Differences to geometry" in text
-    tests = text[text.index("### Differences") :]
-    assert "| all | random | accuracy after 2 |" in tests
-    assert "| all | geometry |" not in tests
-    with pytest.raises(UsageError, match="no policy is called gemoetry"):
-        benchmark_things(
-            knobs, results, replace(settings, reference="gemoetry"), workers=0
-        )
-    # What has not been run is: the others are nothing without it.
-    spread = replace(settings, policies=("random",), reference="spread")
-    tables = benchmark_things(knobs, results, spread, workers=0)
-    assert set(tables.measures["policy"]) == {"random", "geometry", "spread"}
-    assert set(tables.tests["policy"]) == {"random", "geometry"}
-
-
-def test_no_difference_is_no_discovery_and_a_sure_one_is():
-    rng = np.random.default_rng(1)
-    names = tuple(f"t{k}" for k in range(60))
-    alike = Alikeness(names, names, np.arange(60.0))
-    how = ThingSettings(views=(1, 2), threshold=0.97, families=False, samples=2000)
-    found = []
-    for lead in (0.0, 0.5):
-        episodes = []
-        for name in names:
-            by_random, by_spread = rng.random(2) < (0.5, 0.5 + lead)
-            episodes.append(
-                both(
-                    name,
-                    ([False, bool(by_random)], [0.5, 0.6], [0, 1]),
-                    ([False, bool(by_spread)], [0.5, 0.6], [0, 1]),
-                )
-            )
-        tests = summarise_things(episodes, alike, how).tests
-        accuracy = tests[(tests["measure"] == "accuracy") & (tests["set"] == "all")]
-        found.append(float(accuracy["p_holm"].iloc[0]))
-    assert found[0] > 0.05
-    assert found[1] < 1e-3
-
-
-def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings):
-    own = f"{__name__}:FarAzimuth"
-    tables = benchmark_things(
-        knobs,
-        results,
-        replace(settings, policies=(own,)),
-        workers=0,
-    )
-    tables.measures["policy"] = tables.measures["policy"].replace(
-        own,
-        "my_module:Best_50%",
-    )
-    text = latex(tables)
-    assert r"Best\_50\%" in text
-    assert text.count("{") == text.count("}")
-    columns = [len(found) for found in re.findall(r"tabular\}\{(\w+)\}", text)]
-    assert len(columns) == 2
-    bodies = [
-        line for line in text.splitlines() if line.endswith(r"\\") and "&" in line
-    ]
-    assert len(bodies) == 2 * (1 + 3)
-    assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in bodies} == {*columns}
-    assert "| my_module:Best_50% |" in compared_markdown(tables)
-
-
-def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsys):
-    again = shutil.copytree(results, tmp_path / "again")
-    _, alone = joined_things.read_runs([results])
-    measures, both = joined_things.read_runs([results, again])
-    assert set(measures["run"]) == {results.name, "again"}
-    # Twice as many tests: the least p-value is multiplied by twice as much, up to 1.
-    least = alone["p"].min()
-    count = alone["p"].notna().sum()
-    assert both["p_holm"].min() == pytest.approx(min(1, 2 * count * least))
-
-    joined_things.main([results, again])
-    lines = capsys.readouterr().out.splitlines()
-    rows = [line.split(" | ")[1] for line in lines if line.startswith("| ")]
-    assert rows[1:] == ["random, the reference", "geometry"] * 2
-    with pytest.raises(UsageError, match="holds no results"):
-        joined_things.main([tmp_path / "nothing"])
-
-
-def test_runs_that_agree_tell_more_together_than_each_alone():
-    rows = [
-        {"run": run, "policy": policy, "measure": "accuracy", "views": 2}
-        | {"difference": gain, "p": p, "families": 50}
-        for run, p in (("one", 0.05), ("two", 0.05))
-        for policy, gain in (
-            ("better", 0.06),
-            ("mixed", 0.06 if run == "one" else -0.06),
-        )
-    ]
-    better, mixed = joined_things.over_all(pd.DataFrame(rows)).splitlines()
-    # two normal deviates of 1.96: their sum over sqrt(2) is 2.77
-    assert better == "better: +6.0 points after 2 views, mean of 2 runs, p = 0.0056"
-    assert mixed == "mixed: +0.0 points after 2 views, mean of 2 runs, p = 1"

@@ -1,8 +1,5 @@
 """The environment for taught things: Gymnasium's own checks, the joint belief, and an agent."""
 
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,7 +13,6 @@ from nextview.policies.learned_tables import cells_from
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 
 NAME = "nextview/RecogniseThings-v0"
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -99,12 +95,3 @@ def test_invalid_settings_are_rejected(knobs, knobs_memory, tmp_path):
     (tmp_path / "can.ply").write_bytes((knobs / "can.ply").read_bytes())
     with pytest.raises(DatasetError, match="holds no scan of knob"):
         gymnasium.make(NAME, scans=tmp_path, models=str(knobs_memory))
-
-
-def test_the_example_agent_learns_not_to_travel_for_nothing(env, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(ROOT / "examples"))
-    example = importlib.import_module("agent_on_things")
-    agent = example.learn(env, rounds=1, episodes=2)
-    assert capsys.readouterr().out.startswith("round 1: reward")
-    far = example.Agent(0.0, -1.0)  # as far as it can
-    assert example.paid(env, agent, 3, 5) > example.paid(env, far, 3, 5)

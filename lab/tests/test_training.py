@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +17,15 @@ torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
 
 from nextview.errors import ModelError, ResultsError, UsageError
-from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
-from nextview.recognition.network_input import InputSpec, from_store
-from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.data.rendering import Deform, render_object
 from nextview_lab.data.store import ViewStore
 from nextview_lab.training import recogniser_training as training
-from nextview_lab.training.architectures import ResNet, ViewMap
-from nextview_lab.training.export import export_map, export_recogniser, run_network
+from nextview_lab.training.export import export_map, export_recogniser
 from nextview_lab.training.fitting_set import hold_out
-from nextview_lab.training.inputs import load_inputs
 from nextview_lab.training.map_training import Windows, train_map
 from nextview_lab.training.recipes import (
-    THESIS_MAP,
     THESIS_RECOGNISER,
     Hardware,
     MapRecipe,
@@ -43,7 +36,7 @@ from nextview_lab.training.recogniser_training import (
     Views,
     train_recogniser,
 )
-from nextview_lab.training.runs import fit, load_run, read_run, start_from
+from nextview_lab.training.runs import fit, read_run
 from research.training_curves import read_log
 
 V = 5
@@ -92,62 +85,6 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
     assert (
         np.concatenate([label for _, label in views]) == np.array(second) // V % 2
     ).all()
-
-
-def test_balanced_draws_even_out_the_classes():
-    labels = np.repeat([0, 1], [90, 10])
-    inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
-    recipe = RecogniserRecipe(views_per_object=100, batch=100)
-    views = Views(
-        [StoredInputs(inputs, np.arange(100))],
-        np.arange(100),
-        labels,
-        recipe,
-    )
-    seen = np.concatenate([label for _, label in views])
-    # a class of n objects is drawn with weight n / sqrt(n)
-    share = 10**0.5 / (10**0.5 + 90**0.5)
-    assert (seen == 1).mean() == pytest.approx(
-        share,
-        abs=4 * (share * (1 - share) / len(seen)) ** 0.5,
-    )
-
-
-def test_objects_without_a_deformed_twin_are_seen_as_they_are():
-    own, twins = (np.full((2, 40, 1, 1, 1), k, np.uint8) for k in (0, 1))
-    recipe = RecogniserRecipe(
-        views_per_object=2000,
-        batch=50,
-        deformed_share=0.5,
-        balanced=False,
-    )
-    sources = [StoredInputs(own, np.arange(2)), StoredInputs(twins, np.array([-1, 0]))]
-    views = Views(sources, np.arange(2), np.arange(2), recipe)
-    drawn = [[x.numpy() for x in batch] for batch in views]
-    images, labels = (np.concatenate(part).ravel() for part in zip(*drawn, strict=True))
-    assert not images[labels == 0].any()
-    assert 0 < images[labels == 1].mean() < 1
-
-
-@pytest.mark.parametrize("balanced", [True, False])
-def test_devices_share_every_batch(balanced):
-    recipe = replace(THESIS_RECOGNISER, batch=6, balanced=balanced, views_per_object=V)
-    whole, parts = views_of(recipe), [views_of(recipe) for _ in range(2)]
-    for rank, part in enumerate(parts):
-        part.share = slice(rank, None, 2)
-    for (images, labels), (a, la), (b, lb) in zip(whole, *parts, strict=True):
-        assert torch.equal(torch.stack([a, b], 1).flatten(0, 1), images)
-        assert torch.equal(torch.stack([la, lb], 1).flatten(), labels)
-
-
-def test_augment_says_which_views_it_mirrored():
-    torch.manual_seed(0)
-    x = torch.zeros(64, 1, 32, 32)
-    x[:, :, :, 4:12] = 0.5  # something on the left
-    y, mirrored = training.augment(x)
-    on_the_right = y[..., 16:].sum((1, 2, 3)) > y[..., :16].sum((1, 2, 3))
-    assert torch.equal(on_the_right, mirrored)
-    assert 16 < mirrored.sum() < 48
 
 
 def test_map_batches_hold_each_view_with_its_own_map():
@@ -218,24 +155,6 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
     assert training.mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
     bins = training.azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)
     assert bins[:, :, 0].tolist() == [[(-label) % 8] * 2 for label in labels]
-
-
-def test_a_turned_object_is_seen_from_the_side_that_its_turn_says():
-    """The mesh is turned back by the angle and views as if it had never been turned."""
-    corners = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7]], float)
-    mesh = make_mesh(corners, np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]]))
-    turned = Deform(rotated=True)(mesh, 5, "chair_1")
-    _, angle = Deform(rotated=True).draw(5, "chair_1")
-    c, s = np.cos(-angle), np.sin(-angle)
-    back = make_mesh(
-        turned.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T,
-        mesh.faces,
-    )
-    cameras = (SimulatedCamera(m, 32, SPHERE.distance) for m in (mesh, back))
-    a, b = (
-        render_object(camera, SPHERE, 32)["depth"].astype(int) for camera in cameras
-    )
-    assert (np.abs(a - b) > 3).mean() < 0.01
 
 
 def test_the_side_between_two_steps_counts_by_nearness():
@@ -392,17 +311,6 @@ def test_a_run_without_progress_stops_and_stays_stopped(tmp_path):
     assert again.weight.item() == 2
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path):
-    fit(Scripted([1.0]), One(), One(), tmp_path, "score", "min", EXACT)
-    last = tmp_path / "last.ckpt"
-    last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
-    with pytest.raises(
-        ModelError,
-        match=r"last\.ckpt: a damaged checkpoint .* delete it",
-    ):
-        fit(Scripted([1.0, 1.0]), One(), One(), tmp_path, "score", "min", EXACT)
-
-
 # From views to models
 
 
@@ -460,120 +368,6 @@ def test_trained_models_have_cards_and_run(trained, views):
     with pytest.raises(UsageError, match="not a path"):
         export_map(trained / "runs/lem", views, trained / "models", name="../tiny")
     assert (trained / "models/tiny.onnx").read_bytes() == before
-
-
-def test_several_runs_are_averaged(trained, views, tmp_path):
-    run = trained / "runs/recogniser"
-    train_recogniser(
-        views,
-        tmp_path / "on",
-        weights=run,
-        recipe=replace(SMALL, ensemble_seed=1),
-    )
-    export_recogniser(run, views, tmp_path, ensemble=(tmp_path / "on",), name="both")
-    x = load_inputs(views, 32)[0, :3]
-    networks = [
-        run_network(folder, SMALL, ViewStore.open(views))
-        for folder in (run, tmp_path / "on")
-    ]
-    with torch.no_grad():
-        outputs = [network(torch.from_numpy(x).float() / 255) for network in networks]
-    both = NetworkRecogniser(tmp_path / "both.json")
-    assert both.from_inputs(x).logits == pytest.approx(
-        sum(o[0] for o in outputs).numpy() / 2,
-        abs=2e-2,
-    )
-    assert both.card.network == "ResNet-18 + ResNet-18"
-    assert [recipe["ensemble_seed"] for recipe in both.card.training.recipes] == [0, 1]
-
-
-def test_training_continues_from_the_weights_of_a_run(trained, views, tmp_path):
-    run = trained / "runs/recogniser"
-    network = ResNet(18, 3, 4, 8)
-    start_from(network, run)
-    expected = load_run(ResNet(18, 3, 4, 8), run).state_dict()
-    assert all(
-        torch.equal(value, expected[name])
-        for name, value in network.state_dict().items()
-    )
-    maps = ViewMap(5, 8, 18, 4)
-    head = maps.resnet.fc.weight.clone()
-    start_from(maps.resnet, run, head=False)
-    assert torch.equal(
-        maps.resnet.layer2[0].conv1.weight,
-        expected["layer2.0.conv1.weight"],
-    )
-    assert torch.equal(maps.resnet.fc.weight, head)
-    start_from(maps.resnet, trained / "runs/lem")
-    assert not torch.equal(maps.resnet.fc.weight, head)
-    train_map(
-        views,
-        tmp_path / "lem",
-        weights=trained / "runs/lem",
-        recipe=replace(SMALL_MAP, lr=0.0),
-    )
-    last = torch.load(tmp_path / "lem/network.pt", weights_only=True)[
-        "resnet.fc.weight"
-    ]
-    # a rate of 0 leaves the weights that it was given
-    assert torch.equal(last, maps.resnet.fc.weight)
-    with pytest.raises(
-        ModelError,
-        match=r"was trained on .* objects that this network must not",
-    ):
-        train_recogniser(
-            views,
-            tmp_path / "seen",
-            weights=run,
-            recipe=replace(SMALL, validation_share=0.5),
-        )
-    with pytest.raises(ModelError, match="other first weights"):
-        train_map(views, tmp_path / "lem", recipe=replace(SMALL_MAP, lr=0.0))
-    with pytest.raises(ModelError, match=r"another recipe \(epochs was 1, not 2\)"):
-        train_recogniser(views, run, recipe=replace(SMALL, epochs=2))
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign/notes.txt").touch()
-    with pytest.raises(ModelError, match=r"holds notes\.txt and no training run"):
-        train_recogniser(views, tmp_path / "foreign", recipe=SMALL)
-
-
-def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
-    image = replace(
-        THESIS_RECOGNISER,
-        layers=18,
-        epochs=1,
-        size=32,
-        views_per_object=1,
-        batch=4,
-        validation_share=0.25,
-    )
-    assert train_recogniser(views, tmp_path / "image", recipe=image) == [
-        tmp_path / "image"
-    ]
-    run = read_run(tmp_path / "image")
-    assert run.recipe == asdict(image)
-    assert set(run.validation) == set(run.held_out)
-    assert torch.load(tmp_path / "image/network.pt", weights_only=True)[
-        "conv1.weight"
-    ].shape == (
-        64,
-        1,
-        7,
-        7,
-    )
-    cloud = replace(
-        THESIS_MAP,
-        epochs=1,
-        views_per_object=1,
-        points=64,
-        validation_share=0.25,
-    )
-    train_map(views, tmp_path / "cloud", recipe=cloud)
-    made = export_map(tmp_path / "cloud", views, tmp_path, name="published")
-    seen = from_store(InputSpec("cloud"), ViewStore.open(views), 0)[:2]
-    assert {k: v.shape for k, v in MapNetwork(made.card).from_inputs(seen).items()} == {
-        "lem": (2, 5, 3)
-    }
 
 
 def test_an_unfinished_run_is_not_exported(trained, views, tmp_path):

@@ -5,13 +5,11 @@ session answers.
 import hashlib
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from factories import INTRINSICS, TABLE, box, cast, meshed, pose_at
-from lab_programs import main
+from factories import meshed
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
 from scipy.stats import kstest
@@ -20,7 +18,6 @@ import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import print_episode
 from nextview.data.samples import sample_mesh
-from nextview.errors import UsageError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
@@ -32,7 +29,6 @@ from nextview.recognition.novelty import (
     hidden_share,
     read_novelty,
 )
-from nextview.sensing import Frame, ObservedObject
 from nextview.session.result_json import episode_as_json
 from nextview_lab.training.unknown import quantiles
 
@@ -271,37 +267,6 @@ def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
     ) == pytest.approx(share, abs=1e-9)
 
 
-# Rates
-
-
-@pytest.mark.parametrize("objects", [3, 50, 1999])
-def test_the_least_p_value_is_that_of_a_score_beyond_all_known_ones(objects):
-    score = some_score(np.random.default_rng(objects), objects=objects)
-    assert score.least_p_value == pytest.approx(score.p_value(1e9, [1, 3, 7]).min())
-    assert score.p_value(1e9, 1) == score.least_p_value
-
-
-def test_a_rate_that_no_p_value_is_below_is_refused_with_the_least_one(capsys):
-    system = nextview.load(threads=1, unknown=0.3)
-    least = float(system.models.recogniser.novelty.p_value(1e9, 1))
-    said = f"{system.models.recogniser.name}: .* above {least:.4g},"
-    for rate in (least, 0.7 * least, 1e-9):
-        with pytest.raises(UsageError, match=said):
-            nextview.load(threads=1, unknown=rate)
-        with pytest.raises(UsageError, match=said):
-            replace(system, unknown=rate)
-        with pytest.raises(UsageError, match=said):
-            nextview.Session(system.models, system.policy, system.sphere, unknown=rate)
-    assert replace(system, unknown=1.01 * least).unknown == 1.01 * least
-    assert replace(system, unknown=0.0).unknown == 0
-
-    mesh = Path(__file__).parents[2] / "samples" / "chair.off"
-    with pytest.raises(SystemExit):
-        main(["recognise", str(mesh), "--unknown", str(0.9 * least)])
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"0 or above {least:.4g}" in told
-
-
 # Sessions
 
 
@@ -385,30 +350,6 @@ def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
         assert wary.recognise(sample_mesh(name), start=3).answer == name
 
 
-def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
-    mesh = scrambled(0)
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(
-        tmp_path / "heap.off"
-    )
-    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert "It is none of the 10 known classes (most like a " in said
-    assert "of known objects are as novel" in said
-    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0"])
-    assert "It is a " in capsys.readouterr().out
-
-
-def test_an_object_of_an_impossible_size_is_not_in_the_class():
-    chair = sample_mesh("chair")
-    for radius, known in ((0.6, True), (0.05, False), (60.0, False)):
-        seen = SimulatedCamera(chair)
-        seen.radius = radius
-        result = nextview.load().recognise(seen, start=3)
-        assert (result.answer is not None) == known
-        assert result.confident == known
-    assert "has a radius of 60 m" in repr(result)
-
-
 def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
     assert (usual.confident, len(usual.views)) == (True, 1)
@@ -417,35 +358,3 @@ def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
         False,
         2,
     )
-
-
-def test_a_change_of_light_does_not_contradict_the_object(
-    monkeypatch,
-):
-    """From the front a long box is half as long: novel.
-
-    The frame from the side corrects that, also of the first.
-    """
-    scores = []
-    monkeypatch.setattr(
-        Novelty,
-        "scores",
-        lambda self, embeddings, exact: np.full(len(embeddings), scores[-1]),
-    )
-    monkeypatch.setattr(
-        Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1)
-    )
-    session = nextview.load(threshold=0.1).session(
-        object=ObservedObject(life_size=False)
-    )
-    for k, pose in enumerate(
-        (pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))
-    ):
-        assert not session.done
-        scores.append((9.0, 0.0)[k])
-        depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
-        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
-        assert session.views[0].novelty == scores[k]
-    assert session.done
-    assert session.result.confident
-    assert not session.result.stranded

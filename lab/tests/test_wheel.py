@@ -177,14 +177,6 @@ def test_the_constraints_satisfy_the_requirements():
             assert needed.specifier.contains(version), needed
 
 
-def test_every_extra_has_an_example():
-    assert set(EXAMPLES) == {
-        (project, extra)
-        for project in PROJECTS
-        for extra in ("", *asked(project)["optional-dependencies"])
-    }
-
-
 @pytest.mark.parametrize(
     ("project", "extra"),
     EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK,
