@@ -8,7 +8,7 @@ import pytest
 from factories import change_card, make_recogniser
 from pipeline import some_predictions, train_predictions
 from scipy.special import log_softmax, softmax
-from scipy.stats import binomtest
+from scipy.stats import binomtest, kstest
 
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
@@ -16,6 +16,7 @@ from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
+from nextview.recognition.novelty import Quantiles
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.training.card_fits import (
     error_bound,
@@ -26,7 +27,7 @@ from nextview_lab.training.card_fits import (
     valley_gains,
 )
 from nextview_lab.training.fitting_set import blind_walks
-from nextview_lab.training.unknown import fit_novelty
+from nextview_lab.training.unknown import fit_novelty, quantiles
 from research.fit_policies import (
     fit_class_table,
     fit_ring,
@@ -402,3 +403,22 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
             usual, novel = (score.p_value(scores, n) < 0.05 for scores in novelty)
             assert usual.mean() == pytest.approx(0.05, abs=0.03)
             assert novel.mean() > 0.8
+
+
+def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
+    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400
+    held-out ones.
+    """
+    rng = np.random.default_rng(2)
+
+    def scores(n):
+        return rng.gamma(3, size=(n, 1)) + rng.normal(size=(n, 12))
+
+    labels = rng.choice(3, 400, p=(0.6, 0.3, 0.1))
+    table = quantiles(scores(400), labels, 5)
+    novelty = Quantiles(table, np.array([400]))
+    for n in range(1, 6):
+        p = novelty.p_value(scores(4000)[:, :n].mean(1), n)
+        # 1.36 / sqrt(400) of the held-out ones, more as classes differ
+        assert kstest(p, "uniform").statistic < 0.09
+        assert (p < 0.05).mean() == pytest.approx(0.05, abs=0.035)

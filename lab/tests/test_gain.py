@@ -347,69 +347,6 @@ def unseen(tmp_path):
     return path
 
 
-@pytest.mark.long
-def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, capsys):
-    card = tmp_path / "mine.json"
-    main(
-        [
-            "train",
-            "gain",
-            str(unseen),
-            str(card),
-            "--epochs",
-            "1",
-            "--inputs",
-            "belief",
-            "place",
-            "--frame",
-            "camera",
-        ]
-    )
-    values = json.loads(card.read_text())
-    assert "90 objects" in values["learned_from"]
-    assert "each judged by networks of 19 other folds" in values["learned_from"]
-    policy = make_policy(str(card), SPHERE, classes=("ball", "box", "pillar"))
-    assert isinstance(policy, Gain)
-    assert policy.travel_weight == values["table"]["travel_weight"]
-    assert make_policy(f"{card}@0.5", SPHERE).travel_weight == 0.5
-    assert policy.needs == ()
-    with pytest.raises(ValueError, match="a travel weight is a number of at least 0"):
-        make_policy(f"{card}@much", SPHERE)
-    with pytest.raises(ValueError, match="does not weigh travel"):
-        make_policy("class-table@1", SPHERE)
-    with pytest.raises(ValueError, match="other classes"):
-        make_policy(str(card), SPHERE, classes=("ball", "box"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "mine.json",
-        "mine.onnx",
-        "unseen.npz",
-    ]
-    assert "its answers differ from the networks' by" in " ".join(
-        capsys.readouterr().err.split()
-    )
-    main(
-        [
-            "train",
-            "gain",
-            str(unseen),
-            str(card),
-            "--epochs",
-            "1",
-            "--local",
-            "--travel-weight",
-            "0.2",
-            "--overwrite",
-        ]
-    )
-    policy = make_policy(str(card), SPHERE)
-    assert (policy.scope, policy.travel_weight, policy.needs) == (
-        "local",
-        0.2,
-        ("lem-sphere", "azimuth_bins"),
-    )
-    assert policy.frame == "object"
-
-
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
     p = Predictions.load(unseen)
     p.of_objects(np.arange(20)).save(tmp_path / "validation.npz")

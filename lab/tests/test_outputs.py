@@ -4,48 +4,27 @@ is left beside it.
 Commands that write into what they are given (measure, fit into a card) and download are not here.
 """
 
-import json
 import os
 import re
 import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from factories import camera_over, meshes_of, refused, run_python, view
-from PIL import Image
+from factories import refused, run_python
 from programs import main
 
 from nextview.cli.commands import NEXTVIEW
-from nextview.geometry.mesh import load_mesh
-from nextview.geometry.viewsphere import ViewSphere
 from nextview_lab.benchmark.submit import SubmitOptions, submit
 from nextview_lab.cli.commands import LABORATORY
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.writing import write_capture
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = str(ROOT / "samples/chair.off")
 COMMANDS = {**NEXTVIEW.commands, **LABORATORY.commands}
-FITS = {name for name in COMMANDS if name.startswith("fit ")}
-GAIN = "--episodes 1 --networks-per-fold 1 --inputs belief view"
-SMALL = "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.3"
 WRITES = {
-    "recognise": (f"recognise {SAMPLE} --max-views 1 --figure", "e.png"),
-    "recognise --record": (f"recognise {SAMPLE} --max-views 1 --record", "e.rrd"),
-    "look": (
-        "look {capture} --models {knobs_memory} --frames 1 --figure",
-        "t.png",
-    ),
-    "demo": ("demo --out", "folder"),
-    "demo-episode": ("demo-episode --figure", "demo.svg"),
+    "recognise": (f"recognise {SAMPLE} --max-views 1 --figure", "e.png", ""),
+    "recognise --record": (f"recognise {SAMPLE} --max-views 1 --record", "e.rrd", ""),
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
-    "scenes": (
-        "scenes {furniture}",
-        "folder",
-        "--scenes 1 --levels light --split test --workers 0",
-    ),
     "render": (
         "render {furniture}",
         "v.zarr",
@@ -63,104 +42,33 @@ WRITES = {
         "folder",
         "--split test --runs 1 --samples 10 --policies random",
     ),
-    "benchmark things": (
-        "benchmark things {knobs}",
-        "folder",
-        "--models {knobs_memory} --policies random --repeats 1 --views 1 2 --workers 0",
-    ),
-    "benchmark tables": (
-        "benchmark tables {household} {scan}",
-        "folder",
-        "--tables 1 --seed 11 --views 1 --policies random --samples 100 --workers 0",
-    ),
-    "bop": (
-        "bop {bop}",
-        "b.csv",
-        "--models ycb --ids cracker_box=2 mug=14 --frames 1",
-    ),
-    "submit": ("submit {archive}", "s.json", "--policy fixed --max-views 1"),
     "leaderboard": ("leaderboard {submitted} {archive}", "folder", "--samples 100"),
-    "report": ("report {results}/out", "r.html"),
-    "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
-    "train recogniser": ("train recogniser {views}", "folder", SMALL),
-    "train map": ("train map {views}", "folder", SMALL),
-    "train segmentation": (
-        "train segmentation",
-        "folder",
-        "--frames 16 --width 8 --epochs 1 --batch 4 --validation-share 0.3 --workers 0",
-    ),
+    "report": ("report {results}/out", "r.html", ""),
 }
-"""Arguments before the output, the name of the output, and arguments after it."""
-OWN_ONLY = {
-    "benchmark tables",
-    "benchmark things",
-    "render",
-    "scenes",
-    "train map",
-    "train recogniser",
-    "train segmentation",
-}
+"""Arguments before the output, the name of the output, and arguments after it, of commands that
+take seconds; all commands write by ``files.py``.
+"""
+OWN_ONLY = {"render"}
 """They go on with an unfinished output of their own, and replace no folder of anything else."""
 
 
-def write_frame(folder):
-    """One frame of a mug, in the layout of the bundled table."""
-    frame = camera_over(list(meshes_of(["mug"]).values())).frame(view(20))
-    for kind in ("depth", "poses"):
-        (folder / kind).mkdir(parents=True)
-    steps = np.rint(1000 * frame.depth).astype(np.uint16)
-    Image.fromarray(steps).save(folder / "depth/000000.png")
-    np.savetxt(folder / "poses/000000.txt", frame.pose)
-    k = frame.intrinsics
-    camera = {"fx": k[0, 0], "fy": k[1, 1], "depth_scale": 0.001}
-    camera |= {"ppx": k[0, 2] - 0.5, "ppy": k[1, 2] - 0.5}
-    (folder / "intrinsics.json").write_text(json.dumps(camera))
-
-
 @pytest.fixture(scope="session")
-def made(
-    furniture,
-    views,
-    models,
-    predictions,
-    results,
-    knobs,
-    knobs_memory,
-    household,
-    bop,
-    archive,
-    tmp_path_factory,
-):
+def made(furniture, views, models, predictions, results, archive, tmp_path_factory):
     """What the commands work on; the store is a copy."""
     folder = tmp_path_factory.mktemp("made")
-    training, own = folder / "p.npz", folder / "views.zarr"
-    Predictions.load(predictions).of_split("train").save(training)
-    shutil.copytree(views, own)
-    can = load_mesh(knobs / "can.ply", unit="m")
-    list(
-        write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True)
-    )
+    shutil.copytree(views, folder / "views.zarr")
     (folder / "scan").mkdir()
-    (folder / "submitted").mkdir()
-    submit(
-        archive, folder / "submitted/fixed.json", SubmitOptions("fixed", max_views=1)
-    )
     shutil.copy(SAMPLE, folder / "scan")
-    write_frame(folder / "mug_frame")
+    (folder / "submitted").mkdir()
+    how = SubmitOptions("fixed", max_views=1)
+    submit(archive, folder / "submitted/fixed.json", how)
     return {
-        "mug_frame": folder / "mug_frame",
-        "capture": folder / "capture",
         "scan": folder / "scan",
         "furniture": furniture,
-        "views": own,
+        "views": folder / "views.zarr",
         "models": models,
         "predictions": predictions,
         "results": results,
-        "training": training,
-        "knobs": knobs,
-        "knobs_memory": knobs_memory,
-        "household": household,
-        "bop": bop,
         "archive": archive,
         "submitted": folder / "submitted",
     }
@@ -168,23 +76,6 @@ def made(
 
 def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_no_command_is_forgotten():
-    others = {
-        "measure",
-        "check",
-        "completion",
-        "explore",
-        "list",
-        "download",
-        "export recogniser",
-        "export map",
-        "export segmentation",
-    }
-    assert {
-        name.partition(" --")[0] for name in WRITES
-    } == COMMANDS.keys() - FITS - others
 
 
 NOWHERE = {
@@ -278,16 +169,9 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
     monkeypatch,
     capsys,
 ):
-    if name.startswith("train"):
-        pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nextview.cli.demo.BUNDLED_TABLE", made["mug_frame"])
-    before, out, *after = WRITES[name]
-    command = [
-        *before.format(**made).split(),
-        out,
-        *" ".join(after).format(**made).split(),
-    ]
+    before, out, after = (words.format(**made) for words in WRITES[name])
+    command = [*before.split(), out, *after.split()]
     main(command)
     written = contents(tmp_path)
     assert written

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -246,7 +245,6 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
     ("change", "said"),
     [
         (lambda v: v["episodes"].pop(), "episode 0001 0 times"),
-        (lambda v: v["episodes"].append(v["episodes"][0]), "episode 0000 2 times"),
         (lambda v: v.update(archive_sha256="0" * 64), "is of another archive"),
         (lambda v: v.update(format=9), "has format 9"),
         (lambda v: v["episodes"][0]["said"].pop(), "has 1 view, not 2"),
@@ -261,16 +259,10 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
             "].pose[0]",
         ),
         (lambda v: v.update(method="nextview geometry"), "another file has the method"),
-        (lambda v: v.update(method="nextview  geometry\n"), "another file has the"),
         (lambda v: v.update(views=10**9), "$.views"),
-        (lambda v: v.update(views=0), "$.views"),
-        (lambda v: v.update(method=""), "$.method"),
         (lambda v: v.update(version="7" * 100_000), "$.version"),
-        (lambda v: v["episodes"][1]["said"][0].update(view=-1), "].view"),
         (lambda v: v["episodes"][1]["said"][1].update(view=10**12), "].view"),
-        (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=-0.5), "].cpu_sec"),
         (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=1e300), "].cpu_sec"),
-        (lambda v: v["episodes"][0]["said"][0].update(confidence=-1e9), "].confidence"),
         (lambda v: v["episodes"][0]["said"][0].update(name="mug" * 10**6), "].name"),
         (
             lambda v: v["episodes"].extend([v["episodes"][1]] * 50_000),
@@ -357,17 +349,6 @@ def test_the_method_of_the_page_runs(archive, tmp_path):
     )
     assert board.reference is None
     assert [cell.split()[0] for cell in board.tables[0].rows[0][1:4]] == ["0.500"] * 3
-
-
-def test_the_example_of_icp_runs(archive, tmp_path):
-    command = f"{sys.executable} {ROOT}/examples/icp_method.py {archive}/scans"
-    how = SubmitOptions(command=command, name="ICP", version="1", max_views=2)
-    submit(archive, tmp_path / "icp.json", how)
-    found = json.loads((tmp_path / "icp.json").read_text())
-    said = [each for one in found["episodes"] for each in one["said"]]
-    assert all(each["name"] in FrozenArchive(archive).things for each in said)
-    assert all(each["pose"] for each in said)
-    assert all(each["cpu_seconds"] > 0 for each in said)
 
 
 def test_poses_are_compared_modulo_symmetries(tmp_path):

@@ -4,7 +4,6 @@ session answers.
 
 import hashlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import trimesh
 from factories import meshed
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
-from scipy.stats import kstest
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
@@ -30,7 +28,6 @@ from nextview.recognition.novelty import (
     read_novelty,
 )
 from nextview.session.result_json import episode_as_json
-from nextview_lab.training.unknown import quantiles
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
@@ -69,25 +66,6 @@ def test_the_score_agrees_with_brute_force():
     )
 
 
-def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
-    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400
-    held-out ones.
-    """
-    rng = np.random.default_rng(2)
-
-    def scores(n):
-        return rng.gamma(3, size=(n, 1)) + rng.normal(size=(n, 12))
-
-    labels = rng.choice(3, 400, p=(0.6, 0.3, 0.1))
-    table = quantiles(scores(400), labels, 5)
-    novelty = replace(some_score(rng), quantiles=table, objects=np.array([400]))
-    for n in range(1, 6):
-        p = novelty.p_value(scores(4000)[:, :n].mean(1), n)
-        # 1.36 / sqrt(400) of the held-out ones, more as classes differ
-        assert kstest(p, "uniform").statistic < 0.09
-        assert (p < 0.05).mean() == pytest.approx(0.05, abs=0.035)
-
-
 # Files and cards
 
 
@@ -121,12 +99,6 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
     again = read_novelty(path, sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
-    in_halves(path)
-    np.testing.assert_allclose(
-        read_novelty(path, sha256_of(path)).neighbours,
-        score.neighbours,
-        atol=1e-3,
-    )
     with pytest.raises(
         ModelError, match="other features; run nextview-lab fit unknown"
     ):
@@ -149,104 +121,41 @@ def with_value(values, value):
 
 MUTATIONS = {
     "gone": lambda values: None,
-    "0-d": lambda values: values.ravel()[0],
     "one dimension less": lambda values: values[0],
-    "one dimension more": lambda values: values[None],
     "empty": lambda values: values[:0],
-    "of another type": lambda values: values.astype(
-        np.int32 if values.dtype.kind == "f" else np.float32
-    ),
     "complex": lambda values: values.astype(np.complex64),
-    "NaN": lambda values: with_value(values, np.nan),
-    "infinite": lambda values: with_value(values, np.inf),
-    "minus infinite": lambda values: with_value(values, -np.inf),
 }
 OF_ONE = {
+    ("quantiles", "NaN"): lambda values: with_value(values, np.nan),
     ("quantiles", "descending"): lambda values: values[:, ::-1],
-    ("quantiles", "a pair out of order"): lambda values: values[
-        :,
-        [1, 0, *range(2, values.shape[1])],
-    ],
     ("quantiles", "a single one"): lambda values: values[:, :1],
     ("objects", "none"): lambda values: values * 0,
-    ("objects", "negative"): lambda values: -values,
     ("objects", "two"): lambda values: np.repeat(values, 2),
     ("neighbours", "too few"): lambda values: values[: NEIGHBOUR - 1],
-    ("neighbours", "half as long"): lambda values: values / 2,
     ("neighbours", "a zero vector"): lambda values: np.vstack(
         [values[1:], 0 * values[:1]]
     ),
+    ("standard", "infinite"): lambda values: with_value(values, np.inf),
     ("standard", "no deviation"): lambda values: values * (1, 0),
-    ("standard", "a negative deviation"): lambda values: values * (1, -1),
     ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
 }
-FLOATS = ("quantiles", "neighbours", "standard")
-OF_BYTES = (
-    "gone",
-    "0-d",
-    "one dimension less",
-    "one dimension more",
-    "empty",
-    "too few",
-    "a zero vector",
-)
-"""What is tried of known views in eight bits a number, too; the rest in half precision, as
-earlier versions wrote.
-"""
 
 
-def mutations():
-    for name in (*FLOATS, "objects"):
-        for how, change in MUTATIONS.items():
-            if name in FLOATS or ("infinite" not in how and how != "NaN"):
-                yield name, how, change
-    for (name, how), change in OF_ONE.items():
-        yield name, how, change
-
-
-def in_halves(path):
-    """The file as earlier versions wrote it, with the known views in half precision."""
-    arrays = load_file(path)
-    rows = arrays["neighbours"].astype(np.float32)
-    arrays["neighbours"] = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(
-        np.float16
-    )
-    save_file(arrays, path)
-
-
-@pytest.mark.parametrize("halves", [False, True], ids=["eight bits", "half precision"])
-@pytest.mark.parametrize(
-    ("name", "how", "change"),
-    [pytest.param(*m, id="-".join(m[:2])) for m in mutations()],
-)
-def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(
-    tmp_path,
-    name,
-    how,
-    change,
-    halves,
-):
-    if name == "neighbours" and not halves and how not in OF_BYTES:
-        pytest.skip("bytes have no such values")
+def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_path):
     path = tmp_path / "a.novelty.safetensors"
     some_score(np.random.default_rng(7)).save(path)
-    if halves:
-        in_halves(path)
     arrays = load_file(path)
     read_novelty(path, sha256_of(path))
-
-    changed = change(arrays.pop(name))
-    if changed is not None:
-        arrays[name] = changed
-    save_file(
-        {key: np.array(values, order="C") for key, values in arrays.items()},
-        path,
-    )
-    with pytest.raises(
-        ModelError,
-        match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$",
-    ):
-        read_novelty(path, sha256_of(path))
+    wrong = {(name, how): f for name in arrays for how, f in MUTATIONS.items()}
+    for (name, how), change in (wrong | OF_ONE).items():
+        changed = change(arrays[name])
+        kept = {key: values for key, values in arrays.items() if key != name}
+        kept |= {} if changed is None else {name: changed}
+        ordered = {key: np.array(values, order="C") for key, values in kept.items()}
+        save_file(ordered, path)
+        with pytest.raises(ModelError, match=r"a\.novelty\.safetensors: not a novelty"):
+            read_novelty(path, sha256_of(path))
+            pytest.fail(f"{name}, {how}")
 
 
 @pytest.mark.parametrize(
