@@ -117,10 +117,7 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
     ],
 )
 def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
-    tmp_path,
-    monkeypatch,
-    option,
-    value,
+    tmp_path, monkeypatch, option, value
 ):
     def teach(*arguments):
         raise AssertionError("a thing was taught")
@@ -129,21 +126,16 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
     scans_in(tmp_path / "things", "box.ply", "tin.ply")
     with pytest.raises(UsageError, match=re.escape(str(value).rpartition(":")[2])):
         learn(
-            tmp_path / "things",
-            tmp_path / "mine",
-            **({"workers": 0} | {option: value}),
+            tmp_path / "things", tmp_path / "mine", **({"workers": 0} | {option: value})
         )
     assert not (tmp_path / "mine").exists()
 
 
 @pytest.mark.skipif(
-    sys.platform != "linux",
-    reason="names of files are bytes on Linux alone",
+    sys.platform != "linux", reason="names of files are bytes on Linux alone"
 )
 def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(
-    tmp_path,
-    quickly,
-    capsys,
+    tmp_path, quickly, capsys
 ):
     long = "n" * 251
     root = scans_in(tmp_path / "things", "box.ply", f"{long}.ply", "tin.ply")
@@ -183,14 +175,10 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
 
 
 @pytest.mark.parametrize(
-    ("count", "shown"),
-    [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)],
+    ("count", "shown"), [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)]
 )
 def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(
-    tmp_path,
-    monkeypatch,
-    count,
-    shown,
+    tmp_path, monkeypatch, count, shown
 ):
     pages = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: pages.append(self))

@@ -123,11 +123,6 @@ def test_later_changes_of_input_arrays_do_not_affect_observations():
         seen.pose[0, 1],
         seen.intrinsics[0, 1],
         seen.image[0, 0],
-    ) == (
-        3,
-        0,
-        0,
-        7,
-    )
+    ) == (3, 0, 0, 7)
     with pytest.raises(ValueError, match="read-only"):
         seen.depth[0] = 0

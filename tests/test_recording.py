@@ -33,8 +33,7 @@ class Recording:
                 for component, values in batch.items():
                     if ":" in component:
                         self.rows.setdefault(
-                            (chunk.entity_path.strip("/"), component),
-                            {},
+                            (chunk.entity_path.strip("/"), component), {}
                         ).setdefault(step, [])
                         self.rows[chunk.entity_path.strip("/"), component][step].append(
                             values[row]
@@ -74,8 +73,7 @@ def test_belief_and_travel_over_the_steps(made):
             ("this_view_alone", view.alone),
         ):
             np.testing.assert_array_equal(
-                recording.at(name, "BarChart:values", step)[0]["buffer"],
-                values,
+                recording.at(name, "BarChart:values", step)[0]["buffer"], values
             )
     assert recording.steps("belief/chair", "Scalars:scalars") == steps
 
@@ -92,9 +90,7 @@ def test_candidates_values_and_choices(made):
             recording.at("world/next", "Points3D:positions", step).tolist()
         ).reshape(-1, 3)
         np.testing.assert_allclose(
-            chosen,
-            poses[[] if view.next_view is None else [view.next_view]],
-            atol=1e-6,
+            chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6
         )
         values = np.array(recording.at("values", "BarChart:values", step)[0]["buffer"])
         if view.values is None:

