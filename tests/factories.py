@@ -54,10 +54,7 @@ def refused(capsys, *arguments) -> str:
 
 def run_python(code: str, **options) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        **options,
+        [sys.executable, "-c", code], capture_output=True, text=True, **options
     )
 
 
@@ -92,8 +89,7 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
             ]
             split = "train" if k < train else "test"
             write_off(
-                folder / label / split / f"{label}_{k}.off",
-                boxes_mesh(boxes, label),
+                folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label)
             )
     return folder
 
@@ -123,9 +119,7 @@ def make_recogniser(
     inputs = [helper.make_tensor_value_info("input", TensorProto.UINT8, shape)]
     outputs = [
         helper.make_tensor_value_info(
-            "logits",
-            TensorProto.FLOAT,
-            ["batch", len(classes)],
+            "logits", TensorProto.FLOAT, ["batch", len(classes)]
         )
     ]
     outputs += [
@@ -161,10 +155,7 @@ def make_recogniser(
 
 
 def make_map_network(
-    folder: Path,
-    name: str = "lem",
-    rings: int = 5,
-    valleys: tuple[str, ...] = (),
+    folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()
 ) -> Path:
     """A map network whose cells are a random linear map of the cloud's middle."""
     weights = np.random.default_rng(1).normal(size=(3, 3 * rings)).astype(np.float32)
@@ -175,9 +166,7 @@ def make_map_network(
     ]
     inputs = [
         helper.make_tensor_value_info(
-            "cloud",
-            TensorProto.FLOAT,
-            ["batch", "points", 3],
+            "cloud", TensorProto.FLOAT, ["batch", "points", 3]
         )
     ]
     outputs = [
@@ -194,12 +183,7 @@ def make_map_network(
 
 
 def _save(
-    path: Path,
-    nodes: list,
-    inputs: list,
-    outputs: list,
-    constants: dict,
-    card: dict,
+    path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict
 ) -> Path:
     initial = [
         numpy_helper.from_array(np.asarray(values), name)
@@ -207,9 +191,7 @@ def _save(
     ]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
     model = helper.make_model(
-        graph,
-        opset_imports=[helper.make_opsetid("", 18)],
-        ir_version=9,
+        graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9
     )
     weights = path.with_suffix(".onnx")
     onnx.save(model, weights)
@@ -246,10 +228,7 @@ def rays(intrinsics, shape) -> np.ndarray:
 
 
 def cast(
-    meshes: Sequence[trimesh.Trimesh],
-    pose,
-    intrinsics=INTRINSICS,
-    shape=SHAPE,
+    meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) float32, 0 = nothing, and which mesh is seen, -1 for none."""
     scene = EmbreeScene()
@@ -283,11 +262,7 @@ def ball_depth(pose, intrinsics, size, radius=1.0, centre=(0, 0, 0)) -> np.ndarr
 
 
 def pose_at(
-    elevation,
-    azimuth,
-    distance,
-    target=(0.0, 0.0, 0.0),
-    turn=(0.0, 0.0, 0.0),
+    elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """A camera (degrees, metres) that looks at a target and is then turned about its own axes,
     degrees.
@@ -461,10 +436,7 @@ def poses_around(azimuths, elevation, distance, centre) -> np.ndarray:
 
 
 def camera_over(
-    meshes: Sequence[Mesh],
-    seed: int = 5,
-    sensor: str = "stereo",
-    gap: float = 0.08,
+    meshes: Sequence[Mesh], seed: int = 5, sensor: str = "stereo", gap: float = 0.08
 ) -> TableCamera:
     """A camera over a table on which some things are put down at random."""
     rng = np.random.default_rng(seed)

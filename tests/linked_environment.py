@@ -37,8 +37,7 @@ def empty_environment(folder: Path) -> tuple[Path, Path]:
 
 
 def asked_for(
-    requirements: Iterable[tuple[str, str]],
-    found: Found | None = None,
+    requirements: Iterable[tuple[str, str]], found: Found | None = None
 ) -> Found:
     """The installed distributions that requirements need, theirs included.
 
@@ -87,8 +86,7 @@ def link(installed: Distribution, packages: Path) -> None:
 
 
 def installation(
-    folder: Path,
-    projects: Mapping[str, Iterable[str]] = {"nextview": ()},
+    folder: Path, projects: Mapping[str, Iterable[str]] = {"nextview": ()}
 ) -> Path:
     """Make an environment in which this clone is installed, with its commands; returns its Python.
 

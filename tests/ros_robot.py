@@ -71,11 +71,7 @@ class Robot(Node):
     """
 
     def __init__(
-        self,
-        see: Callable,
-        k: np.ndarray,
-        start: dict[str, np.ndarray],
-        **options,
+        self, see: Callable, k: np.ndarray, start: dict[str, np.ndarray], **options
     ):
         super().__init__("robot", **options)
         self.see, self.k, self.start = see, k, start

@@ -255,10 +255,7 @@ def models(shared) -> Path:
 
     def make(folder: Path) -> None:
         card = factories.make_recogniser(
-            folder,
-            factories.FURNITURE,
-            size=32,
-            azimuth_bins=8,
+            folder, factories.FURNITURE, size=32, azimuth_bins=8
         )
         calibration = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
         held_out = [f"{label}_{k}" for label in factories.FURNITURE for k in (2, 3)]

@@ -75,10 +75,7 @@ def test_the_threshold_of_a_risk_is_the_lowest_that_promises_it(row, risk):
 
 @given(st.floats(0.5, 0.999), st.floats(0, 2), st.integers(1, 8), st.integers(0, 2**32))
 def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_plain_sum_does(
-    threshold_at,
-    c,
-    n_views,
-    seed,
+    threshold_at, c, n_views, seed
 ):
     # Of two classes, where the peak of the belief is one to one with the difference of the logits.
     logits = np.random.default_rng(seed).normal(size=(50, n_views, 2))
@@ -119,9 +116,7 @@ def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
     """
     logits, azimuth_bins, azimuth = some_views(n_views)
     belief = Calibration(0.7, 0.0, bin_correlation=0.0).belief(
-        log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0),
-        n_views,
-        3,
+        log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0), n_views, 3
     )
     joint = np.zeros((3, 8))
     for c in range(3):
@@ -147,7 +142,5 @@ def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing()
     evidence = SizeEvidence((1.0, 4.0), ((0.0, 2.0), (1.0, 1.0)), 0.5)
     found = evidence.logits(np.array([1.0, 2.0, 4.0, 100.0, 0.001, np.nan]))
     np.testing.assert_allclose(
-        found,
-        [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]],
-        atol=1e-6,
+        found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6
     )

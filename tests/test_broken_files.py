@@ -315,11 +315,7 @@ LAYOUT_ROWS = {
     "a lost camera": (write_seven, f"{SEVEN}.pose.txt", text(4 * "nan nan nan nan\n")),
     "no intrinsics of a folder": (write_folder, "intrinsics.json", Path.unlink),
     "another size": (write_folder, "intrinsics.json", fields(width=1280)),
-    "no depth scale": (
-        write_folder,
-        "intrinsics.json",
-        text(json.dumps(CAMERA)),
-    ),
+    "no depth scale": (write_folder, "intrinsics.json", text(json.dumps(CAMERA))),
     "no pose": (write_folder, "poses", lambda path: path.rename(path.parent / "other")),
     "a pose too many": (
         partial(write_folder, poses="json"),

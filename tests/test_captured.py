@@ -50,8 +50,7 @@ def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
         turn = Rotation.from_rotvec(rng.normal(0, turned, 3), degrees=True).as_matrix()
         there = pose[:3, 3] + rng.normal(0, moved, 3)
         depth, which = caster.cast(
-            there,
-            rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32),
+            there, rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32)
         )
         depths.append(np.where(which < 0, 0, depth).reshape(120, 160))
     return depths, poses
@@ -85,8 +84,7 @@ def write_frames(folder, layout, depths, poses, step=1.0, unit=1.0, swapped=Fals
             "7scenes": f"frame-{i:06d}.depth.png",
         }[layout]
         write_png(
-            folder / name,
-            np.minimum(np.rint(depth / (step * STEPS[layout])), 65534),
+            folder / name, np.minimum(np.rint(depth / (step * STEPS[layout])), 65534)
         )
         if layout == "bop":
             there = {
@@ -96,8 +94,7 @@ def write_frames(folder, layout, depths, poses, step=1.0, unit=1.0, swapped=Fals
             cameras[str(i)] = {"cam_K": k.ravel().tolist(), "depth_scale": 1.0, **there}
         elif layout == "tum":
             quaternion = np.roll(
-                Rotation.from_matrix(pose[:3, :3]).as_quat(),
-                int(swapped),
+                Rotation.from_matrix(pose[:3, :3]).as_quat(), int(swapped)
             )
             lines.append(
                 " ".join(f"{value:.6f}" for value in (i, *pose[:3, 3], *quaternion))
@@ -292,9 +289,7 @@ def test_of_a_can_on_a_table_nothing_is_said(change, tmp_path):
     can = trimesh.creation.cylinder(0.15, 0.4, sections=180)
     can.apply_translation([0, 0, 0.2])
     depths, poses = seen(
-        12,
-        evenly=True,
-        thing=(can.vertices, can.faces.astype(np.int32)),
+        12, evenly=True, thing=(can.vertices, can.faces.astype(np.int32))
     )
     write_frames(tmp_path, "7scenes", depths, change(poses))
     assert check_capture(read_capture(tmp_path))[1] == {}
@@ -306,9 +301,7 @@ def test_a_thing_that_looks_the_same_from_all_sides_contradicts_nothing(tmp_path
     y, x = np.mgrid[:120, :160]
     across = np.hypot((x + 0.5 - 80) / 131.25, (y + 0.5 - 60) / 131.25)
     depth = np.where(
-        across < 0.18,
-        1 - 0.2 * np.sqrt(np.maximum(0, 1 - (across / 0.2) ** 2)),
-        0,
+        across < 0.18, 1 - 0.2 * np.sqrt(np.maximum(0, 1 - (across / 0.2) ** 2)), 0
     )
     write_frames(tmp_path, "7scenes", [depth] * 5, np.roll(poses, 1, axis=0))
     assert check_capture(read_capture(tmp_path))[1] == {}
@@ -343,9 +336,7 @@ ONE_BAD = {
 
 @pytest.mark.parametrize("what", ONE_BAD)
 def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(
-    what,
-    nine,
-    tmp_path,
+    what, nine, tmp_path
 ):
     harm, said = ONE_BAD[what]
     write_frames(tmp_path, "7scenes", *nine)

@@ -188,10 +188,7 @@ def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
     ],
 )
 def test_the_exit_status_is_right_if_an_output_is_full_or_closed(
-    where,
-    words,
-    status,
-    said,
+    where, words, status, said
 ):
     line = ["bash", "-c", f'"$@" {where}', "bash", *COMMAND, *words.split()]
     done = subprocess.run(line, capture_output=True, text=True)
@@ -221,10 +218,7 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
     assert "--models" in script
 
 
-def test_without_a_terminal_progress_is_printed_as_lines(
-    monkeypatch,
-    capsys,
-):
+def test_without_a_terminal_progress_is_printed_as_lines(monkeypatch, capsys):
     seconds = 0
     monkeypatch.setattr("nextview.data.progress.time.monotonic", lambda: seconds)
 

@@ -16,9 +16,7 @@ POSES = ViewSphere.named("40").poses
 
 
 def unprojected(
-    depth: np.ndarray,
-    pose: np.ndarray,
-    intrinsics: np.ndarray,
+    depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
     """The point under every pixel, one after the other, object frame, (H, W, 3)."""
     points = np.zeros((*depth.shape, 3))
@@ -29,9 +27,7 @@ def unprojected(
 
 
 def pixels_of(
-    points: np.ndarray,
-    pose: np.ndarray,
-    intrinsics: np.ndarray,
+    points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
     """(row, column) in which each point appears."""
     seen = (points - pose[:3, 3]) @ pose[:3, :3] @ intrinsics.T
@@ -55,9 +51,7 @@ def test_every_point_is_under_a_visible_pixel(share, view):
     row, column = pixels_of(points, POSES[view], intrinsics).T
     assert (depth[row, column] > 0).all()
     np.testing.assert_allclose(
-        points,
-        unprojected(depth, POSES[view], intrinsics)[row, column],
-        atol=1e-6,
+        points, unprojected(depth, POSES[view], intrinsics)[row, column], atol=1e-6
     )
 
 
@@ -72,9 +66,7 @@ def test_pixels_are_drawn_without_replacement_and_repeat_evenly_when_few(visible
         assert (points == 0).all()
         return
     drawn, times = np.unique(
-        pixels_of(points, POSES[10], intrinsics),
-        axis=0,
-        return_counts=True,
+        pixels_of(points, POSES[10], intrinsics), axis=0, return_counts=True
     )
     assert len(drawn) == min(visible, CLOUD_POINTS)
     assert np.ptp(times) <= 1
@@ -92,9 +84,7 @@ def test_clouds_are_scaled_by_their_own_global_extent():
     for cloud, raw in zip(clouds, points, strict=True):
         assert (cloud.min(), cloud.max()) == (0, 1)
         np.testing.assert_allclose(
-            cloud,
-            np.interp(raw, [raw.min(), raw.max()], [0, 1]),
-            atol=1e-5,
+            cloud, np.interp(raw, [raw.min(), raw.max()], [0, 1]), atol=1e-5
         )
 
 
@@ -106,7 +96,6 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
     turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     ahead = cloud_input(points.astype(np.float32), look_at_origin([elevation], [0.0]))
     found = cloud_input(
-        turned.astype(np.float32),
-        look_at_origin([elevation], [azimuth]),
+        turned.astype(np.float32), look_at_origin([elevation], [azimuth])
     )
     np.testing.assert_allclose(found, ahead, atol=1e-5)

@@ -116,8 +116,7 @@ def other_episodes():
 
 def _recognise(sample, options, how):
     return nextview.load(threads=1, **options).recognise(
-        SAMPLES / f"{sample}.off",
-        **how,
+        SAMPLES / f"{sample}.off", **how
     )
 
 
@@ -129,8 +128,7 @@ def _arm(sample):
         sys.path.remove(str(ROOT / "examples"))
     return example.recognise(
         example.Arm(
-            nextview.load_mesh(SAMPLES / f"{sample}.off"),
-            np.random.default_rng(1),
+            nextview.load_mesh(SAMPLES / f"{sample}.off"), np.random.default_rng(1)
         )
     )
 
@@ -138,8 +136,7 @@ def _arm(sample):
 def _constrained():
     """A session with a mask, a matrix of costs, and two targets that could not be reached."""
     session = nextview.load(threads=1, threshold=0.9995, max_views=5).session(
-        start=10,
-        seed=3,
+        start=10, seed=3
     )
     camera = nextview.SimulatedCamera(nextview.load_mesh(SAMPLES / "monitor.off"))
     session.reachable = np.arange(40) % 3 > 0
@@ -214,8 +211,7 @@ def test_all_imports_of_the_pages_exist(page):
         (module, name.strip()) for module, names in lines for name in names.split(", ")
     ):
         there = hasattr(
-            importlib.import_module(module),
-            name,
+            importlib.import_module(module), name
         ) or importlib.util.find_spec(f"{module}.{name}")
         assert there, f"{page.name}: {name} of {module}"
 
@@ -230,8 +226,7 @@ def test_episodes(name, golden):
     )
     # Other processors round otherwise: 1.5e-8 in the way of the arm.
     assert [found["travel"], found["arc"]] == pytest.approx(
-        [wanted["travel"], wanted["arc"]],
-        abs=1e-6,
+        [wanted["travel"], wanted["arc"]], abs=1e-6
     )
     np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
     # ONNX Runtime takes other kernels on other processors: 4e-4 between two of them.

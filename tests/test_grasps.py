@@ -4,7 +4,6 @@ import json
 import re
 import sys
 import types
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from nextview.scene.grasps import (
     HALF_TURN,
     Grasp,
     Gripper,
-    free_grasps,
     load_grasps,
     propose_grasps,
     save_grasps,
@@ -346,12 +344,3 @@ def test_what_no_frame_has_shown_is_not_free(lonely):
             place = (one.pose @ own)[:3]
             share, _ = caster.cast(camera, (place - camera)[None])
             assert share[0] > 0.98
-
-
-def test_an_uncertain_object_offers_no_grasp(lonely):
-    names, scene, _, _ = lonely
-    unsure = [replace(one, confident=False) for one in scene.objects]
-    own = names["grasps"], names["GRIPPER"]
-    assert free_grasps(scene.objects, scene.tops, *own)
-    assert free_grasps(unsure, scene.tops, *own) == []
-    assert nextview.Scene(names["system"]).grasps(*own) == []

@@ -72,18 +72,13 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
             for k, side in product(kept, range(8)):
                 zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[
-                    e,
-                    k,
-                    :,
-                    side,
+                    e, k, :, side
                 ]
             total = total + np.log(
                 np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1)
             )
         np.testing.assert_allclose(
-            together.steps[-1].belief[e],
-            softmax(total),
-            atol=1e-12,
+            together.steps[-1].belief[e], softmax(total), atol=1e-12
         )
     np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
 

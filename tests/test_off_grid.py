@@ -90,8 +90,7 @@ def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"],
+    "name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"]
 )
 def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
     """The 40 views as a mere list of directions: the same decisions and values as on the grid
@@ -110,22 +109,16 @@ def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(nam
         assert off.next_views(state, rng) == policy.next_views(state, rng)
         if name in ("gain", "visible-gain", "lem-peak"):
             np.testing.assert_allclose(
-                off.view_values(state),
-                policy.view_values(state),
-                atol=1e-9,
+                off.view_values(state), policy.view_values(state), atol=1e-9
             )
         assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(
-            state,
-            rng,
+            state, rng
         )
 
 
 @settings(deadline=None, max_examples=40)
 @given(
-    st.floats(-20, 89),
-    st.floats(0, 360),
-    st.sampled_from(LAYOUTS),
-    st.integers(0, 99),
+    st.floats(-20, 89), st.floats(0, 360), st.sampled_from(LAYOUTS), st.integers(0, 99)
 )
 def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout, seed):
     """Bilinear in elevation and in azimuth from the camera, written out for each view."""
@@ -176,16 +169,10 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
 
 @settings(deadline=None, max_examples=150)
 @given(
-    st.data(),
-    st.sampled_from(LAYOUTS),
-    st.sampled_from(NAMES),
-    st.integers(0, 10**6),
+    st.data(), st.sampled_from(LAYOUTS), st.sampled_from(NAMES), st.integers(0, 10**6)
 )
 def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
-    data,
-    layout,
-    name,
-    seed,
+    data, layout, name, seed
 ):
     sphere = viewpoints_of(layout)
     policy = make_policy_anywhere(name, sphere)
@@ -215,9 +202,7 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
             place /= np.linalg.norm(place)
             places.append(place[0])
             step = episodes.update(
-                evidence(rng),
-                place,
-                partial(replace, reachable=reachable[None]),
+                evidence(rng), place, partial(replace, reachable=reachable[None])
             )
             assert step.belief.sum() == pytest.approx(1)
             to = int(step.next_views[0])

@@ -29,8 +29,7 @@ README = (ROOT / "README.md").read_text()
 def test_the_examples_of_a_page_run(page):
     try:
         failed, tried = doctest.testfile(
-            str(ROOT / f"docs/{page}.md"),
-            module_relative=False,
+            str(ROOT / f"docs/{page}.md"), module_relative=False
         )
     finally:
         sys.modules.pop("spread", None)
@@ -44,8 +43,7 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
     example = importlib.import_module(name)
     kind = example.Arm if name == "arm_and_object" else example.Turntable
     robot = kind(
-        nextview.load_mesh(SAMPLE_FILES / "table.off"),
-        np.random.default_rng(1),
+        nextview.load_mesh(SAMPLE_FILES / "table.off"), np.random.default_rng(1)
     )
     result = example.recognise(robot)
     assert result.answer == "table"
@@ -175,8 +173,7 @@ def test_each_page_names_what_its_commands_need():
                     "research": r"\./research",
                 }[project]
                 said = re.search(
-                    name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""),
-                    text,
+                    name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""), text
                 )
                 assert said, (
                     f"{page}:{step.line} needs {wanted}, which the page does not name"

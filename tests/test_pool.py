@@ -62,9 +62,6 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
 def test_what_a_guarded_script_defines_reaches_the_workers(tmp_path, function, items):
     (tmp_path / "script.py").write_text(OWN_CODE.format(function=function, items=items))
     done = subprocess.run(
-        [sys.executable, "script.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
     )
     assert (done.stderr, done.stdout) == ("", "[2, 8, 18]\n")

@@ -52,8 +52,7 @@ def test_all_files_of_the_workflows_exist(workflow):
     for target in re.findall(r"\bmake ([\w./-]+)", text):
         assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
     for path in re.findall(
-        r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w",
-        text,
+        r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w", text
     ):
         assert (ROOT / path).exists(), path
     for folder, names in re.findall(r"(\.|\./research)\[([\w,-]+)\]", text):

@@ -38,9 +38,7 @@ def plate(points):
     """A sheet without thickness, cut along a polygon that is seen whole from its first corner."""
     fan = [(0, k, k + 1) for k in range(1, len(points) - 1)]
     return Trimesh(
-        np.pad(np.array(points, float), ((0, 0), (0, 1))),
-        fan,
-        process=False,
+        np.pad(np.array(points, float), ((0, 0), (0, 1))), fan, process=False
     )
 
 
@@ -51,9 +49,7 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
     assert len(found) == 3  # of its six sides two and two look alike
     np.testing.assert_array_equal(found[0], np.eye(3))
     np.testing.assert_allclose(
-        sorted(np.abs(found[:, 2]).tolist()),
-        np.eye(3)[::-1],
-        atol=1e-6,
+        sorted(np.abs(found[:, 2]).tolist()), np.eye(3)[::-1], atol=1e-6
     )
     for rotation in found:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
@@ -81,9 +77,7 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
 )
 @pytest.mark.parametrize("turn", [(0, 0, 0), (40, 30, 70)])
 def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(
-    shape,
-    tilts,
-    turn,
+    shape, tilts, turn
 ):
     away = Rotation.from_euler("zxz", turn, degrees=True)
     mesh = of(Trimesh(away.apply(shape.vertices), shape.faces, process=False))
@@ -96,8 +90,7 @@ def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(
 
 
 @pytest.mark.parametrize(
-    "shape",
-    [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)],
+    "shape", [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)]
 )
 def test_a_ball_and_a_die_have_one_pose(shape):
     assert len(resting_poses(of(shape))) == 1

@@ -14,11 +14,7 @@ def walk(knobs, knobs_memory):
     """One view of the box without a knob."""
     shown = shown_objects(knobs / "plain.ply", unit="m")
     exploration = Exploration(
-        shown,
-        models=knobs_memory,
-        sensor="wrist",
-        start=20,
-        threads=1,
+        shown, models=knobs_memory, sensor="wrist", start=20, threads=1
     )
     walk = exploration.walks[0]
     assert walk.rival_pictures(SPHERE.directions[0]) is None  # nothing was seen yet

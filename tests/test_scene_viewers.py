@@ -11,9 +11,8 @@ pytest.importorskip("viser", reason="the extra 'explore' is not installed")
 from rerun.chunk import RrdReader
 
 import nextview
-from nextview.errors import SessionError, UsageError
 from nextview.viewers.page import serve
-from nextview.viewers.scene_page import draw_scene_in_3d, write_scene_page
+from nextview.viewers.scene_page import draw_scene_in_3d
 from nextview.viewers.scene_recording import SceneRecorder, record_scene
 
 NAMES = ("cracker_box", "mug", "banana")
@@ -121,13 +120,3 @@ def test_a_page_has_things_and_cameras_where_they_are(made, camera):
         assert server.scene.get_handle_by_name(f"/objects/{before['banana']}") is None
     finally:
         server.stop()
-
-
-def test_invalid_outputs_of_a_scene_are_rejected(made, tmp_path):
-    scene, _, _ = made
-    with pytest.raises(UsageError, match=r"called \.html"):
-        write_scene_page(scene, tmp_path / "scene.txt")
-    with pytest.raises(UsageError, match=r"called \.rrd"):
-        SceneRecorder(tmp_path / "scene.html")
-    with pytest.raises(SessionError, match="before the first frame"):
-        write_scene_page(nextview.Scene(scene.system), tmp_path / "none.html")

@@ -128,20 +128,16 @@ def test_points_lie_on_the_surface_and_are_visible(mesh, view):
     assert observation.points.dtype == np.float32
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     _, distance, _ = trimesh.proximity.closest_point_naive(
-        solid,
-        observation.points[::16].astype(float),
+        solid, observation.points[::16].astype(float)
     )
     np.testing.assert_allclose(distance, 0, atol=2e-5)
     in_camera = (observation.points - observation.pose[:3, 3]) @ observation.pose[
-        :3,
-        :3,
+        :3, :3
     ]
     projected = in_camera @ observation.intrinsics.T
     column, row = np.floor(projected[:, :2] / projected[:, 2:]).astype(int).T
     np.testing.assert_allclose(
-        observation.depth[row, column],
-        in_camera[:, 2],
-        atol=1e-4,
+        observation.depth[row, column], in_camera[:, 2], atol=1e-4
     )
 
 

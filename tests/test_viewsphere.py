@@ -95,17 +95,13 @@ def test_poses_look_at_the_origin_with_a_level_horizon(elevation, azimuth, dista
     np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
     # z is forward
     np.testing.assert_allclose(
-        position + distance * rotation[:, 2],
-        0,
-        atol=1e-12 * distance,
+        position + distance * rotation[:, 2], 0, atol=1e-12 * distance
     )
     assert np.linalg.norm(position) == pytest.approx(distance)
     assert rotation[2, 0] == 0  # x has no vertical part: the horizon is level
     assert rotation[2, 1] <= 1e-12  # y is down
     np.testing.assert_allclose(
-        np.cross(rotation[:, 0], rotation[:, 1]),
-        rotation[:, 2],
-        atol=1e-12,
+        np.cross(rotation[:, 0], rotation[:, 1]), rotation[:, 2], atol=1e-12
     )
 
 

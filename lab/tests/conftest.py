@@ -89,11 +89,7 @@ def predictions(shared, views, models) -> Path:
         )
         list(
             predict(
-                views,
-                folder / "predictions.npz",
-                recogniser,
-                {"lem": lem},
-                workers=0,
+                views, folder / "predictions.npz", recogniser, {"lem": lem}, workers=0
             )
         )
 
@@ -115,11 +111,7 @@ def results(shared) -> Path:
             folder / "p.npz"
         )
         pipeline.benchmark(
-            folder / "p.npz",
-            folder / "out",
-            thresholds=(0.7, 0.9),
-            runs=3,
-            samples=200,
+            folder / "p.npz", folder / "out", thresholds=(0.7, 0.9), runs=3, samples=200
         )
 
     return shared("results", make)

@@ -42,12 +42,7 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
 
 
 def train_predictions(
-    logits,
-    labels,
-    sphere,
-    classes,
-    azimuth_bins=None,
-    **fields,
+    logits, labels, sphere, classes, azimuth_bins=None, **fields
 ) -> Predictions:
     """Predictions of objects of the training split of which nothing but this is known."""
     n, v, _ = logits.shape
@@ -80,9 +75,7 @@ def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
     opened, rng = ViewStore.open(store), np.random.default_rng(0)
     shows = opened.measure("visible_share") > 0.3
     logits = np.where(
-        shows[..., None],
-        2 * rng.normal(size=(len(opened), 40, len(classes))),
-        0,
+        shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0
     ).astype(np.float32)
     return replace(
         some_predictions(len(opened)),
@@ -104,12 +97,7 @@ def benchmark(predictions: Path, out: Path, **settings):
 
 
 def store_of(
-    path: Path,
-    names,
-    labels,
-    sphere: ViewSphere,
-    size: int = 16,
-    **arrays,
+    path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays
 ) -> ViewStore:
     """A store whose objects are rendered, if only these arrays of it hold anything:
     depth_entropy, image.
@@ -136,7 +124,5 @@ def of_depth(depth, distance=3.0) -> MeasuredView:
     """What a measure is handed where the depth alone is known, from straight ahead."""
     depth = np.asarray(depth)
     return MeasuredView(
-        depth,
-        look_at_origin(0, 0, distance),
-        pinhole(max(depth.shape), distance),
+        depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance)
     )

@@ -68,8 +68,7 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
     measures = pd.read_csv(results / "out" / "measures.csv").query("set == 'all'")
     summary = measures.set_index(["policy", "threshold", "measure"])["value"]
     for (policy, threshold), cell in rows.groupby(
-        ["policy", "threshold"],
-        observed=True,
+        ["policy", "threshold"], observed=True
     ):
         moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
         by_class = cell.groupby("label", observed=True)
@@ -88,18 +87,13 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
             "confident": len(sure) / len(cell),
             "confident_accuracy": sure.right.mean(),
             "calibration_error": calibration_error(
-                cell.confidence.to_numpy(),
-                cell.right.to_numpy(),
+                cell.confidence.to_numpy(), cell.right.to_numpy()
             ),
         }
         for measure, value in wanted.items():
             assert summary[policy, threshold, measure] == pytest.approx(
-                value,
-                nan_ok=True,
-            ), (
-                policy,
-                measure,
-            )
+                value, nan_ok=True
+            ), (policy, measure)
 
 
 def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
@@ -137,17 +131,14 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
         for column in ("n_views", "confidence", "travel", "arc"):
             np.testing.assert_array_equal(getattr(ends, column), rows[column])
         np.testing.assert_array_equal(
-            np.array(p.classes)[ends.answer],
-            rows["answer"].astype(str),
+            np.array(p.classes)[ends.answer], rows["answer"].astype(str)
         )
         # a threshold that stays
         assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()
 
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(
-    results,
-    tmp_path,
-    capsys,
+    results, tmp_path, capsys
 ):
     names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
     sentences = refused(
@@ -184,9 +175,7 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
 
 
 def test_measured_error_rates_stand_beside_the_promised_ones(
-    predictions,
-    tmp_path,
-    capsys,
+    predictions, tmp_path, capsys
 ):
     bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
     replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(

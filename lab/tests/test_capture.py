@@ -43,9 +43,7 @@ def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system
     those of the mesh.
     """
     camera = CapturedCamera(
-        read_capture(captured),
-        up=(0, 0, 1),
-        box=read_box(captured / "box.json"),
+        read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json")
     )
     found, looked = (
         system.recognise(camera, start=4),
@@ -64,9 +62,7 @@ def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system
     np.testing.assert_allclose(centre, [0, 0, height], atol=1e-9)
     for view in found.views:
         np.testing.assert_allclose(
-            view.observation.pose,
-            TWELVE.poses[view.index],
-            atol=1e-6,
+            view.observation.pose, TWELVE.poses[view.index], atol=1e-6
         )
 
 
@@ -92,8 +88,7 @@ def test_every_request_gets_the_nearest_view_that_is_left(captured):
     box = read_box(captured / "box.json")
     camera = CapturedCamera(capture, box=box)
     asked = look_at_origin(
-        np.radians([50, 30, 70, 10]),
-        np.radians([130, 128, 131, 310]),
+        np.radians([50, 30, 70, 10]), np.radians([130, 128, 131, 310])
     )
     left = dict(enumerate(capture.frames))
     for pose in asked:

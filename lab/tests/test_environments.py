@@ -114,8 +114,7 @@ def test_the_vectorised_environment_is_many_single_ones(options):
             seen, reward, over, _, alone = singles[row].step(actions[row])
             last = info["final_info"] if over else info
             np.testing.assert_array_equal(
-                seen,
-                info["final_obs"][row] if over else observation[row],
+                seen, info["final_obs"][row] if over else observation[row]
             )
             assert (reward, over) == (rewards[row], ended[row])
             assert all(np.array_equal(alone[name], last[name][row]) for name in alone)
@@ -140,13 +139,7 @@ def test_an_episode_is_the_loop_of_a_robot():
 
         rng = np.random.default_rng(k)
         expected = run_episodes(
-            observe,
-            p.sphere,
-            policy,
-            np.array([3 * k]),
-            stopping,
-            rng,
-            p.calibration,
+            observe, p.sphere, policy, np.array([3 * k]), stopping, rng, p.calibration
         )
         views = expected.outcome.views[0]
         env = gymnasium.make(
@@ -159,9 +152,7 @@ def test_an_episode_is_the_loop_of_a_robot():
         observation, info = env.reset(options={"object": k, "start": int(views[0])})
         total, ended = observation[p.labels[k]], False
         for step, (here, there) in zip(
-            expected.steps[1:],
-            pairwise(views),
-            strict=False,
+            expected.steps[1:], pairwise(views), strict=False
         ):
             action = cells_to(p.sphere)[here, there]
             assert info["action_mask"][action]
@@ -179,8 +170,7 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(
-        str(Path(__file__).parents[2] / "docs/environments.md"),
-        module_relative=False,
+        str(Path(__file__).parents[2] / "docs/environments.md"), module_relative=False
     )
     assert tried > 12
     assert failed == 0

@@ -123,16 +123,11 @@ def test_intervals_are_scipys():
         (score(found.maps, by="network", label="", measure="mse"), error),
     ):
         theirs = bootstrap(
-            (values,),
-            np.mean,
-            n_resamples=4000,
-            method="percentile",
-            rng=1,
+            (values,), np.mean, n_resamples=4000, method="percentile", rng=1
         ).confidence_interval
         assert row.value == pytest.approx(values.mean())
         assert (row.low, row.high) == pytest.approx(
-            theirs,
-            abs=0.1 * (theirs.high - theirs.low),
+            theirs, abs=0.1 * (theirs.high - theirs.low)
         )
 
 
@@ -140,15 +135,12 @@ def true_windows(p):
     """The true LEM's windows, cell by cell."""
     values = p.depth_entropy.astype(float)
     values = (values - values.min(1, keepdims=True)) / np.ptp(
-        values,
-        axis=1,
-        keepdims=True,
+        values, axis=1, keepdims=True
     )
     windows = np.empty((len(p), 40, 5, 3))
     for view, ring, column in np.ndindex(40, 5, 3):
         windows[:, view, ring, column] = values[
-            :,
-            8 * ring + (view % 8 + column - 1) % 8,
+            :, 8 * ring + (view % 8 + column - 1) % 8
         ]
     return windows
 
@@ -173,11 +165,7 @@ def test_map_scores_by_hand():
     # All objects have the same true map, so the class's mean at the view is the truth; the mean map
     # is 4/9 everywhere.
     of_class = score(
-        found.maps,
-        map="lem",
-        by="mean map of the class",
-        label="",
-        measure="mse",
+        found.maps, map="lem", by="mean map of the class", label="", measure="mse"
     )
     assert of_class.value == pytest.approx(0, abs=1e-12)
     mean = score(found.maps, map="lem", by="mean map", label="", measure="mse")

@@ -28,22 +28,14 @@ from nextview_lab.training.card_fits import (
 )
 from nextview_lab.training.fitting_set import blind_walks
 from nextview_lab.training.unknown import fit_novelty, quantiles
-from research.fit_policies import (
-    fit_class_table,
-    fit_ring,
-    fit_sequence,
-    fitting_set,
-)
+from research.fit_policies import fit_class_table, fit_ring, fit_sequence, fitting_set
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 
 
 def correlated(
-    n: int,
-    correlation: float,
-    temperature: float,
-    seed: int = 0,
+    n: int, correlation: float, temperature: float, seed: int = 0
 ) -> Predictions:
     """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views
     of an object.
@@ -59,20 +51,15 @@ def correlated(
     )
     logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
     return train_predictions(
-        (temperature * logits).astype(np.float32),
-        labels,
-        SMALL,
-        ("minus", "plus"),
+        (temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus")
     )
 
 
 @pytest.mark.parametrize(
-    ("correlation", "temperature"),
-    [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)],
+    ("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)]
 )
 def test_the_correlation_and_temperature_of_generated_looks_are_found(
-    correlation,
-    temperature,
+    correlation, temperature
 ):
     data = correlated(4000, correlation, temperature)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
@@ -98,9 +85,7 @@ def test_sides_count_as_far_as_looks_are_right_about_them(right):
     true = (SMALL.azimuth_index - zero[:, None]) % s
     wrong = (true + rng.integers(1, s, (n, v))) % s
     claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(
-        rng.random((n, v)) < right,
-        true,
-        wrong,
+        rng.random((n, v)) < right, true, wrong
     )
     azimuth_bins = np.log(
         np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))
@@ -148,8 +133,7 @@ def test_promises_are_kept_as_often_as_promised():
         reached = sure >= threshold
         stopped, first = reached.any(1), reached.argmax(1)
         return np.average(
-            wrong[np.arange(len(whole)), first][stopped],
-            weights=even[stopped],
+            wrong[np.arange(len(whole)), first][stopped], weights=even[stopped]
         )
 
     promises, broken = 0, 0
@@ -157,12 +141,7 @@ def test_promises_are_kept_as_often_as_promised():
         some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
         part = whole.of_objects(some)
         bounds = fit_risk(
-            part,
-            calibration,
-            np.random.default_rng(seed),
-            delta,
-            n_views,
-            walks=1,
+            part, calibration, np.random.default_rng(seed), delta, n_views, walks=1
         )
         # else it promises nothing, and nothing is broken
         if min(bounds.bounds[n_views - 1]) <= risk:
@@ -198,8 +177,7 @@ def test_a_shape_that_was_copied_counts_once():
     assert once.names == p.names
     np.testing.assert_array_equal(once.logits, p.logits)
     relabelled = replace(
-        many,
-        labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3],
+        many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3]
     )
     # which of two labels is right is not for us
     assert relabelled.deduplicate().names == (*p.names, "copy8")
@@ -218,10 +196,7 @@ def test_a_shape_that_was_copied_counts_once():
 
 
 def telling(
-    sphere: ViewSphere,
-    rings_of_class: list[list[int]],
-    n: int = 40,
-    seed: int = 0,
+    sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0
 ) -> Predictions:
     """Every view says little of the class, but those on some rings, which depend on the class,
     say it loudly.
@@ -235,10 +210,7 @@ def telling(
         loud = np.isin(sphere.ring, rings_of_class[label])
         logits[i, loud, label] += 3
     return train_predictions(
-        logits.astype(np.float32),
-        labels,
-        sphere,
-        tuple("abcdef"[:c]),
+        logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c])
     )
 
 
@@ -248,20 +220,12 @@ def test_what_tells_most_is_found(scope):
     assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
     assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
     by_class = fit_class_table(
-        telling(SMALL, [[0], [2]]),
-        4,
-        0.0,
-        PLAIN_SUM,
-        np.random.default_rng(0),
+        telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0)
     )
     assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
     assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
     shared = fit_class_table(
-        telling(SMALL, [[0], [2]]),
-        4,
-        1e9,
-        PLAIN_SUM,
-        np.random.default_rng(0),
+        telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0)
     )
     np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
 
@@ -322,9 +286,7 @@ def training_predictions(tmp_path):
     p = some_predictions(90)
     logits = p.logits.copy()
     logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(
-        0.6,
-        0.8,
-        (90, 1),
+        0.6, 0.8, (90, 1)
     )
     change_card(card, held_out=list(p.names[:45]))
     models = {**p.models, "recogniser": ("tiny", read_card(card).sha256)}
@@ -339,8 +301,7 @@ def training_predictions(tmp_path):
 
 
 def test_a_calibration_goes_into_the_card_and_is_used(
-    training_predictions,
-    monkeypatch,
+    training_predictions, monkeypatch
 ):
     card, path = training_predictions
     before = json.loads(card.read_text())

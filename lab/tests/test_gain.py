@@ -56,12 +56,7 @@ INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
 
 
 def some_gain(
-    sphere=SPHERE,
-    inputs=INPUTS,
-    networks=2,
-    seed=0,
-    frame="camera",
-    **rest,
+    sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest
 ) -> Gain:
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
@@ -176,8 +171,7 @@ def some_table(n=30, sphere=SMALL, seed=0, azimuth_bins=False) -> ReplayTable:
     noisy = data.logits + rng.normal(size=data.logits.shape)
     maps = {
         "lem-sphere": rng.random(
-            (n, len(sphere), sphere.rings, sphere.azimuths),
-            dtype=np.float32,
+            (n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32
         )
     }
     shape = (n, len(sphere), len(data.classes), sphere.azimuths)
@@ -203,9 +197,7 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
             for kind in OBJECTIVES:
                 reached = value_after(table, moment.total, state.step, kind)
                 np.testing.assert_allclose(
-                    reached,
-                    log_evidence[kind][np.arange(30), state.current],
-                    atol=1e-9,
+                    reached, log_evidence[kind][np.arange(30), state.current], atol=1e-9
                 )
         seen.append(
             (
@@ -218,9 +210,7 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
     assert (moment.state.visited.sum(1) == 4).all()
     of_truth = logs[np.arange(30), table.data.labels]
     np.testing.assert_allclose(
-        value_after(table, moment.total, 4, "log-belief"),
-        of_truth,
-        atol=1e-9,
+        value_after(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9
     )
     right = (logs.argmax(1) == table.data.labels).astype(float)
     np.testing.assert_array_equal(value_after(table, moment.total, 4, "right"), right)
@@ -261,14 +251,11 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     assert (other.inputs, other.scope, other.travel_weight) == (inputs, scope, 0.1)
     seen = features(SPHERE, state, inputs)
     np.testing.assert_allclose(
-        other.score(seen.astype(np.float32)),
-        policy.score(seen),
-        atol=1e-5,
+        other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5
     )
     random = np.random.default_rng(0)
     np.testing.assert_array_equal(
-        other.next_views(state, random),
-        policy.next_views(state, random),
+        other.next_views(state, random), policy.next_views(state, random)
     )
 
 
@@ -276,12 +263,7 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
 
 
 QUICK = GainRecipe(
-    epochs=6,
-    episodes=2,
-    batch=128,
-    networks_per_fold=2,
-    max_views=3,
-    lr=1e-2,
+    epochs=6, episodes=2, batch=128, networks_per_fold=2, max_views=3, lr=1e-2
 )
 
 
@@ -292,10 +274,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240))
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1))
     recipe = replace(
-        QUICK,
-        inputs=("belief", "view", "place"),
-        frame="camera",
-        epochs=20,
+        QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20
     )
     *_, ((policy,), value) = best_epoch([train(learned, recipe)], [fresh], recipe)
     first, second = (
@@ -317,8 +296,7 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     )
     assert free > cheap > dear
     fitted = replace(
-        policy,
-        travel_weight=fit_travel_weight([(fresh, policy)], 3, "log-belief", 0),
+        policy, travel_weight=fit_travel_weight([(fresh, policy)], 3, "log-belief", 0)
     )
     assert (travel(fitted) <= travel(Random(SMALL))).all()
 
@@ -339,10 +317,7 @@ def unseen(tmp_path):
     )
     maps = p.maps | {"lem-sphere": sphere}
     replace(
-        p,
-        splits=np.array(["train"] * 90),
-        maps=maps,
-        azimuth_bins=azimuth_bins,
+        p, splits=np.array(["train"] * 90), maps=maps, azimuth_bins=azimuth_bins
     ).save(path)
     return path
 

@@ -216,9 +216,6 @@ def test_bash_completes_commands_and_options(words, offered, completions_for_bas
         " COMP_CWORD=$((${#COMP_WORDS[@]}-1)); $f; echo ${COMPREPLY[@]}"
     )
     done = subprocess.run(
-        ["bash", "-c", ask],
-        capture_output=True,
-        text=True,
-        check=True,
+        ["bash", "-c", ask], capture_output=True, text=True, check=True
     )
     assert set(done.stdout.split()) == offered

@@ -13,10 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
-from nextview_lab.training.architectures import (
-    PointNet,
-    ResNet,
-)
+from nextview_lab.training.architectures import PointNet, ResNet
 from nextview_lab.training.export import export_onnx
 from nextview_lab.training.runs import start_from
 
@@ -54,8 +51,7 @@ def torchvisions_shapes(depth, classes=1000, channels=3, counts_batches=True):
     norm("bn1", 64)
     before = 64
     for stage, (blocks, width) in enumerate(
-        zip(BLOCKS[depth], (64, 128, 256, 512), strict=True),
-        1,
+        zip(BLOCKS[depth], (64, 128, 256, 512), strict=True), 1
     ):
         after = width if depth < 50 else 4 * width
         # (inner convolutions, each: outputs, inputs, side)
@@ -129,26 +125,20 @@ BROKEN = {
         pickle.dumps(Bomb(path.parent / "executed"))
     ),
     "cannot be a pickle inside torch's own file": lambda path: torch.save(
-        {"x": Bomb(path.parent / "executed")},
-        path,
+        {"x": Bomb(path.parent / "executed")}, path
     ),
     "truncated": lambda path: (
         checkpoint(path),
         path.write_bytes(path.read_bytes()[: 2 << 20]),
     ),
     "another network": lambda path: torch.save(
-        {"features.0.weight": torch.zeros(3)},
-        path,
+        {"features.0.weight": torch.zeros(3)}, path
     ),
     "wrong shape": lambda path: damaged(
-        path,
-        "layer2.0.conv1.weight",
-        torch.zeros(128, 64, 1, 1),
+        path, "layer2.0.conv1.weight", torch.zeros(128, 64, 1, 1)
     ),
     "not finite": lambda path: damaged(
-        path,
-        "layer1.0.bn1.weight",
-        torch.full((64,), torch.nan),
+        path, "layer1.0.bn1.weight", torch.full((64,), torch.nan)
     ),
 }
 
@@ -177,9 +167,7 @@ def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
     assert torch.allclose(a, torch.eye(3).expand(3, 3, 3))
     assert torch.allclose(b, torch.eye(64).expand(3, 64, 64))
     assert torch.allclose(
-        network(cloud[:, torch.randperm(200)])[0],
-        predicted,
-        atol=1e-5,
+        network(cloud[:, torch.randperm(200)])[0], predicted, atol=1e-5
     )
 
 
@@ -197,12 +185,7 @@ def exported(tmp_path_factory):
     example = torch.rand(2, 4, 64, 64).numpy()
     for bits in (16, 8):
         export_onnx(
-            network,
-            example,
-            "input",
-            ["logits"],
-            folder / f"{bits}.onnx",
-            bits,
+            network, example, "input", ["logits"], folder / f"{bits}.onnx", bits
         )
     return network, folder
 
@@ -211,8 +194,7 @@ def answers(network, folder, bits):
     """What a file and its network say of another number of inputs than the example's."""
     x = torch.rand(3, 4, 64, 64, generator=torch.Generator().manual_seed(1))
     session = ort.InferenceSession(
-        folder / f"{bits}.onnx",
-        providers=["CPUExecutionProvider"],
+        folder / f"{bits}.onnx", providers=["CPUExecutionProvider"]
     )
     with torch.no_grad():
         expected = network(x)[0].numpy()

@@ -163,11 +163,7 @@ def test_a_package_that_an_output_needs_is_missed_before_an_input_is_read(
 
 @pytest.mark.parametrize("name", WRITES)
 def test_what_exists_is_refused_and_overwritten_on_demand_only(
-    name,
-    made,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    name, made, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     before, out, after = (words.format(**made) for words in WRITES[name])

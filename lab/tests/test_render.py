@@ -38,9 +38,7 @@ def assert_same(a: Path, b: Path) -> None:
     first, second = ViewStore.open(a), ViewStore.open(b)
     for name in first.rendered:
         np.testing.assert_array_equal(
-            first.array(name)[:],
-            second.array(name)[:],
-            err_msg=name,
+            first.array(name)[:], second.array(name)[:], err_msg=name
         )
     assert not list(b.rglob("*.partial"))
     assert not b.with_name(b.name + ".part").exists()
@@ -77,9 +75,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 @linux
 def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(
-    furniture,
-    whole,
-    tmp_path,
+    furniture, whole, tmp_path
 ):
     path = tmp_path / "views.zarr"
     killed = subprocess.run(
@@ -192,8 +188,7 @@ sys.addaudithook(hook)
 
 
 def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_others_are_rendered(
-    meshes,
-    tmp_path,
+    meshes, tmp_path
 ):
     (tmp_path / "sitecustomize.py").write_text(KILLER)
     for mesh in (meshes / "chair/train").glob("chair_[23].off"):
@@ -249,11 +244,7 @@ def test_a_dask_cluster_renders_the_same(furniture, whole, tmp_path):
         names = [
             name
             for name, _ in render(
-                furniture,
-                path,
-                SPHERE,
-                SIZE,
-                scheduler=cluster.scheduler_address,
+                furniture, path, SPHERE, SIZE, scheduler=cluster.scheduler_address
             )
         ]
     assert sorted(names) == sorted(ViewStore.open(path).names)

@@ -156,8 +156,7 @@ class ToItsBack:
         ) % n
         views = self.sphere.ring[state.current][:, None] * n + to
         return views[
-            rows,
-            np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1),
+            rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)
         ]
 
 

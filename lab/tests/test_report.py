@@ -20,11 +20,7 @@ def made(tmp_path_factory):
     p = replace(some_predictions(20, seed=1), store=str(folder / "views.zarr"))
     p.save(folder / "p.npz")
     benchmark(
-        folder / "p.npz",
-        folder / "out",
-        thresholds=(0.8, 0.97),
-        runs=3,
-        samples=100,
+        folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=3, samples=100
     )
     image = np.random.default_rng(0).integers(0, 255, (20, 40, 32, 32), np.uint8)
     labels, arrays = (
@@ -83,8 +79,7 @@ def test_the_tables_show_the_numbers_of_the_results(made):
 
 
 def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
-    made,
-    tmp_path,
+    made, tmp_path
 ):
     p = load(made / "out").predictions
     assert pictures_of(p)[0] is not None

@@ -98,8 +98,7 @@ def test_training_targets_of_a_picture():
         12**-0.5,
     )  # by the pixels of a thing; the smaller one counts
     np.testing.assert_allclose(
-        example.compared[right, 5, [0, 5, 9, 11, 13]],
-        [0, large, small, 0, 0],
+        example.compared[right, 5, [0, 5, 9, 11, 13]], [0, large, small, 0, 0]
     )
 
 
@@ -205,9 +204,7 @@ from nextview_lab.training import segmentation_training as training
 from nextview_lab.training.architectures import SegmentationNet
 from nextview_lab.training.recipes import Hardware, SegmentationRecipe
 from nextview_lab.training.runs import load_run
-from nextview_lab.training.segmentation_training import (
-    fit_segmentation,
-)
+from nextview_lab.training.segmentation_training import fit_segmentation
 
 RECIPE = SegmentationRecipe(
     frames=8, width=4, epochs=6, batch=2, lr=0.01, validation_share=0.25, seed=3
@@ -250,9 +247,7 @@ def test_training_lowers_its_loss(run):
 
 
 def test_a_stopped_training_ends_with_the_weights_of_one_that_was_not(
-    tmp_path,
-    run,
-    monkeypatch,
+    tmp_path, run, monkeypatch
 ):
     step = training.SegmentationModule.training_step
 

@@ -46,16 +46,12 @@ def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp
 
 
 def test_another_seed_of_the_noise_shows_the_same_turns_with_other_errors(
-    furniture,
-    tmp_path,
+    furniture, tmp_path
 ):
     stores = []
     for seed in (None, 1):
         options = RenderOptions(
-            split="test",
-            sensor="wrist",
-            deform=Deform(rotated=True),
-            noise_seed=seed,
+            split="test", sensor="wrist", deform=Deform(rotated=True), noise_seed=seed
         )
         path = tmp_path / f"{seed}.zarr"
         list(render(furniture, path, FEW, workers=0, options=options))

@@ -22,9 +22,7 @@ def test_a_density_is_that_of_its_class_and_a_share_of_anything():
     assert share == pytest.approx([1, 1], rel=0.03)
     near = np.abs(RADII - 0.1).argmin()
     wanted = 0.95 * norm.pdf(
-        np.log(RADII[near]),
-        np.log(0.1),
-        np.hypot(0.1, 0.1 * 500**-0.2),
+        np.log(RADII[near]), np.log(0.1), np.hypot(0.1, 0.1 * 500**-0.2)
     )
     assert np.exp(found[0, near]) == pytest.approx(wanted, rel=0.15)
     assert np.exp(found[1, near]) == pytest.approx(ANY_SIZE / span)
@@ -51,8 +49,7 @@ def test_the_weight_is_the_most_likely_one():
     assert evidence.weight == pytest.approx(1, abs=0.15)
     alone = np.log1p(np.exp(np.where(labels == 0, -shape, shape)))
     assert before == pytest.approx(
-        np.mean([alone[labels == c].mean() for c in (0, 1)]),
-        rel=1e-4,
+        np.mean([alone[labels == c].mean() for c in (0, 1)]), rel=1e-4
     )
     assert after < before - 0.1
     assert fit_weight(data, np.exp(rng.permutation(logs)), density)[

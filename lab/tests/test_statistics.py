@@ -65,8 +65,7 @@ def test_the_p_value_is_that_of_scipy_s_permutation_test(families):
     )
     exact = families < 15
     assert st.sign_flip_p((ours - theirs)[:, None])[0] == pytest.approx(
-        theirs_test.pvalue,
-        abs=1e-12 if exact else 0.01,
+        theirs_test.pvalue, abs=1e-12 if exact else 0.01
     )
 
 
@@ -125,16 +124,14 @@ def test_any_difference_of_two_policies_is_tested_by_exchanging_them():
 def test_holm_gives_the_textbook_values():
     # R: p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm")
     np.testing.assert_allclose(
-        st.holm(np.array([0.01, 0.04, 0.03, 0.005])),
-        [0.03, 0.06, 0.06, 0.02],
+        st.holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02]
     )
     np.testing.assert_allclose(st.holm(np.array([0.6, np.nan, 0.9])), [1, np.nan, 1])
 
 
 def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
     assert metrics.calibration_error(
-        np.full(8, 0.75),
-        np.arange(8) < 4,
+        np.full(8, 0.75), np.arange(8) < 4
     ) == pytest.approx(0.25)
     rng = np.random.default_rng(0)
     confidence = rng.uniform(0.1, 1, 200_000)
@@ -142,9 +139,7 @@ def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
         metrics.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
     )
     sure, accuracy, count = metrics.reliability(
-        np.array([0.0, 1.0]),
-        np.array([False, True]),
-        bins=4,
+        np.array([0.0, 1.0]), np.array([False, True]), bins=4
     )
     np.testing.assert_array_equal(count, [1, 0, 0, 1])
     np.testing.assert_array_equal([sure[3], accuracy[3]], [1, 1])

@@ -199,31 +199,6 @@ def test_a_line_of_any_length_is_waited_for_no_longer_than_told(tmp_path, code):
         asked(tmp_path, code, 0.5)
 
 
-needs_proc = pytest.mark.skipif(
-    not Path("/proc/self/stat").exists(), reason="needs /proc"
-)
-BURNS = "'import time\\nwhile time.process_time() < 0.3: pass'"
-
-
-@needs_proc
-@pytest.mark.parametrize(
-    "code",
-    [
-        f"subprocess.run([sys.executable, '-c', {BURNS}])",
-        f"subprocess.run(['sh', '-c', sys.executable + ' -c \"$0\"; true', {BURNS}])",
-        f"exec({BURNS})",
-    ],
-    ids=["child", "child of a child", "itself"],
-)
-def test_the_cpu_time_is_that_of_all_processes(tmp_path, code):
-    code = (
-        f"import subprocess, sys\ninput(); {code}; print('done', flush=True); input()"
-    )
-    with closing(LineProcess(as_command(tmp_path, code))) as process:
-        process.ask(b"", 60, "method")
-        assert process.cpu_seconds() > 0.25
-
-
 def test_a_changed_image_is_found(own, tmp_path, capsys):
     path = own / "episodes/0000/000.png"
     with Image.open(path) as image:

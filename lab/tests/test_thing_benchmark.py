@@ -32,10 +32,7 @@ from nextview_lab.benchmark.thing_tables import summarise_things
 from nextview_lab.benchmark.things import ThingSettings, benchmark_things
 
 SETTINGS = ThingSettings(
-    views=(1, 2),
-    policies=("random", "geometry"),
-    repeats=1,
-    samples=200,
+    views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200
 )
 
 
@@ -89,11 +86,7 @@ def episode_of(knobs_memory, knobs, thing, folder=None, occlusion="none"):
 
 
 def test_the_command_prints_and_writes_tables_of_all_policies(
-    knobs,
-    knobs_memory,
-    results,
-    capsys,
-    monkeypatch,
+    knobs, knobs_memory, results, capsys, monkeypatch
 ):
     monkeypatch.setattr(
         stage, "work", lambda job: pytest.fail("nothing was left to do")
@@ -127,10 +120,7 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
 
 
 def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
-    knobs,
-    results,
-    settings,
-    monkeypatch,
+    knobs, results, settings, monkeypatch
 ):
     sensed = []
     observe = SensedCamera.observe
@@ -147,10 +137,7 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
     FarAzimuth.seen.clear()
     own = f"{__name__}:FarAzimuth"
     tables = benchmark_things(
-        knobs,
-        results,
-        replace(settings, policies=(own,)),
-        workers=0,
+        knobs, results, replace(settings, policies=(own,)), workers=0
     )
     assert len(sensed) <= 3  # the second view of each episode
     assert list(tables.measures["policy"].unique()) == ["random", "geometry", own]
@@ -175,9 +162,7 @@ def scaled(scans, unit, folder):
 
 
 def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
-    knobs,
-    settings,
-    tmp_path,
+    knobs, settings, tmp_path
 ):
     scans = scaled(knobs, "cm", tmp_path / "cm")
     with pytest.raises(DatasetError, match=r"is not in m, .* give unit='cm'"):
@@ -192,9 +177,7 @@ def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
 
 
 def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
-    knobs_memory,
-    knobs,
-    tmp_path,
+    knobs_memory, knobs, tmp_path
 ):
     file = tmp_path / "episode"
     fresh = episode_of(knobs_memory, knobs, 0, file)
@@ -223,10 +206,7 @@ def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
     for low, high in VISIBLE_SHARES.values():
         boxes = hiding_boxes(standing, (low, high), (0, 1))
         camera = SensedCamera(
-            standing,
-            episode.stage.sensor,
-            np.random.default_rng(0),
-            around=boxes,
+            standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
         )
         shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
         assert low - 0.08 < np.mean(shares) < high + 0.08
@@ -240,11 +220,7 @@ def state_at(view, visited=()):
     mask[0, [view, *visited]] = True
     nothing = Evidence(np.zeros((1, 1)))
     return EpisodeState(
-        np.array([view]),
-        mask,
-        np.ones((1, 1)),
-        nothing,
-        len(visited) + 1,
+        np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1
     )
 
 
@@ -260,16 +236,14 @@ def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
     assert sorted(taken) == list(range(8, 16))
     assert taken[1] == 11  # three steps of 45 degrees ahead
     after = RingSteps(EPISODE_SPHERE).next_views(
-        state_at(taken[-1], taken),
-        np.random.default_rng(0),
+        state_at(taken[-1], taken), np.random.default_rng(0)
     )
     assert int(after[0]) not in taken
 
 
 @pytest.mark.long  # a whole benchmark
 def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
-    knobs,
-    knobs_memory,
+    knobs, knobs_memory
 ):
     for thing in range(3):
         episode = episode_of(knobs_memory, knobs, thing)
@@ -296,9 +270,7 @@ class AlwaysCan:
 
 
 def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
-    knobs,
-    tmp_path,
-    capsys,
+    knobs, tmp_path, capsys
 ):
     out = tmp_path / "out"
     line = ["benchmark", "things", knobs, out, "--recogniser", f"{__name__}:AlwaysCan"]
@@ -323,9 +295,7 @@ def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
 
 
 def test_policies_are_compared_with_the_best_blind_rule_of_other_episodes(
-    knobs,
-    settings,
-    tmp_path,
+    knobs, settings, tmp_path
 ):
     asked = replace(settings, policies=("geometry",), reference="best-blind")
     out = tmp_path / "out"
@@ -382,9 +352,7 @@ def test_measures_are_those_of_a_hand_count():
         both("b_x", wrong, good),
     ]
     alike = Alikeness(
-        ("a_x", "a_y", "b_x"),
-        ("a_y", "a_x", "a_x"),
-        np.array([0.1, 0.2, 0.3]),
+        ("a_x", "a_y", "b_x"), ("a_y", "a_x", "a_x"), np.array([0.1, 0.2, 0.3])
     )
     how = ThingSettings(views=(1, 2, 3), threshold=0.97, families=True, samples=2000)
     tables = summarise_things(episodes, alike, how)
@@ -398,8 +366,7 @@ def test_measures_are_those_of_a_hand_count():
     assert random["pose error, 95 %", 3] == 1
     steps = np.pi / 4 * np.cos(EPISODE_SPHERE.elevation[0])
     assert random["travel, rad", 2] == pytest.approx(
-        np.pi * np.cos(EPISODE_SPHERE.elevation[0]),
-        abs=0.2,
+        np.pi * np.cos(EPISODE_SPHERE.elevation[0]), abs=0.2
     )
     assert steps > 0
     difference = tables.tests.query(
