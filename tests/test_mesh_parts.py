@@ -89,8 +89,7 @@ SCANS = {
 }
 
 
-@pytest.mark.parametrize("turn", [False, True])
-@pytest.mark.parametrize("kind", ["ply", "stl"])
+@pytest.mark.parametrize(("kind", "turn"), [("ply", True), ("stl", False)])
 @pytest.mark.parametrize("name", SCANS)
 def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, turn):
     parts, connected, sentence = SCANS[name]
