@@ -19,6 +19,7 @@ from nextview.errors import DatasetError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.teaching.learn import learn
 
 LAYOUTS = ("bop", "tum", "7scenes")
 SMALL_K = np.array([[131.25, 0, 80], [0, 131.25, 60], [0, 0, 1]])
@@ -347,3 +348,18 @@ def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(
     cut_image(tmp_path, 7)
     with pytest.raises(DatasetError, match="2 of 9 frames cannot be used"):
         CapturedCamera(read_capture(tmp_path))
+
+
+def test_learn_names_the_frames_that_it_leaves_out_and_refuses_wrong_poses(
+    nine, tmp_path
+):
+    depths, poses = nine
+    write_frames(tmp_path / "things/stool", "7scenes", depths, poses)
+    cut_image(tmp_path / "things/stool")
+    write_frames(tmp_path / "things/wrong", "7scenes", depths, np.linalg.inv(poses))
+    learned = learn(tmp_path / "things", tmp_path / "mine", workers=0)
+    assert learned.things == 1
+    wrong, frame = sorted(learned.left_out, key=lambda phrase: "stool" in phrase)
+    assert "the poses are inverse" in wrong
+    assert "1 of 9 frames" in frame
+    assert "000004" in frame

@@ -4,6 +4,7 @@ is damaged.
 
 import io
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import some_predictions
+from pipeline import SPHERE, some_predictions
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
@@ -22,6 +23,7 @@ from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview_lab.data.predicting import predict
 from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.rendering import render
 from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import PredictionsError
 
@@ -209,3 +211,32 @@ def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_t
         with pytest.raises(PredictionsError):
             Predictions.load(tmp_path / f"{name}.npz")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 50_000
+
+
+def test_the_same_mesh_under_two_labels_is_marked_across_splits(
+    furniture, models, tmp_path
+):
+    for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
+        path = tmp_path / f"meshes/{place}.off"
+        path.parent.mkdir(parents=True)
+        shutil.copy(
+            furniture
+            / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off",
+            path,
+        )
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
+    list(
+        predict(
+            tmp_path / "views.zarr",
+            tmp_path / "p.npz",
+            cards(models)[0],
+            {},
+            "test",
+            workers=0,
+        )
+    )
+    found = Predictions.load(tmp_path / "p.npz")
+    assert dict(zip(found.names, found.conflicting, strict=True)) == {
+        "chair_4": True,
+        "monitor_4": False,
+    }
