@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from factories import refused, run_python
-from programs import main
+from factories import run_python
+from lab_programs import main, refused
 
 from nextview.cli.commands import NEXTVIEW
 from nextview_lab.benchmark.submit import SubmitOptions, submit
@@ -255,7 +255,7 @@ def test_who_wants_telemetry_keeps_it():
         if name != "ORT_DISABLE_TELEMETRY"
     }
     assert run_python(code, env=environment).stdout.strip() == "1"
-    tops = ("src", "lab", "benchmarks", "research", "examples", "docs", "workflow")
+    tops = ("src", "lab/src", "benchmarks", "research", "examples", "docs", "workflow")
     sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
     with_it = {
         path.name

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import trimesh
+from lab_programs import refused
 
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import level_pose
@@ -228,7 +229,7 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
         match=r"how large is a plank\? Give the files' --unit",
     ):
         list(draw_rooms(tins, tmp_path / "out", workers=0))
-    said = factories.refused(
+    said = refused(
         capsys,
         "scenes",
         furniture,
@@ -238,7 +239,7 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, rooms, furniture, 
         "light",
     )
     assert "--levels and --held-out are for cluttered tables" in said
-    said = factories.refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
+    said = refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
     assert "--unit is for --room" in said
     layout = RoomLayout.load(sorted(rooms.rglob("*.json"))[0])
     other = msgspec.structs.replace(layout.target, sha256="0" * 64)
