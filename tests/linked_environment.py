@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECTS = {
     "nextview": (".", "src"),
     "nextview-lab": ("lab", "lab/src"),
-    "nextview-research": ("research", "."),
 }
 COMMANDS = {"nextview": "nextview_command", "nextview-lab": "nextview_lab_command"}
 

@@ -65,7 +65,7 @@ def test_the_grasp_point_is_at_the_handle(monkeypatch, capsys):
 def test_the_tests_named_on_pages_exist():
     tests = [
         path
-        for folder in ("tests", "lab/tests", "research/tests")
+        for folder in ("tests", "lab/tests")
         for path in (ROOT / folder).glob("test_*.py")
     ]
     names = {
@@ -75,7 +75,7 @@ def test_the_tests_named_on_pages_exist():
     }
     for page in (ROOT / "docs").glob("*.md"):
         text = page.read_text()
-        for path in re.findall(r"`((?:research/|lab/)?tests/\w+\.py)`", text):
+        for path in re.findall(r"`((?:lab/)?tests/\w+\.py)`", text):
             assert (ROOT / path).exists(), (page.name, path)
         column = re.findall(r"\| `(\w+)` \|$", text, re.M) if "| test |" in text else []
         for part in column:
@@ -111,7 +111,7 @@ def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
         for page in documented_commands.PAGES
         for step in documented_commands.steps_of(page)
     ]
-    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {
+    assert {"README.md", "docs/picking.md", "docs/training.md"} <= {
         step.page for step in steps
     }
     for pattern in documented_commands.NOT_RUN:
@@ -170,7 +170,6 @@ def test_each_page_names_what_its_commands_need():
                 name = {
                     "nextview": r"(nextview|\.)",
                     "nextview-lab": r"(nextview-lab|\./lab)",
-                    "research": r"\./research",
                 }[project]
                 said = re.search(
                     name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""), text

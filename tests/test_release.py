@@ -29,10 +29,8 @@ def citation() -> dict:
 
 def test_version_citation_and_changelog_are_in_step():
     cited = citation()
-    research = tomllib.loads((ROOT / "research/pyproject.toml").read_text())
     assert cited["version"] == nextview.__version__
     assert isinstance(cited["date-released"], date)
-    assert research["project"]["version"] == nextview.__version__
     assert top_of_changelog()[0] == nextview.__version__
 
 
@@ -55,7 +53,7 @@ def test_all_files_of_the_workflows_exist(workflow):
         r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w", text
     ):
         assert (ROOT / path).exists(), path
-    for folder, names in re.findall(r"(\.|\./research)\[([\w,-]+)\]", text):
+    for folder, names in re.findall(r"(\.|\./lab)\[([\w,-]+)\]", text):
         project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())
         extras = project["project"]["optional-dependencies"]
         assert set(names.split(",")) <= set(extras), names

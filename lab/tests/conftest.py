@@ -15,7 +15,7 @@ from bop_datasets import write_dataset
 from frozen_archives import write_archive
 
 from nextview_lab.benchmark import table_runs
-from nextview_lab.data import room_drawing
+from nextview_lab.data import scene_drawing
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,7 +23,7 @@ def kept_rests(shared):
     """Find the resting poses of each thing once in a run, as ``kept_things`` does."""
     folder = shared("kept", lambda folder: None)
     with pytest.MonkeyPatch.context() as patched:
-        for module in (table_runs, room_drawing):
+        for module in (table_runs, scene_drawing):
             function = module.resting_poses
             kept = kept_results.Kept(function, folder, kept_results.of_mesh)
             patched.setattr(module, "resting_poses", kept)

@@ -1,4 +1,4 @@
-"""What benchmarks share, and how they count: results line by line, so that a run goes on after a
+"""What studies share, and how they count: results line by line, so that a run goes on after a
 kill and runs nothing again; frames with their truth.
 """
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.real_frames import Answer, alone, answers, frames_in
-from benchmarks.shared import read_lines, results, scans_in, scans_of, share
 from nextview.errors import UsageError
+from nextview_lab.studies.real_frames import Answer, alone, answers, frames_in
+from nextview_lab.studies.shared import read_lines, results, scans_in, scans_of, share
 
 INTRINSICS = (30.0, 31.0, 11.5, 7.5)
 

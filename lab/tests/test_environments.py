@@ -86,46 +86,6 @@ def played(env, seed: int, n: int = 60):
     return found
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}],
-)
-def test_the_vectorised_environment_is_many_single_ones(options):
-    p, n, rng = learnable(), 7, np.random.default_rng(1)
-    many = gymnasium.make_vec(RECOGNISE, num_envs=n, predictions=p, **options)
-    singles = [gymnasium.make(RECOGNISE, predictions=p, **options) for _ in range(n)]
-    many.action_space.seed(0)
-    observation, info = many.reset(seed=0)
-    lengths = set()
-
-    def begin(row):
-        """The single environment on the same object, from the same first view."""
-        return singles[row].reset(
-            options={"object": info["object"][row], "start": info["view"][row]}
-        )[0]
-
-    for row in range(n):
-        np.testing.assert_array_equal(begin(row), observation[row])
-    for _ in range(40):
-        actions = rng.integers(40, size=n)
-        observation, rewards, ended, truncated, info = many.step(actions)
-        assert not truncated.any()
-        for row in range(n):
-            seen, reward, over, _, alone = singles[row].step(actions[row])
-            last = info["final_info"] if over else info
-            np.testing.assert_array_equal(
-                seen, info["final_obs"][row] if over else observation[row]
-            )
-            assert (reward, over) == (rewards[row], ended[row])
-            assert all(np.array_equal(alone[name], last[name][row]) for name in alone)
-            if over:
-                lengths.add(int(alone["n_views"]))
-                np.testing.assert_array_equal(begin(row), observation[row])
-    assert (
-        len(lengths) > 1 or not options
-    )  # with a threshold some end earlier than others
-
-
 def test_an_episode_is_the_loop_of_a_robot():
     """Beliefs, travel and the end are those of ``run_episodes`` with a policy that goes where
     the actions went.

@@ -21,7 +21,6 @@ from packaging.utils import canonicalize_name
 
 from nextview.checks import EXTRAS
 from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
-from research.extras import EXTRAS as EXTRAS_OF_RESEARCH
 
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "lab/src").rglob("*.py")])
 
@@ -123,10 +122,10 @@ def test_a_wrong_import_is_found(code, wrong):
     )
 
 
-@pytest.mark.parametrize("folder", [".", "lab", "research"])
+@pytest.mark.parametrize("folder", [".", "lab"])
 def test_an_extra_contains_the_package_that_its_error_names(folder):
     (name,) = [name for name, (place, _) in PROJECTS.items() if place == folder]
-    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB, "research": EXTRAS_OF_RESEARCH}
+    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB}
     for extra, packages in declared[folder].items():
         asked = requirements_of({name: [extra]}).values()
         texts = [text for of_project in asked for text in of_project]

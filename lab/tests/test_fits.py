@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from factories import change_card, make_recogniser
 from pipeline import some_predictions, train_predictions
-from scipy.special import log_softmax, softmax
+from scipy.special import softmax
 from scipy.stats import binomtest, kstest
 
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
-from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
@@ -28,7 +27,6 @@ from nextview_lab.training.card_fits import (
 )
 from nextview_lab.training.fitting_set import blind_walks
 from nextview_lab.training.unknown import fit_novelty, quantiles
-from research.fit_policies import fit_class_table, fit_ring, fit_sequence, fitting_set
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
@@ -181,18 +179,9 @@ def test_a_shape_that_was_copied_counts_once():
     )
     # which of two labels is right is not for us
     assert relabelled.deduplicate().names == (*p.names, "copy8")
-    np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
-    drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
-    assert any(p.logits[0] in data.logits for data in drawn)
-    assert all(
-        sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn
-    )
-    assert not any(
-        (row == p.logits[0] + 1).all() for data in drawn for row in data.logits
-    )
 
 
-# Tables
+# Views that tell
 
 
 def telling(
@@ -212,68 +201,6 @@ def telling(
     return train_predictions(
         logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c])
     )
-
-
-@pytest.mark.parametrize("scope", ["global", "local"])
-def test_what_tells_most_is_found(scope):
-    data = telling(SMALL, [[2], [2]])
-    assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
-    assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
-    by_class = fit_class_table(
-        telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0)
-    )
-    assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
-    assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
-    shared = fit_class_table(
-        telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0)
-    )
-    np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
-
-
-@pytest.mark.parametrize("scope", ["global", "local"])
-def test_each_move_of_a_sequence_is_the_best_there_is(scope):
-    rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
-    labels = np.array([0, 0, 0, 1, 2])
-    data = train_predictions(
-        rng.normal(size=(5, len(SMALL), 3)).astype(np.float32),
-        labels,
-        SMALL,
-        ("a", "b", "c"),
-    )
-    travel_weight = 0.05
-    moves = fit_sequence(data, scope, 2, calibration, travel_weight)
-
-    def turned(view: int, steps: int) -> int:
-        ring, azimuth = divmod(view, 4)
-        return ring * 4 + (azimuth + steps) % 4
-
-    def value(path: list[int]) -> float:
-        by_class = {0: [], 1: [], 2: []}
-        for i, label in enumerate(labels):
-            for steps in range(4):
-                total = (
-                    data.logits[i, [turned(v, steps) for v in path]]
-                    .astype(float)
-                    .sum(0)
-                )
-                by_class[label].append(
-                    log_softmax(total / calibration.temperature_after(len(path)))[label]
-                )
-        return np.mean([np.mean(values) for values in by_class.values()])
-
-    for ring in range(3):
-        path = [ring * 4]
-        for move in moves[ring]:
-            reachable = (
-                range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
-            )
-            left = [v for v in reachable if v not in path]
-            values = {
-                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v]
-                for v in left
-            }
-            path.append(int(cells_from(SMALL)[path[-1], move]))
-            assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
 
 
 # The stages

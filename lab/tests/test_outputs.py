@@ -255,7 +255,7 @@ def test_who_wants_telemetry_keeps_it():
         if name != "ORT_DISABLE_TELEMETRY"
     }
     assert run_python(code, env=environment).stdout.strip() == "1"
-    tops = ("src", "lab/src", "benchmarks", "research", "examples", "docs", "workflow")
+    tops = ("src", "lab/src", "examples", "docs", "workflow")
     sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
     with_it = {
         path.name

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from benchmarks.staged_things import (
+from nextview_lab.studies.staged_things import (
     CAMERA_MATRIX,
     FOCAL,
     IMAGE,
@@ -90,7 +90,13 @@ def test_a_thing_alone_is_staged_and_recognised(tmp_path):
     scans = tmp_path / "scans"
     scans.mkdir()
     (scans / f"{NAME}.ply").symlink_to(SCANS / f"{NAME}.ply")
-    command = [sys.executable, "-m", "benchmarks.places", scans, tmp_path / "out.jsonl"]
+    command = [
+        sys.executable,
+        "-m",
+        "nextview_lab.studies.places",
+        scans,
+        tmp_path / "out.jsonl",
+    ]
     for _ in range(2):  # the second run finds all done
         ended = subprocess.run(
             [*command, "--places", "alone"],

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.verified_things import rotation_error
 from nextview.recognition.model_card import Symmetry
+from nextview_lab.studies.verified_things import rotation_error
 
 ERROR = 3.0  # degrees
 BOX = (Symmetry((1.0, 0.0, 0.0), 2), Symmetry((0.0, 1.0, 0.0), 2))

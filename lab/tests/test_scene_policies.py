@@ -11,7 +11,6 @@ from pipeline import scene_predictions
 from test_policies import state_of as state_at
 from test_scenes import GRID, scene_of
 
-from benchmarks.scenes import Believed
 from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
 from nextview.policies.base import EpisodeState, Evidence
@@ -27,7 +26,6 @@ from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import EntryError
 from nextview_lab.worlds.scene_cameras import SHOWS_TARGET, OccludedCamera, SceneCamera
 from nextview_lab.worlds.scene_layout import Block
-from research.plan import plan
 
 TEN = tuple(read_table(ACCURACY[10]))
 POSITIONS = GRID.poses[:, :3, 3]
@@ -135,24 +133,6 @@ def test_the_product_avoids_occluded_views():
 # In scenes
 
 
-class FirstFree:
-    """A policy that wants to see scenes, and makes nothing of them."""
-
-    needs = ("observations",)
-
-    def __init__(self, sphere):
-        pass
-
-    def next_views(self, state, rng):
-        assert all(
-            seen.scene is not None for views in state.observations for seen in views
-        )
-        return state.free.argmax(1)
-
-
-OWN = "test_scene_policies:FirstFree"
-
-
 @pytest.fixture(scope="module")
 def predictions(cluttered_views) -> Predictions:
     return scene_predictions(cluttered_views, TEN)
@@ -180,13 +160,12 @@ def test_expected_visibility_in_a_store_agrees_with_its_frames(cluttered_views):
         SceneSight.of(opened, ["nothing@light-0"])
 
 
-def test_no_policy_goes_where_no_camera_can(predictions, cluttered_views):
-    list(plan(cluttered_views, [OWN], workers=0))
+def test_no_policy_goes_where_no_camera_can(predictions):
     specs = make_specs(predictions, 2, 0)
     reachable = specs.scenes.reachable
     assert not reachable.all()
     entries = "random-all", "random", "visibility", "visibility@0.05"
-    for name in (*entries, OWN, "true-visible_share-all", "oracle-gain-all"):
+    for name in (*entries, "true-visible_share-all", "oracle-gain-all"):
         views = replay(name, specs, 4, 0).views
         assert reachable[specs.objects[:, None], views].all(), name
     entries = default_entries(specs)
@@ -245,22 +224,3 @@ def test_scenes_around_one_target_are_drawn_together():
         ),
         plain,
     )
-
-
-def test_the_script_agrees_with_the_beliefs_of_replay(predictions):
-    specs = make_specs(predictions, 4, 0)
-    path = replay("random-all", specs, 4, 0)
-    assert (path.views >= 0).all()
-    found = Believed.of(predictions, specs.objects, path.views)
-    np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
-    sure = found.confidence > 0.11  # else all classes are alike
-    np.testing.assert_array_equal(
-        found.right[sure],
-        (path.answers == specs.labels[:, None])[sure],
-    )
-    np.testing.assert_allclose(
-        found.loss[found.right],
-        -np.log(found.confidence[found.right]),
-        rtol=1e-6,
-    )
-    assert (found.loss[~found.right] >= np.log(2)).all()

@@ -2,13 +2,10 @@
 seed, the same scene.
 """
 
-from itertools import combinations
-
 import factories
 import numpy as np
 import pytest
 import trimesh
-from matplotlib.path import Path as Outline
 
 from nextview import SimulatedCamera
 from nextview.errors import DatasetError
@@ -22,7 +19,6 @@ from nextview_lab.worlds.scene import (
     TargetScene,
     block_item,
     build_scene,
-    footprint,
     separation,
 )
 from nextview_lab.worlds.scene_cameras import (
@@ -44,6 +40,16 @@ FRONT = GRID.poses[0]
 def scene_of(*blocks: Block, target=BALL) -> TargetScene:
     floor = float(target.vertices[:, 2].min())
     return TargetScene(target, tuple(block_item(block, floor) for block in blocks))
+
+
+def things_under_a_point(*things) -> int:
+    """The most things that a vertical line meets, by another ray caster."""
+    grid = np.linspace(-SCENE_TABLE, SCENE_TABLE, 100)
+    above = np.stack([*np.meshgrid(grid, grid), np.full((100, 100), 9.0)], -1)
+    down = np.tile([0.0, 0, -1], (100 * 100, 1))
+    meshes = [trimesh.Trimesh(t.vertices, t.faces, process=False) for t in things]
+    met = [m.ray.intersects_any(above.reshape(-1, 3), down) for m in meshes]
+    return int(np.sum(met, axis=0).max())
 
 
 # What hides what
@@ -98,7 +104,7 @@ def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
     path = sorted(cluttered.rglob("*heavy*.json"))[0]
     layout, k = (
         SceneLayout.load(path),
-        np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]]),
+        np.array([[200.0, 0, 100], [0, 200.0, 100], [0, 0, 1]]),
     )
     scene = build_scene(layout, furniture)
     things = [
@@ -106,8 +112,8 @@ def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
         for item in (scene.target, *scene.items)
     ]
     for view in (3, 14, 25, 36):
-        _, alone = factories.cast(things[:1], GRID.poses[view], k, (64, 64))
-        _, among = factories.cast(things, GRID.poses[view], k, (64, 64))
+        _, alone = factories.cast(things[:1], GRID.poses[view], k, (200, 200))
+        _, among = factories.cast(things, GRID.poses[view], k, (200, 200))
         assert layout.visible[view] == pytest.approx(
             (among == 0).sum() / (alone == 0).sum(),
             abs=0.03,
@@ -140,12 +146,7 @@ def test_drawn_scenes_stand_on_their_table_and_never_overlap(cluttered, furnitur
         for item in scene.items:
             assert item.vertices[:, 2].min() == pytest.approx(scene.floor, abs=1e-12)
             assert np.abs(item.footprint).max() <= SCENE_TABLE
-        outlines = [
-            footprint(scene.target.vertices),
-            *(item.footprint for item in scene.items),
-        ]
-        for a, b in combinations(outlines, 2):
-            assert not Outline(a).intersects_path(Outline(b), filled=True)
+        assert things_under_a_point(scene.target, *scene.items) <= 1
         assert (
             abs(np.mean(layout.visible) - CLUTTER_LEVELS[layout.level])
             < SPREAD + VISIBLE_TOLERANCE + 0.03
@@ -228,7 +229,9 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(
         SimulatedCamera(scene.target, 48).observe(pose).visible for pose in GRID.poses
     ]
     shown = np.count_nonzero(opened.depth(i), axis=(1, 2)) / alone
-    assert shown == pytest.approx(views.visible_share, abs=0.05)
+    # through slits between things, 48 pixels show another share than 112
+    assert shown == pytest.approx(views.visible_share, abs=0.15)
+    assert np.abs(shown - views.visible_share).mean() < 0.02
     # The same object fills the same part of both pictures.
     wide = (
         np.count_nonzero(views.owner == SHOWS_TARGET, axis=(1, 2))

@@ -22,7 +22,7 @@ from nextview_lab.benchmark.frozen import FrozenArchive
 from nextview_lab.benchmark.line_process import LineProcess
 from nextview_lab.benchmark.standings import KnownShape, leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, submit
-from nextview_lab.cli.submit import print_leaderboard
+from nextview_lab.cli.benchmark_tables import print_standings
 
 ROOT = Path(__file__).parents[2]
 BLIND = SubmitOptions("fixed", max_views=2)
@@ -265,7 +265,7 @@ def test_names_are_text_in_markdown_html_and_terminals(
     folder = shutil.copytree(submitted, tmp_path / "submitted")
     edited(folder / "fixed.json", lambda v: v.update(method=NASTY, version="<b>|"))
     board = leaderboard_of(folder, archive, tmp_path / "board", samples=100)
-    print_leaderboard(board)
+    print_standings(board)
     in_terminal = capsys.readouterr()
     markdown = (tmp_path / "board/leaderboard.md").read_text(encoding="utf-8")
     page = (tmp_path / "board/leaderboard.html").read_text(encoding="utf-8")

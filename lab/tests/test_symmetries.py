@@ -5,7 +5,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from benchmarks.machine_parts import (
+from nextview.errors import UsageError
+from nextview.recognition.model_card import Symmetry
+from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
+from nextview.teaching.symmetries import named_symmetries
+from nextview.things.surface import Surface
+from nextview.things.symmetry import find_near_symmetries, find_symmetries
+from nextview_lab.studies.machine_parts import (
     around,
     degrees_off,
     keyed,
@@ -13,12 +19,6 @@ from benchmarks.machine_parts import (
     toothed,
     turns_of,
 )
-from nextview.errors import UsageError
-from nextview.recognition.model_card import Symmetry
-from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
-from nextview.teaching.symmetries import named_symmetries
-from nextview.things.surface import Surface
-from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview_lab.worlds.solids import extruded, joined, moved, ring_points
 
 PARTS = parts()

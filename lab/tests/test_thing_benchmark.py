@@ -106,7 +106,7 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
     main([str(word) for word in line])
     shown = capsys.readouterr().out
     assert "geometry" in shown
-    assert "until confident" in shown
+    assert "All things: share named right after views; 3 things" in shown
     text = (results / "tables.md").read_text()
     assert text.count("| geometry | ") == 2 + 2 * 3  # two tables; three tests for each
     for name in (

@@ -2,6 +2,7 @@
 models with cards.
 """
 
+import csv
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,7 @@ from pipeline import store_of
 
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
+
 
 from nextview.errors import ModelError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
@@ -37,7 +39,6 @@ from nextview_lab.training.recogniser_training import (
     train_recogniser,
 )
 from nextview_lab.training.runs import fit, read_run
-from research.training_curves import read_log
 
 V = 5
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
@@ -243,9 +244,16 @@ def test_a_run_that_was_killed_in_mid_epoch_and_moved_resumes_the_same_to_the_bi
     (tmp_path / "a").rename(tmp_path / "b")
     assert same(train(tmp_path / "b"), whole)
     assert not (tmp_path / "a").exists()
-    log, expected = read_log(tmp_path / "b"), read_log(folder)
+    log, expected = log_of(tmp_path / "b"), log_of(folder)
     del log["seconds"], expected["seconds"]
     assert log == expected
+
+
+def log_of(run):
+    """The log of a run, a value for every epoch by column."""
+    with (run / "log/metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
 class Scripted(L.LightningModule):
@@ -278,7 +286,7 @@ def test_the_best_epoch_is_kept(tmp_path, mode, best):
     module = Scripted([0.5, 0.9, 0.7, 0.1])
     fit(module, One(), One(), tmp_path, "score", mode, EXACT)
     assert module.weight.item() == best  # after as many steps
-    assert read_log(tmp_path)["score"] == pytest.approx([0.5, 0.9, 0.7, 0.1])
+    assert log_of(tmp_path)["score"] == pytest.approx([0.5, 0.9, 0.7, 0.1])
 
 
 def test_a_run_without_progress_stops_and_stays_stopped(tmp_path):

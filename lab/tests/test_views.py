@@ -8,25 +8,25 @@ import pytest
 from lab_programs import main, refused
 from pipeline import benchmark, some_predictions
 
-from benchmarks.views import main as compare
-
-NAMES = ("lem", "furthest", "spread", "orbit-4", "best-4")
+NAMES = ("random", "lem", "furthest", "spread", "oracle-gain")
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
+    """Predictions, and the results of ``nextview-lab benchmark classes --views``."""
     folder = tmp_path_factory.mktemp("n_views")
     some_predictions(24, seed=2).save(folder / "p.npz")
-    compare(folder / "p.npz", folder / "out", NAMES, (4, 2), runs=3, samples=200)
+    command = ["benchmark", "classes", str(folder / "p.npz"), str(folder / "out")]
+    command += ["--policies", *NAMES, "--views", "4", "2", "--thresholds", "0.9"]
+    main([*command, "--runs", "3", "--samples", "200"])
     return folder
 
 
 @pytest.mark.parametrize("n_views", [2, 4])
 def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
-    names = ("random", "random-all", "lem", "furthest", "spread", "oracle-gain")
     out = made / f"benchmark{n_views}"
     settings = {
-        "policies": names,
+        "policies": NAMES,
         "thresholds": (1.0,),
         "runs": 3,
         "max_views": n_views,
@@ -34,12 +34,16 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
     }
     tables = benchmark(made / "p.npz", out, **settings).tables
     keys = ["policy", "views", "measure"]
-    found = pd.read_csv(made / "out" / "measures.csv").set_index(keys).sort_index()
-    apart = pd.read_csv(made / "out" / "tests.csv").query("reference == 'random'")
+    found, apart = (
+        pd.read_csv(made / "out" / f"{name}.csv").query("set == 'all' and views > 0")
+        for name in ("measures", "tests")
+    )
+    found = found.set_index(keys).sort_index()
+    apart = apart[apart["measure"] == "accuracy"]
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
         of_all = tables.measures.query("set == 'all'").set_index(["measure", "policy"])
         summary = of_all.loc[theirs]
-        for name in names:
+        for name in NAMES:
             for column in ("value", "low", "high"):
                 assert found.loc[name, n_views, ours][column] == pytest.approx(
                     summary.loc[name, column],
@@ -47,7 +51,7 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
                 )
     tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
     after = apart[apart["views"] == n_views].set_index("policy")
-    for name in names[1:]:
+    for name in NAMES[1:]:
         for column in ("difference", "low", "high"):
             assert after.loc[name, column] == pytest.approx(
                 tests.loc[name, column],
@@ -59,67 +63,9 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
             assert after.loc[name, "p"] == pytest.approx(tests.loc[name, "p"], abs=1e-9)
 
 
-def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
-    keys = ["measure", "views", "policy"]
-    measures = pd.read_csv(made / "out" / "measures.csv")
-    found = measures.set_index(keys)["value"].sort_index()
-    for n_views in (2, 4):
-        accuracy, share = found["accuracy", n_views], found["share_of_gap", n_views]
-        assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
-        floor, top = accuracy["random"], accuracy["oracle-gain"]
-        assert share["spread"] == pytest.approx(
-            (accuracy["spread"] - floor) / (top - floor)
-        )
-
-
-def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
-    """``nextview-lab benchmark classes --views``, from the same first views; then figures
-    and tables for papers.
-    """
-    out = made / "command"
-    main(
-        [
-            "benchmark",
-            "classes",
-            str(made / "p.npz"),
-            str(out),
-            "--policies",
-            "lem",
-            "spread",
-            "oracle-gain",
-            "--views",
-            "4",
-            "2",
-            "--runs",
-            "3",
-            "--samples",
-            "200",
-            "--thresholds",
-            "0.9",
-        ]
-    )
-    assert "| policy | 2 views | 4 views |" in capsys.readouterr().out
-    keys = ["policy", "views", "measure"]
-    for name, columns in (
-        ("measures", ["value", "low", "high"]),
-        ("tests", ["difference", "low", "high", "p"]),
-    ):
-        ours, script = (
-            pd.read_csv(folder / f"{name}.csv").query("set == 'all' and views > 0")
-            for folder in (out, made / "out")
-        )
-        if name == "tests":
-            script = script[script["reference"] == "random"]
-        ours, script = (each.set_index(keys).sort_index() for each in (ours, script))
-        shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
-        assert len(shared) > 3
-        np.testing.assert_allclose(
-            ours.loc[shared, columns],
-            script.loc[shared, columns],
-            atol=1e-9,
-        )
-    assert (out / "views.md").read_text().startswith("| policy | 2 views")
-    main(["report", str(out), "--figures", str(made / "figures")])
+def test_the_report_draws_figures_and_tables_for_papers(made):
+    assert (made / "out/views.md").read_text().startswith("| policy | 2 views")
+    main(["report", str(made / "out"), "--figures", str(made / "figures")])
     written = {path.name for path in (made / "figures").iterdir()}
     for name in ("accuracy", "n_views", "reliability"):
         assert (made / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")

@@ -128,9 +128,7 @@ HOLES = {
 """Versions with known holes, the last before each was mended."""
 
 
-@pytest.mark.parametrize(
-    "project", ["pyproject.toml", "lab/pyproject.toml", "research/pyproject.toml"]
-)
+@pytest.mark.parametrize("project", ["pyproject.toml", "lab/pyproject.toml"])
 def test_no_version_with_a_known_hole_is_asked_for(project):
     table = tomllib.loads((ROOT / project).read_text())
     parts = table["project"].get("optional-dependencies", {}).values()

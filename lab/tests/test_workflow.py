@@ -142,13 +142,6 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
         "report",
     ):
         assert f"nextview-lab {command} " in planned
-    for script in (
-        "fit_policies validation.npz policies",
-        "measure_study views.zarr measures --meshes",
-        "train_agent ppo validation.npz",
-        "plan views.zarr volumetric coverage",
-    ):
-        assert f"python -m research.{script}" in planned
     assert "docs/results.md" in planned
 
 
@@ -163,7 +156,6 @@ def test_a_small_run_of_the_whole_graph(tmp_path):
     result = snakemake(tmp_path, *small, config=("data=",))
     assert result.returncode == 0, result.stdout + result.stderr
     page = (tmp_path / "docs/results.md").read_text()
-    assert "| mvselect |" in page
     for heading in (
         "Recogniser",
         "Map networks",
@@ -177,7 +169,7 @@ def test_a_small_run_of_the_whole_graph(tmp_path):
     )
     assert "| one view, all objects | " in page
     assert f"{float(alone[4]):.3f} (" in page
-    assert (tmp_path / "docs/images/front.png").stat().st_size > 10_000
+    assert (tmp_path / "docs/images/episode.png").stat().st_size > 10_000
     for card in (BUNDLED / "recognition/bundled").glob("*-modelnet10.json"):
         assert (tmp_path / "landed" / card.name).exists()
     again = snakemake(tmp_path, *small, "-n", config=("data=",))

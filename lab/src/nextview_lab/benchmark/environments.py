@@ -2,8 +2,7 @@
 
 Importing this module registers them:
 
-- ``nextview/Recognise-v0``: replays a file of predictions, thousands of episodes in one batch,
-  without rendering.
+- ``nextview/Recognise-v0``: replays a file of predictions, without rendering.
 - ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
 - ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
 """
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import number, one_line, whole
 from nextview.data.folders import list_dataset
@@ -43,7 +41,7 @@ from nextview.recognition.map_names import in_order
 from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.types import Float, Float32, Index, Mask
+from nextview.types import Float, Float32, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
@@ -51,18 +49,12 @@ from nextview_lab.training.rollout import OBJECTIVES, value_of
 
 with extras():
     import gymnasium
-    from gymnasium.vector import AutoresetMode, VectorEnv
-    from gymnasium.vector.utils import batch_space
 
 log = logging.getLogger(__name__)
 PredictionsSource = str | Path | Predictions
 CAMERAS = 16  # meshes that are cached
 _HERE = "nextview_lab.benchmark.environments"
-gymnasium.register(
-    "nextview/Recognise-v0",
-    f"{_HERE}:RecogniseEnv",
-    vector_entry_point=f"{_HERE}:RecogniseVectorEnv",
-)
+gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv")
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
 gymnasium.register(
     "nextview/RecogniseThings-v0",
@@ -191,33 +183,27 @@ class EnvironmentTask:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
     def begin(
-        self,
-        n: int,
-        rng: np.random.Generator,
-        options: Info | None = None,
-    ) -> "Cohort":
-        """Begin episodes.
+        self, rng: np.random.Generator, options: Info | None = None
+    ) -> tuple[Index, Index]:
+        """Draw the object and the first view of an episode, (1,) each.
 
         Args:
-            n: number of episodes.
             rng: source of all random numbers.
-            options: of ``reset``: "object" and "start" of each episode; random by default.
-
-        Returns:
-            The episodes.
+            options: of ``reset``: "object" and "start"; random by default.
 
         Raises:
             UsageError: an option is not valid.
         """
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
-        objects = rng.choice(len(self.labels), n, p=chance)
-        starts = rng.integers(len(self.sphere), size=n)
-        given = {"object": objects, "start": starts} | (options or {})
-        below = {"object": len(self.labels), "start": len(self.sphere)}
-        return Cohort(
-            self,
-            *(rows(given[name], n, most, name) for name, most in below.items()),
+        drawn = {
+            "object": rng.choice(len(self.labels), 1, p=chance),
+            "start": rng.integers(len(self.sphere), size=1),
+        }
+        given = drawn | (options or {})
+        return (
+            rows(given["object"], 1, len(self.labels), "object"),
+            rows(given["start"], 1, len(self.sphere), "start"),
         )
 
     @property
@@ -314,155 +300,34 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of a cohort: takes the free view nearest to the agent's action.
+    """The policy of an agent: takes the free view nearest to its action.
 
     Attributes:
         sphere: of the views.
-        views: requested views, one per episode.
+        view: the requested view.
         needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
-    views: Index
+    view: int
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Return the free view nearest to the requested one.
+        """Return the free view nearest to the requested one, (1,).
 
         Args:
-            state: the state of B episodes with V candidate views.
+            state: of the episode.
             rng: source of all random numbers.
-
-        Returns:
-            The next view of each episode, (B,) int64.
         """
-        return np.where(
-            state.free,
-            self.sphere.travel[self.views[state.episodes]],
-            np.inf,
-        ).argmin(1)
-
-
-@dataclass(frozen=True)
-class Seen:
-    """Outcomes of the actions in A episodes.
-
-    Attributes:
-        observation: (A, D) float32.
-        change: of the objective, (A,).
-        price: of the view and the travel to it, (A,).
-        ended: whether each episode has ended, (A,) bool.
-        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer", its
-            "confidence", "prediction_target" and "action_mask", the actions that lead to an
-            unvisited view, (A, V) int8.
-    """
-
-    observation: Float32
-    change: Float
-    price: Float
-    ended: Mask
-    info: dict[str, NDArray[Any]]
-
-
-class Cohort:
-    """B episodes that run side by side, all with the same number of views.
-
-    ``first`` is the outcome before any action.
-    """
-
-    def __init__(self, task: EnvironmentTask, objects: Index, starts: Index) -> None:
-        self.task = task
-        self.objects = objects
-        self._asked = Asked(task.sphere, np.array(starts))
-        # not used for any draw
-        rng = np.random.default_rng(0)
-        stopping = task.rules.stopping(task.calibration)
-        self.episodes = Episodes(
-            task.sphere,
-            self._asked,
-            starts,
-            stopping,
-            rng,
-            task.calibration,
-        )
-        self._visited = np.zeros((len(objects), len(task.sphere)), bool)
-        self._value = np.zeros(len(objects))
-        self._travel = np.zeros(len(objects))
-        self.first = self._look(np.zeros(len(objects)))
-
-    def step(self, actions: Index) -> Seen:
-        """Continue all running episodes; visited views are replaced by the nearest free ones."""
-        sphere = self.task.sphere
-        running = self.episodes.running
-        rules = self.task.rules
-        # ``current`` is the next view
-        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]
-        self._asked.views[running] = self._reached[np.arange(len(running)), actions]
-        self.episodes.keep_choice(self.episodes.next_choice())
-        way = sphere.travel[before, self.episodes.current[running]]
-        self._travel[running] += way
-        return self._look(rules.view_price + rules.travel_price * way)
-
-    def _look(self, price: Float) -> Seen:
-        task = self.task
-        running = self.episodes.running
-        k = len(self.episodes.steps) + 1
-        sphere = task.sphere
-        calibration = task.calibration
-        classes = len(task.classes)
-        objects = self.objects[running]
-        views = self.episodes.current[running]
-
-        step = self.episodes.update(task.observe(objects, views))
-        n_seen = np.maximum(step.seen, 1)
-        self._visited[running, views] = True
-        visited = self._visited[running]
-        labels = task.labels[objects]
-
-        azimuth_bins = calibration.azimuth_bins(
-            step.total,
-            n_seen,
-            classes,
-            sphere.azimuth[views],
-        )
-        state = EpisodeState(
-            views,
-            visited,
-            step.belief,
-            step.evidence,
-            k,
-            running,
-            azimuth_bins,
-        )
-        value = value_of(
-            calibration.log_belief(step.total, n_seen, classes),
-            labels,
-            task.rules.objective,
-        )
-
-        change = value - self._value[running] if k > 1 else np.zeros(len(running))
-        self._value[running] = value
-        reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
-        self._reached = reached[~step.stopped]
-
-        info = {
-            "object": objects,
-            "view": views,
-            "n_views": np.full(len(running), k),
-            "travel": self._travel[running],
-            "answer": step.belief.argmax(1),
-            "confidence": step.belief.max(1),
-            "prediction_target": labels,
-            "action_mask": (~np.take_along_axis(visited, reached, 1)).astype(np.int8),
-        }
-        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(
-            np.float32
-        )
-        return Seen(seen, change, price, step.stopped, info)
+        return np.where(state.free, self.sphere.travel[self.view], np.inf).argmin(1)
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """A task as an environment with one episode at a time."""
+    """A task as an environment.
+
+    The info holds "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
+    "prediction_target" and "action_mask", the actions that lead to an unvisited view, (V,) int8.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
@@ -470,7 +335,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self.task = task
         self.observation_space = task.observation_space
         self.action_space = task.action_space
-        self._cohort: Cohort | None = None
+        self._episodes: Episodes | None = None
 
     def reset(
         self,
@@ -488,33 +353,84 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             The first observation and its info.
         """
         super().reset(seed=seed)
-        self._cohort = self.task.begin(1, self.np_random, options)
-        return self.observed(self._cohort.first), info_of(self._cohort.first)
+        task = self.task
+        self._objects, start = task.begin(self.np_random, options)
+        self._asked = Asked(task.sphere, int(start[0]))
+        self._episodes = Episodes(
+            task.sphere,
+            self._asked,
+            start,
+            task.rules.stopping(task.calibration),
+            np.random.default_rng(0),  # not used for any draw
+            task.calibration,
+        )
+        self._travel = 0.0
+        self._visited = np.zeros((1, len(task.sphere)), bool)
+        observation, self._value, info = self._look(self._episodes)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        seen = self.go(action)
-        return (
-            self.observed(seen),
-            float((seen.change - seen.price)[0]),
-            bool(seen.ended[0]),
-            False,
-            info_of(seen),
-        )
-
-    def go(self, action: Any) -> Seen:
-        """Return the outcome of an action."""
-        if self._cohort is None or len(self._cohort.episodes.running) == 0:
+        """Take a view; a visited one is replaced by the nearest free one."""
+        episodes = self._episodes
+        if episodes is None or len(episodes.running) == 0:
             raise SessionError("no episode is under way; call reset")
-        return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
+        sphere = self.task.sphere
+        rules = self.task.rules
+        chosen = int(rows(action, 1, len(sphere), "action")[0])
+        # ``current`` is the next view
+        before = int(episodes.steps[-1].views[0])
+        self._asked.view = int(self._reached[chosen])
+        episodes.keep_choice(episodes.next_choice())
+        way = float(sphere.travel[before, episodes.current[0]])
+        self._travel += way
 
-    def observed(self, seen: Seen) -> Any:
-        """Return the observation of the single episode."""
-        return seen.observation[0]
+        earlier = self._value
+        observation, self._value, info = self._look(episodes)
+        reward = self._value - earlier - rules.view_price - rules.travel_price * way
+        return observation, float(reward), len(episodes.running) == 0, False, info
 
+    def _look(self, episodes: Episodes) -> tuple[Any, float, Info]:
+        """Take the current view: the observation, the objective and the info after it."""
+        task = self.task
+        sphere = task.sphere
+        calibration = task.calibration
+        views = episodes.current.copy()
+        step = episodes.update(task.observe(self._objects, views))
+        n_seen = np.maximum(step.seen, 1)
+        self._visited[0, views] = True
+        labels = task.labels[self._objects]
+        classes = len(task.classes)
+        bins = calibration.azimuth_bins(
+            step.total, n_seen, classes, sphere.azimuth[views]
+        )
+        state = EpisodeState(
+            views,
+            self._visited,
+            step.belief,
+            step.evidence,
+            len(episodes.steps),
+            np.zeros(1, np.int64),
+            bins,
+        )
+        logs = calibration.log_belief(step.total, n_seen, classes)
+        value = value_of(logs, labels, task.rules.objective)
+        self._reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)][0]
+        seen = features(sphere, state, task.rules.inputs, task.rules.frame)
+        info = {
+            "object": self._objects[0],
+            "view": views[0],
+            "n_views": len(episodes.steps),
+            "travel": self._travel,
+            "answer": step.belief[0].argmax(),
+            "confidence": step.belief[0].max(),
+            "prediction_target": labels[0],
+            "action_mask": (~self._visited[0, self._reached]).astype(np.int8),
+        }
+        return self.observed(seen[0].astype(np.float32)), float(value[0]), info
 
-def info_of(seen: Seen) -> Info:
-    """Return the info of a single episode."""
-    return {name: values[0] for name, values in seen.info.items()}
+    def observed(self, state: Float32) -> Any:
+        """Return the observation with a state, (D,)."""
+        return state
 
 
 class RecogniseEnv(TaskEnv):
@@ -531,118 +447,6 @@ class RecogniseEnv(TaskEnv):
         **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
-
-
-class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
-    """Many episodes of a task at once, grouped in cohorts by number of views."""
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
-    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
-
-    def __init__(self, task: EnvironmentTask, num_envs: int) -> None:
-        self.task = task
-        self.num_envs = whole(num_envs, "the number of environments", 1)
-        self.single_observation_space = task.observation_space
-        self.single_action_space = task.action_space
-        self.observation_space = batch_space(task.observation_space, num_envs)
-        self.action_space = batch_space(task.action_space, num_envs)
-        self._cohorts: list[tuple[Cohort, Index]] = []
-
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        options: Info | None = None,
-    ) -> tuple[Float32, Info]:
-        """Begin an episode in every environment; see Gymnasium.
-
-        Args:
-            seed: of the random numbers; None to continue their sequence.
-            options: "object" and "start" of each episode; random by default.
-
-        Returns:
-            The first observations, (E, D) float32, and their infos.
-        """
-        super().reset(seed=seed)
-        cohort = self.task.begin(self.num_envs, self.np_random, options)
-        self._cohorts = [(cohort, np.arange(self.num_envs))]
-        return cohort.first.observation, cohort.first.info
-
-    def step(self, actions: Any) -> tuple[Float32, NDArray, Mask, Mask, Info]:
-        seen, info = self.go(actions)
-        return (
-            seen.observation,
-            seen.change - seen.price,
-            seen.ended,
-            np.zeros(self.num_envs, bool),
-            info,
-        )
-
-    def go(self, actions: Any) -> tuple[Seen, Info]:
-        """Return the next observation of each episode; ended episodes are replaced by new ones."""
-        if not self._cohorts:
-            raise SessionError("no episode is under way; call reset")
-
-        actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
-        wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
-        parts = [
-            cohort.step(actions[where])
-            for (cohort, _), where in zip(self._cohorts, wheres, strict=True)
-        ]
-
-        order = np.argsort(np.concatenate(wheres))
-        names = ("observation", "change", "price", "ended")
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order]
-            for name in names
-        }
-        info = {
-            name: np.concatenate([part.info[name] for part in parts])[order]
-            for name in parts[0].info
-        }
-
-        seen = Seen(**joined, info=info)
-        self._cohorts = [
-            (cohort, members)
-            for cohort, members in self._cohorts
-            if len(cohort.episodes.running)
-        ]
-
-        over = np.flatnonzero(seen.ended)
-        if len(over) == 0:
-            return seen, info
-        last = seen.observation.copy()
-        now = {name: values.copy() for name, values in info.items()}
-
-        fresh = self.task.begin(len(over), self.np_random)
-        self._cohorts.append((fresh, over))
-        seen.observation[over] = fresh.first.observation
-        for name, values in fresh.first.info.items():
-            now[name][over] = values
-
-        return seen, now | {
-            "final_obs": last,
-            "_final_obs": seen.ended,
-            "final_info": info,
-            "_final_info": seen.ended,
-        }
-
-
-class RecogniseVectorEnv(TaskVectorEnv):
-    """Vector version of ``RecogniseEnv`` with ``num_envs`` episodes side by side."""
-
-    def __init__(
-        self,
-        num_envs: int,
-        predictions: PredictionsSource,
-        split: EnvironmentSplit = "train",
-        balanced: bool = False,
-        **rules: Any,
-    ) -> None:
-        super().__init__(
-            replayed(predictions, split, balanced, Rules(**rules)),
-            num_envs,
-        )
 
 
 class RecogniseMeshEnv(TaskEnv):
@@ -743,7 +547,6 @@ class RecogniseMeshEnv(TaskEnv):
         self._last = seen[-1]
         return self._models.evidence(seen)
 
-    def observed(self, seen: Seen) -> Any:
+    def observed(self, state: Float32) -> Any:
         """Return the state, with the depth image if requested."""
-        state = super().observed(seen)
         return {"state": state, "depth": self._last.depth} if self._depth else state

@@ -70,7 +70,7 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
     """
     rows = []
     for risk, threshold in risks.items():
-        values = values_of(tables, ALL, threshold)
+        values = values_of(tables.measures, ALL, threshold)
         for policy in dict.fromkeys(policy for policy, _, _ in values):
             # the upper limit of the accuracy is the lower limit of the error
             right, high, low = values[policy, "confident_accuracy", 0]
@@ -98,7 +98,7 @@ def levels_in(tables: Tables) -> dict[str, dict[str, Any]]:
         found[str(name)] = {
             "views": rows["views"].unique().tolist(),
             "policies": sorted(rows["policy"].unique(), key=is_oracle),
-            "values": values_of(tables, str(name)),
+            "values": values_of(tables.measures, str(name)),
             "tests": tests.set_index(["policy", "views"]).to_dict("index"),
         }
     return found
@@ -201,7 +201,7 @@ def after_views_rows(tables: Tables) -> "pd.DataFrame":
     tested = tables.tests.query("set == @ALL and views > 0")
     keys = ["policy", "reference", "views"]
     tests = tested.set_index(keys)[["difference", "p_holm"]]
-    values = values_of(tables, ALL)
+    values = values_of(tables.measures, ALL)
     n_views = [int(k) for k in after["views"].unique()]
     at = " at " + ", ".join(map(str, n_views))
 

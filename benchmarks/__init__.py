@@ -1,3 +1,0 @@
-"""What the pages measure: each script runs as ``python -m benchmarks.NAME`` from the root of the
-repository.
-"""
