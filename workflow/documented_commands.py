@@ -113,7 +113,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"benchmarks\.(frozen|poses_alone)|nextview-bench": (
         "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
-    r"benchmarks\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
+    r"benchmarks\.places": "needs the YCB scans, an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
@@ -131,7 +131,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
     ),
     r"nextview-lab scenes YCB ": "needs the YCB scans; lab/tests/test_room_scenes.py draws tables",
-    r"RoomLayout\.load": "names one of the drawn rooms; lab/tests/test_room_scenes.py looks into some",
+    r"RoomLayout\.load": "names a drawn room; lab/tests/test_room_scenes.py looks into some",
     r"agent_on_things": (
         "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),

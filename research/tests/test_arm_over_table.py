@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 pytest.importorskip("mujoco", reason="the extra 'arm' of research is not installed")
 
 from conftest import ROOT
-
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.sensor import SENSORS

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("mujoco", reason="the extra 'arm' of research is not installed")
 
 from conftest import ROOT
-
 from nextview.geometry.mesh import make_mesh
 from nextview.scene.grasps import FreeGrasp, propose_grasps
 
