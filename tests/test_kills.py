@@ -160,7 +160,7 @@ def died(program, *arguments):
     return json.loads(ran.stdout.splitlines()[-1])
 
 
-COMMANDS = [("add", "now"), ("remove", "now"), ("overwrite", "now"), ("add", "earlier")]
+COMMANDS = [("overwrite", "now"), ("add", "earlier")]
 """Commands, and the layout of the memory that they find: the file of earlier versions had no
 hash in its name.
 """

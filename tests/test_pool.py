@@ -31,14 +31,12 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("way", ["a file", "a module", "standard input", "a line"])
+@pytest.mark.parametrize("way", ["a file", "standard input"])
 def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
     (tmp_path / "script.py").write_text(LINES)
     call = {
         "a file": ["script.py"],
-        "a module": ["-m", "script"],
         "standard input": ["-"],
-        "a line": ["-c", LINES],
     }[way]
     done = subprocess.run(
         [sys.executable, *call],
@@ -51,16 +49,10 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
     assert done.stdout == "script runs\n[1.0, 2.0, 3.0]\n"
 
 
-@pytest.mark.parametrize(
-    ("function", "items"),
-    [
-        ("double", "[1, 4, 9]"),
-        ("partial(double, times=2)", "[1, 4, 9]"),
-        ("attrgetter('value')", "[Mine(2), Mine(8), Mine(18)]"),
-    ],
-)
-def test_what_a_guarded_script_defines_reaches_the_workers(tmp_path, function, items):
-    (tmp_path / "script.py").write_text(OWN_CODE.format(function=function, items=items))
+def test_what_a_guarded_script_defines_reaches_the_workers(tmp_path):
+    items = "[Mine(2), Mine(8), Mine(18)]"
+    code = OWN_CODE.format(function="attrgetter('value')", items=items)
+    (tmp_path / "script.py").write_text(code)
     done = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
     )
