@@ -30,20 +30,17 @@ from nextview.things import view_templates
 from nextview.things.memory import open_memory
 
 LONG = (
-    "test_workflow.py",
     "test_training.py",
-    "test_site.py",
-    "test_captured.py",
-    "test_poses.py",
-    "test_outputs.py",
     "test_scene_changes.py",
+    "test_scene.py",
+    "test_poses.py",
     "test_several_cameras.py",
     "test_learn.py",
-    "test_pages.py",
-    "test_scene.py",
-    "test_verification.py",
     "test_verification_fit.py",
-    "test_wheel.py",
+    "test_pages.py",
+    "test_verification.py",
+    "test_kills.py",
+    "test_workflow.py",
 )
 """Files that take longest: begun first, no process is left alone with one at the end."""
 

@@ -117,10 +117,9 @@ def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
     return found
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_an_error_of_a_camera_is_told(seed):
+def test_an_error_of_a_camera_is_told():
     """4 mm and .6 degrees, within 1 mm and .15 degrees."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     error = an_error(rng)
     (offset,) = camera_offsets(moments_of(rng, error))
     assert offset.noticed
@@ -132,9 +131,8 @@ def test_an_error_of_a_camera_is_told(seed):
     assert "relative to camera left" in str(offset)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_exact_cameras_are_not_reported(seed):
-    rng = np.random.default_rng(seed + 50)
+def test_exact_cameras_are_not_reported():
+    rng = np.random.default_rng(50)
     (offset,) = camera_offsets(moments_of(rng, np.eye(4), 2))
     assert not offset.noticed
 
