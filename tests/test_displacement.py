@@ -215,6 +215,7 @@ def test_depth_that_leans_every_plane_with_the_camera_is_no_lean(turns, forward,
 # In a session
 
 
+@pytest.mark.long
 def test_what_is_allowed_for_takes_no_certainty():
     """A nudged taught thing is named with confidence, and the result warns of the nudge."""
     session = nextview.load("ycb", max_views=3, threshold=1.0).session(

@@ -239,6 +239,7 @@ def emptied(parts, tmp_path_factory):
     return names, robot, folder
 
 
+@pytest.mark.long
 def test_the_program_of_the_page_empties_the_bin(emptied):
     _, robot, _ = emptied
     assert robot.parts == {}

@@ -130,6 +130,7 @@ def named(scene, name):
     )
 
 
+@pytest.mark.long
 def test_a_thing_that_leans_is_confident_in_a_scene_of_any_orientation(leans, ycb):
     frames, truth = leans
     resting = nextview.Scene(ycb)

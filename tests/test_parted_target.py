@@ -127,6 +127,7 @@ def test_another_object_is_not_taken_for_the_known_one_that_it_hides(
     assert len(session.views) == 1
 
 
+@pytest.mark.long
 def test_a_thing_that_is_cut_into_seven_strips_is_found_whole(ycb, block_and_box):
     block, _ = block_and_box
     camera, instances = over(block)

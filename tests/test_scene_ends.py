@@ -162,6 +162,7 @@ def litter(count: int) -> TableCamera:
     return TableCamera(SimulatedTable(tuple(things)), SENSORS["stereo"], rng)
 
 
+@pytest.mark.long
 def test_a_limited_number_of_objects_is_verified_per_frame(ycb, capsys):
     scene = nextview.Scene(ycb)
     look = scene.update(litter(100).frame(view(20)))
