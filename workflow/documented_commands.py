@@ -477,12 +477,8 @@ def make_rig(folder: Path) -> None:
 FILES = {
     "mine.py": (
         """
-from nextview_lab.data.measures import Measure
-
 def clutter(view):
     return float(view.seen.mean())
-
-uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
 """
     ),
     "spread.py": (
@@ -786,10 +782,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
-    **dict.fromkeys(
-        ("picking.gif", "scenes.png"),
-        "drawn by an earlier version, whose script is gone",
-    ),
+    "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 
 

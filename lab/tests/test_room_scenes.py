@@ -232,6 +232,10 @@ def test_invalid_inputs_of_rooms_are_reported(tins, tmp_path, furniture, capsys)
         match=r"how large is a plank\? Give the files' --unit",
     ):
         list(draw_scenes(tins, tmp_path / "out", [ROOM], workers=0))
+    said = refused(
+        capsys, "scenes", furniture, tmp_path / "o", "--levels", "room", "rooms"
+    )
+    assert "the level of a scene is light, medium, heavy, room, not rooms" in said
     said = refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
     assert "--unit is for --levels room" in said
 

@@ -47,6 +47,10 @@ EXAMPLES = {
     ),
     ("nextview", "dev"): "import hypothesis, mypy, pytest, ruff, skimage",
     ("nextview-lab", ""): "import nextview_lab.data.rendering, nextview_lab.data.store",
+    ("nextview-lab", "arm"): (
+        "from nextview_lab.studies.staged_things import physics; physics();"
+        " import gymnasium_robotics, mink"
+    ),
     ("nextview-lab", "benchmark"): (
         "from nextview_lab.benchmark.classes import benchmark_classes;"
         " from nextview_lab.benchmark.report import report"

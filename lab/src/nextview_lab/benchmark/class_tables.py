@@ -148,7 +148,7 @@ def summarise(
     whole = counted.tests(ALL, weights, reference, lambda key: key.measure in TESTED)
     of_measures = [whole[whole["measure"] == measure] for measure in TESTED]
     parts = [by_level(grid, reference, samples, rng)]
-    parts += [after_views(grid, n_views, weights, [reference])] if n_views else []
+    parts += [after_views(grid, n_views, weights, reference)] if n_views else []
     measures = [_measures(grid, cells, counted, weights), *(part for part, _ in parts)]
     tests = [*(corrected([some]) for some in of_measures), *(part for _, part in parts)]
 
@@ -329,7 +329,7 @@ def after_views(
     grid: Grid,
     n_views: Sequence[int],
     weights: Float,
-    references: Sequence[str],
+    reference: str,
 ) -> Both:
     """Compare policies after fixed numbers of views, without a threshold.
 
@@ -340,7 +340,7 @@ def after_views(
         grid: the episodes; the paths are long enough, or end by themselves.
         n_views: numbers of views.
         weights: bootstrap weight of each object in each sample, (S, N).
-        references: names of the reference policies.
+        reference: name of the reference policy.
 
     Returns:
         Measures and tests.
@@ -351,29 +351,24 @@ def after_views(
         for name, paths in grid.paths.items()
         if not paths.fixed or paths.views.shape[1] >= long
     ]
-    references = [name for name in references if name in names]
     families = st.target_families(grid.specs.predictions.names)
     counted = Counted.of(_after(grid, names, n_views), AFTER, {}, families)
-    measures = [counted.measures(ALL, weights), _gap(counted, references)]
-    tests = [
-        counted.tests(ALL, weights, reference, lambda key: key.measure == "accuracy")
-        for reference in references
-    ]
-    return pd.concat(measures, ignore_index=True), corrected(tests, knows_truth)
+    measures = [counted.measures(ALL, weights), _gap(counted, reference)]
+    tests = counted.tests(
+        ALL, weights, reference, lambda key: key.measure == "accuracy"
+    )
+    return pd.concat(measures, ignore_index=True), corrected([tests], knows_truth)
 
 
-def _gap(counted: Counted, references: Sequence[str]) -> pd.DataFrame:
-    """Return the share of the lead of one-step lookahead over the first reference."""
+def _gap(counted: Counted, reference: str) -> pd.DataFrame:
+    """Return the share of the lead of one-step lookahead over the reference."""
     right = counted.only(["accuracy"])
-    of_each = dict(zip(right.keys, right.top.T, strict=True))
+    mean = dict(zip(right.keys, right.top.mean(0).tolist(), strict=True))
     rows = []
-    for key, own in of_each.items():
-        share = np.nan
-        if references:
-            floor = of_each[key._replace(policy=references[0])]
-            ahead = of_each.get(key._replace(policy=ONE_STEP), floor)
-            lead = (ahead - floor).mean()
-            share = (own - floor).mean() / lead if lead > 0 else np.nan
+    for key, own in mean.items():
+        floor = mean.get(key._replace(policy=reference), np.nan)
+        lead = mean.get(key._replace(policy=ONE_STEP), floor) - floor
+        share = (own - floor) / lead if lead > 0 else np.nan
         rows.append((*key._replace(measure="share_of_gap"), share, np.nan, np.nan))
     return measures_of(ALL, rows)
 

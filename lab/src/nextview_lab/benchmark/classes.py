@@ -19,7 +19,7 @@ from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ClassResults, ClassTables, summarise
 from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.jobs import Settings
-from nextview_lab.benchmark.leaderboard import after_views_rows
+from nextview_lab.benchmark.leaderboard import after_views_table
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview_lab.benchmark.results import RECORD, write_results
 from nextview_lab.data.predictions import Predictions
@@ -118,9 +118,8 @@ def benchmark_classes(
 
     def more(part: Path) -> None:
         _write_episodes(part / "episodes.parquet", grid)
-        if settings.views:
-            rows = after_views_rows(tables)
-            text = markdown(rows.columns, rows.itertuples(index=False))
+        if after := after_views_table(tables):
+            text = markdown(after.headings, after.rows)
             (part / "views.md").write_text(text, encoding="utf-8")
         table.save(part / "predictions.npz")
 

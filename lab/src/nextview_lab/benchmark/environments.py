@@ -179,33 +179,6 @@ class EnvironmentTask:
     rules: Rules = Rules()
     balanced: bool = False
 
-    def __post_init__(self) -> None:
-        whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
-
-    def begin(
-        self, rng: np.random.Generator, options: Info | None = None
-    ) -> tuple[Index, Index]:
-        """Draw the object and the first view of an episode, (1,) each.
-
-        Args:
-            rng: source of all random numbers.
-            options: of ``reset``: "object" and "start"; random by default.
-
-        Raises:
-            UsageError: an option is not valid.
-        """
-        weight = 1 / np.bincount(self.labels)[self.labels]
-        chance = weight / weight.sum() if self.balanced else None
-        drawn = {
-            "object": rng.choice(len(self.labels), 1, p=chance),
-            "start": rng.integers(len(self.sphere), size=1),
-        }
-        given = drawn | (options or {})
-        return (
-            rows(given["object"], 1, len(self.labels), "object"),
-            rows(given["start"], 1, len(self.sphere), "start"),
-        )
-
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Space of ``policies.gain.features``, (D,) float32; all but the maps are in 0 to 1."""
@@ -226,11 +199,6 @@ class EnvironmentTask:
             np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
             high.astype(np.float32),
         )
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Discrete:
-        """Ring and azimuth steps ahead, as ``ring * azimuths + steps``; V actions."""
-        return gymnasium.spaces.Discrete(len(self.sphere))
 
 
 def replayed(
@@ -300,11 +268,11 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of an agent: takes the free view nearest to its action.
+    """The policy of an agent: takes the view that it asks for, or the free one nearest to it.
 
     Attributes:
         sphere: of the views.
-        view: the requested view.
+        view: the view.
         needs: required inputs, see ``Policy.needs``.
     """
 
@@ -313,7 +281,7 @@ class Asked:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Return the free view nearest to the requested one, (1,).
+        """Return the view, (1,).
 
         Args:
             state: of the episode.
@@ -322,20 +290,39 @@ class Asked:
         return np.where(state.free, self.sphere.travel[self.view], np.inf).argmin(1)
 
 
-class TaskEnv(gymnasium.Env[Any, Any]):
-    """A task as an environment.
+class ViewsEnv(gymnasium.Env[Any, Any]):
+    """Episodes in which an agent takes views: its actions, its rewards, and their end.
 
-    The info holds "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
-    "prediction_target" and "action_mask", the actions that lead to an unvisited view, (V,) int8.
+    An action is a ring and a number of azimuth steps ahead: ``ring * azimuths + steps``. One that
+    leads to a visited view goes to the nearest free one. The reward is the change of the objective
+    minus the prices. Kinds of episodes define ``begin`` and ``take``.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
-    def __init__(self, task: EnvironmentTask) -> None:
-        self.task = task
-        self.observation_space = task.observation_space
-        self.action_space = task.action_space
-        self._episodes: Episodes | None = None
+    def __init__(self, sphere: ViewSphere, rules: Rules) -> None:
+        whole(rules.max_views, "the number of views", 2, len(sphere))
+        self.sphere = sphere
+        self.rules = rules
+        self.action_space = gymnasium.spaces.Discrete(len(sphere))
+        # view that each action leads to, (V,); None where no episode is under way
+        self.reached: Index | None = None
+
+    def begin(self, options: Info) -> int:
+        """Begin an episode, and return its first view.
+
+        Args:
+            options: of ``reset``.
+        """
+        raise NotImplementedError
+
+    def take(self, view: int) -> tuple[Any, float, Index | None, Info]:
+        """Take a view: the observation, the objective, what actions lead to, and the info.
+
+        Args:
+            view: that is free.
+        """
+        raise NotImplementedError
 
     def reset(
         self,
@@ -343,90 +330,139 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         seed: int | None = None,
         options: Info | None = None,
     ) -> tuple[Any, Info]:
-        """Begin an episode; see Gymnasium.
+        """Begin an episode; its first view is not chosen by the agent.
 
         Args:
             seed: of the random numbers; None to continue their sequence.
-            options: "object" and "start"; random by default.
+            options: numbers of the episode; random by default.
 
         Returns:
             The first observation and its info.
         """
         super().reset(seed=seed)
+        self.views = [self.begin(options or {})]
+        self.travel = 0.0
+        observation, self._value, self.reached, info = self.take(self.views[0])
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """Take a view; see Gymnasium."""
+        if self.reached is None:
+            raise SessionError("no episode is under way; call reset")
+        chosen = int(rows(action, 1, len(self.sphere), "action")[0])
+        away = self.sphere.travel[self.reached[chosen]].copy()
+        away[self.views] = np.inf
+        view = int(away.argmin())
+        way = float(self.sphere.travel[self.views[-1], view])
+        self.views.append(view)
+        self.travel += way
+
+        earlier = self._value
+        observation, self._value, self.reached, info = self.take(view)
+        price = self.rules.view_price + self.rules.travel_price * way
+        over = self.reached is None
+        return observation, self._value - earlier - price, over, False, info
+
+    def drawn(self, options: Info, below: dict[str, int]) -> list[int]:
+        """Return numbers of an episode: those of the options, or else random ones.
+
+        Args:
+            options: of ``reset``.
+            below: upper limit of each number, exclusive, by name.
+
+        Raises:
+            UsageError: an option is not valid.
+        """
+        found = {name: self.np_random.integers(most) for name, most in below.items()}
+        given = found | options
+        return [
+            int(rows(given[name], 1, most, name)[0]) for name, most in below.items()
+        ]
+
+
+class TaskEnv(ViewsEnv):
+    """A task as an environment.
+
+    The info holds "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
+    "prediction_target" and "action_mask", the actions that lead to an unvisited view, (V,) int8.
+    """
+
+    def __init__(self, task: EnvironmentTask) -> None:
+        super().__init__(task.sphere, task.rules)
+        self.task = task
+        self.observation_space = task.observation_space
+
+    def begin(self, options: Info) -> int:
+        """Begin an episode; see ``ViewsEnv``.
+
+        Args:
+            options: "object" and "start".
+        """
         task = self.task
-        self._objects, start = task.begin(self.np_random, options)
-        self._asked = Asked(task.sphere, int(start[0]))
+        weight = 1 / np.bincount(task.labels)[task.labels]
+        chance = weight / weight.sum() if task.balanced else None
+        object_ = {"object": self.np_random.choice(len(task.labels), p=chance)}
+        below = {"object": len(task.labels), "start": len(task.sphere)}
+        number, start = self.drawn(object_ | options, below)
+        self._objects = np.array([number])
+        self._asked = Asked(task.sphere, start)
         self._episodes = Episodes(
             task.sphere,
             self._asked,
-            start,
+            np.array([start]),
             task.rules.stopping(task.calibration),
             np.random.default_rng(0),  # not used for any draw
             task.calibration,
         )
-        self._travel = 0.0
-        self._visited = np.zeros((1, len(task.sphere)), bool)
-        observation, self._value, info = self._look(self._episodes)
-        return observation, info
+        return start
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Take a view; a visited one is replaced by the nearest free one."""
+    def take(self, view: int) -> tuple[Any, float, Index | None, Info]:
+        """Take a view; see ``ViewsEnv``.
+
+        Args:
+            view: that is free.
+        """
         episodes = self._episodes
-        if episodes is None or len(episodes.running) == 0:
-            raise SessionError("no episode is under way; call reset")
-        sphere = self.task.sphere
-        rules = self.task.rules
-        chosen = int(rows(action, 1, len(sphere), "action")[0])
-        # ``current`` is the next view
-        before = int(episodes.steps[-1].views[0])
-        self._asked.view = int(self._reached[chosen])
-        episodes.keep_choice(episodes.next_choice())
-        way = float(sphere.travel[before, episodes.current[0]])
-        self._travel += way
-
-        earlier = self._value
-        observation, self._value, info = self._look(episodes)
-        reward = self._value - earlier - rules.view_price - rules.travel_price * way
-        return observation, float(reward), len(episodes.running) == 0, False, info
-
-    def _look(self, episodes: Episodes) -> tuple[Any, float, Info]:
-        """Take the current view: the observation, the objective and the info after it."""
+        if episodes.steps:
+            self._asked.view = view
+            episodes.keep_choice(episodes.next_choice())
         task = self.task
-        sphere = task.sphere
         calibration = task.calibration
-        views = episodes.current.copy()
-        step = episodes.update(task.observe(self._objects, views))
+        here = np.array([view])
+        step = episodes.update(task.observe(self._objects, here))
         n_seen = np.maximum(step.seen, 1)
-        self._visited[0, views] = True
+        visited = np.zeros((1, len(task.sphere)), bool)
+        visited[0, self.views] = True
         labels = task.labels[self._objects]
         classes = len(task.classes)
-        bins = calibration.azimuth_bins(
-            step.total, n_seen, classes, sphere.azimuth[views]
-        )
         state = EpisodeState(
-            views,
-            self._visited,
+            here,
+            visited,
             step.belief,
             step.evidence,
-            len(episodes.steps),
+            len(self.views),
             np.zeros(1, np.int64),
-            bins,
+            calibration.azimuth_bins(
+                step.total, n_seen, classes, task.sphere.azimuth[here]
+            ),
         )
         logs = calibration.log_belief(step.total, n_seen, classes)
-        value = value_of(logs, labels, task.rules.objective)
-        self._reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)][0]
-        seen = features(sphere, state, task.rules.inputs, task.rules.frame)
+        value = float(value_of(logs, labels, task.rules.objective)[0])
+        inputs, frame = task.rules.inputs, task.rules.frame
+        reached = cells_from(task.sphere)[origin(task.sphere, state, frame)][0]
+        seen = features(task.sphere, state, inputs, frame)[0].astype(np.float32)
         info = {
             "object": self._objects[0],
-            "view": views[0],
-            "n_views": len(episodes.steps),
-            "travel": self._travel,
+            "view": view,
+            "n_views": len(self.views),
+            "travel": self.travel,
             "answer": step.belief[0].argmax(),
             "confidence": step.belief[0].max(),
             "prediction_target": labels[0],
-            "action_mask": (~self._visited[0, self._reached]).astype(np.int8),
+            "action_mask": (~visited[0, reached]).astype(np.int8),
         }
-        return self.observed(seen[0].astype(np.float32)), float(value[0]), info
+        going = reached if len(episodes.running) else None
+        return self.observed(seen), value, going, info
 
     def observed(self, state: Float32) -> Any:
         """Return the observation with a state, (D,)."""

@@ -84,8 +84,8 @@ def report(
             "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
             "tests": tables.tests,
         }
-        after = board.after_views_rows(tables)
-        shown |= {} if after.empty else {"views": after}
+        if after := board.after_views_table(tables):
+            shown["views"] = pd.DataFrame(after.rows, columns=list(after.headings))
         write_figures(
             figures,
             _figures(loaded, headline_policy(loaded, at), at),

@@ -1,7 +1,7 @@
 """Write a folder of results: tables as CSV, Markdown and LaTeX, figures, and settings."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,8 @@ import numpy as np
 
 from nextview.files import new_folder
 from nextview.session.style import to_png
-from nextview_lab.benchmark.board_page import WrittenTable, markdown
-from nextview_lab.benchmark.comparison import Tables, too_few, values_of
+from nextview_lab.benchmark.board_page import Board, markdown, written
+from nextview_lab.benchmark.comparison import Tables, too_few
 from nextview_lab.benchmark.figures import differences, views_curve
 from nextview_lab.extras import extras
 
@@ -19,46 +19,6 @@ with extras():
     import pandas as pd
 
 RECORD = "benchmark.json"
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table that compares policies.
-
-    Attributes:
-        heading: of the column.
-        measures: in a cell, separated by commas.
-        views: number of views; 0 for whole episodes.
-        digits: after the decimal point.
-        short: heading in narrow tables; "" if it is not part of them.
-    """
-
-    heading: str
-    measures: tuple[str, ...]
-    views: int = 0
-    digits: int = 3
-    short: str = ""
-
-
-@dataclass(frozen=True)
-class Board:
-    """A table that compares policies.
-
-    Attributes:
-        title: of the table.
-        name: of the set of objects.
-        columns: after the column of policy names.
-        about: a line below the title.
-    """
-
-    title: str
-    name: str
-    columns: tuple[Column, ...]
-    about: str = ""
-
-    def narrow(self) -> dict[str, Column]:
-        """Return the columns of the narrow tables, by their short headings."""
-        return {column.short: column for column in self.columns if column.short}
 
 
 @dataclass(frozen=True)
@@ -102,41 +62,6 @@ def write_results(
             table.to_csv(part / f"{name}.csv", index=False)
         more(part)
         (part / RECORD).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-
-
-def written(
-    tables: Tables,
-    board: Board,
-    columns: Mapping[str, Column],
-    marked: Iterable[tuple[str, str, int]] = (),
-) -> WrittenTable:
-    """Return a board as text: a row for each policy.
-
-    Args:
-        tables: of the benchmark.
-        board: the table.
-        columns: of the table, by heading.
-        marked: policy, measure and views of the numbers marked with a star.
-    """
-    values = values_of(tables.measures, board.name)
-    stars = set(marked)
-
-    def shown(policy: str, measure: str, column: Column) -> str:
-        value = values[policy, measure, column.views][0]
-        star = "*" * ((policy, measure, column.views) in stars)
-        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
-
-    rows = tuple(
-        (
-            policy,
-            *(
-                ", ".join(shown(policy, m, c) for m in c.measures)
-                for c in columns.values()
-            ),
-        )
-        for policy in tables.policies()
-    )
-    return WrittenTable(board.title, board.about, ("policy", *columns), rows)
 
 
 def compared_markdown(tables: ComparedTables) -> str:

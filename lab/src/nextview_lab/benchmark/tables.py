@@ -12,9 +12,10 @@ from nextview.errors import UsageError
 from nextview.files import command, only_one
 from nextview.scene.view_policies import SCENE_POLICIES
 from nextview.things.memory import open_memory
+from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import ALL, ONE, Counted, Key, corrected
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
-from nextview_lab.benchmark.results import Board, Column, ComparedTables, write_compared
+from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample
 from nextview_lab.benchmark.table_runs import (
     MOST_THINGS,

@@ -8,6 +8,7 @@ import numpy as np
 from nextview.session.result import SUSPICIOUS
 from nextview.session.system import UNKNOWN_ALPHA
 from nextview.types import Float, Index
+from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -18,7 +19,7 @@ from nextview_lab.benchmark.comparison import (
     tests_of,
 )
 from nextview_lab.benchmark.confusable import Alikeness
-from nextview_lab.benchmark.results import Board, Column, ComparedTables
+from nextview_lab.benchmark.results import ComparedTables
 from nextview_lab.benchmark.statistics import exchange_p, interval, resample_families
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview_lab.benchmark.thing_policies import CEILINGS

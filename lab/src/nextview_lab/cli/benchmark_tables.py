@@ -15,14 +15,14 @@ from nextview_lab.benchmark import leaderboard as board
 from nextview_lab.benchmark.board_page import (
     Leaderboard,
     WrittenTable,
-    markdown,
     points,
+    written,
 )
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant
 from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import Number, numbers
-from nextview_lab.benchmark.results import ComparedTables, written
+from nextview_lab.benchmark.results import ComparedTables
 from nextview_lab.benchmark.submit import Submitted
 from nextview_lab.errors import EntryError
 
@@ -55,9 +55,8 @@ def print_leaderboard(results: ClassResults) -> None:
             if sentence:
                 terminal.print(sentence)
 
-    after = board.after_views_rows(tables)
-    if not after.empty:
-        print(markdown(after.columns, after.itertuples(index=False)), end="")
+    if after := board.after_views_table(tables):
+        print_tables([after])
     if sentence := board.level_differences(tables, reference):
         terminal.print(sentence)
 

@@ -1,22 +1,19 @@
 """``nextview-lab scenes``: generate random cluttered tables and rooms."""
 
 from pathlib import Path
-from typing import Literal
 
 from nextview.cli.common_options import NamedSplit, Unit, Workers
 from nextview.cli.progress import console, track_all
 from nextview.errors import DatasetError, UsageError
 from nextview_lab.data import scene_drawing
-from nextview_lab.worlds.scene_layout import ROOM
-
-SceneLevel = Literal["light", "medium", "heavy", "room"]
+from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS, ROOM
 
 
 def scenes(
     meshes: Path,
     out: Path,
     /,
-    levels: tuple[SceneLevel, ...] = ("light", "medium", "heavy"),
+    levels: tuple[str, ...] = tuple(CLUTTER_LEVELS),
     scenes: int | None = None,
     split: NamedSplit | None = None,
     held_out: str | None = None,
@@ -38,8 +35,8 @@ def scenes(
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
         out: folder of the scenes; existing scenes are kept.
-        levels: clutter levels: the visible share of the target is 85 % (light), 65 % (medium) or
-            45 % (heavy), averaged over the 40 views; in a room, things are life-size.
+        levels: light, medium, heavy or room: the visible share of the target is 85 % (light), 65 %
+            (medium) or 45 % (heavy), averaged over the 40 views; in a room, things are life-size.
         scenes: number of scenes per level and split; by default one for each object.
         split: generate only scenes of this split.
         held_out: use only target objects that this model (name or card) held out of its training.

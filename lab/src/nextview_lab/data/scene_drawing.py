@@ -76,7 +76,7 @@ MOST_FACES = 100_000
 MOST_SCENES = 100_000  # per level and split
 
 # rooms, metres
-ROOM_WALLS = (1.2, 4.0)  # distance of each wall from the target
+ROOM_WALLS = (0.6, 3.5)  # distance of each wall from the target's sphere
 ROOM_HEIGHT = (2.4, 2.8)
 HAND_SIZED = 0.3  # objects with a smaller radius are on a table
 TABLE_HEIGHTS = (0.70, 0.78)
@@ -85,10 +85,10 @@ LEAST_IN_ROOM = 0.35  # least visible share of a target in a room, mean over the
 VIEWS_TRIED = 60  # attempts to find a first view
 AIM_OFF = 0.02  # standard deviation of its aim, relative to the distance
 LEAST_SHOWN = 0.7  # least visible share of the target in it
-# distance of the first camera, and its elevation, degrees
-FROM_FLOOR = (1.5, 3.5), (5.0, 30.0)
-FROM_TABLE = (0.4, 0.7), (20.0, 60.0)
-FREE_OF_TARGET = 0.25  # least distance between the camera and the target's sphere
+# distance of the first camera, its elevation, degrees, and its least distance from the target's
+# sphere
+FROM_FLOOR = (1.5, 3.5), (5.0, 30.0), 0.8
+FROM_TABLE = (0.4, 0.7), (20.0, 60.0), 0.25
 
 
 @dataclass(frozen=True)
@@ -359,7 +359,8 @@ def draw_scene(
         metres = life_radius(mesh, label, rng)
         small = label in ON_TABLES or (mesh.metres or np.inf) < HAND_SIZED
         if meshes.unit is None:
-            others = [file for file in others if _is_furniture(meshes, file, small)]
+            known = set() if small else set(LIFE_SIZES) - set(ON_TABLES)
+            others = [file for file in others if meshes.labels[file] in known]
         elif small:
             poses = resting_poses(mesh)
             turn = poses[rng.integers(len(poses))]
@@ -416,12 +417,6 @@ def draw_scene(
     )
 
 
-def _is_furniture(meshes: Meshes, file: str, small: bool) -> bool:
-    """Return True if a mesh of a known class may stand on a floor; none lies on a table."""
-    label = meshes.labels[file]
-    return not small and label in LIFE_SIZES and label not in ON_TABLES
-
-
 def _on_table(level: str, rng: np.random.Generator) -> _Stage:
     """Draw the number of walls and the visible share of a cluttered table."""
     goal = CLUTTER_LEVELS[level] + rng.uniform(-SPREAD, SPREAD)
@@ -433,7 +428,7 @@ def _on_table(level: str, rng: np.random.Generator) -> _Stage:
 
 def _in_room(metres: float, small: bool, rng: np.random.Generator) -> _Stage:
     """Draw a room around a target, which stands on its floor or, if small, on a table."""
-    away = np.array(_rounded(*rng.uniform(*ROOM_WALLS, 4) / metres))
+    away = np.array(_rounded(*1 + rng.uniform(*ROOM_WALLS, 4) / metres))
     height, below, thick = _rounded(
         rng.uniform(*ROOM_HEIGHT) / metres,
         small * rng.uniform(*TABLE_HEIGHTS) / metres,
@@ -468,9 +463,9 @@ def _first_pose(
     scene: TargetScene, metres: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
     """Find a level pose from which the target is visible, (16,), metres; None if there is none."""
-    distances, elevations = FROM_TABLE if metres < HAND_SIZED else FROM_FLOOR
+    distances, elevations, free = FROM_TABLE if metres < HAND_SIZED else FROM_FLOOR
     for _ in range(VIEWS_TRIED):
-        away = max(rng.uniform(*distances), metres + FREE_OF_TARGET) / metres
+        away = max(rng.uniform(*distances), metres + free) / metres
         elevation = np.radians(rng.uniform(*elevations, 1))
         pose = look_at_origin(elevation, rng.uniform(0, 2 * np.pi, 1), away)[0]
         pose[:3, 3] += rng.normal(0, AIM_OFF * away, 3)
