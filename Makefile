@@ -2,13 +2,19 @@
 PYTHON ?= python3
 
 .SECONDARY:  # what a rule makes on the way is kept
-.PHONY: demo test test-ros lint docs docs-check reproduce reproduce-small reproduce-things clean
+.PHONY: demo test test-package test-ros lint docs docs-check reproduce reproduce-small reproduce-things clean
 
 demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
 	.venv/bin/nextview demo
 
-test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # for two cores, as tests wait, too; one file is run by one process, of one thread; what it imports is compiled once
+# One file is run by one process, of one thread; what it imports is compiled once.
+PYTEST = OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+test: .venv-test/installed  ## run the tests of both packages; NEXTVIEW_TESTS=all: also those that take long
+	$(PYTEST)
+
+test-package: .venv-test/installed  ## run the tests of nextview alone
+	$(PYTEST) tests
 
 # Folder with clones of the ten repositories in ros2/environment.py; those that are missing are cloned from GitHub.
 ROS_SOURCES ?= .venv-ros/src

@@ -36,8 +36,7 @@ def empty_environment(folder: Path) -> tuple[Path, Path]:
 
 
 def asked_for(
-    requirements: Iterable[tuple[str, str]],
-    found: Found | None = None,
+    requirements: Iterable[tuple[str, str]], found: Found | None = None
 ) -> Found:
     """The installed distributions that requirements need, theirs included.
 
@@ -86,8 +85,7 @@ def link(installed: Distribution, packages: Path) -> None:
 
 
 def installation(
-    folder: Path,
-    projects: Mapping[str, Iterable[str]] = {"nextview": ()},
+    folder: Path, projects: Mapping[str, Iterable[str]] = {"nextview": ()}
 ) -> Path:
     """Make an environment in which this clone is installed, with its commands; returns its Python.
 

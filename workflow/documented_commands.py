@@ -77,15 +77,15 @@ TOLERANCE = (
 )
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
-    r"lmo": "needs a dataset of BOP: tests/test_bop.py writes one and runs it",
+    r"lmo": "needs a dataset of BOP: lab/tests/test_bop.py writes one and runs it",
     r"studies\.(real_frames|segmentation)": "needs real frames, which are not part of this",
     r"^nextview-lab benchmark tables|studies\.(moves|tracking)": (
         "needs scans of all things that the bundled memory knows"
     ),
-    r"^make ": "the workflow is run by tests/test_workflow.py",
-    r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
+    r"^make ": "the workflow is run by lab/tests/test_workflow.py",
+    r"^(pip|python3 -m pip) ": "installs; lab/tests/test_wheel.py installs each extra",
     r"^nextview-lab download": (
-        "473 MB from a server of others; tests/test_download.py has a server of its own"
+        "473 MB from a server of others; lab/tests/test_download.py has a server of its own"
     ),
     r"^nextview explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
@@ -94,30 +94,30 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
     ),
     r"^rerun ": "opens a window",
-    r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
+    r"^dask ": "serves until it is stopped; lab/tests/test_render.py has a cluster of its own",
     r"--scheduler": "needs the scheduler of the line before",
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |python3.11 ros2|export AMENT_PREFIX)": (
         "needs ROS 2; make test-ros runs the node, and the first steps of its page"
     ),
     r"my_(recordings?|folder)": (
-        "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
+        "needs a recording of the reader's; tests/test_bags.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
     r"studies\.frozen|nextview-bench": (
-        "needs the YCB scans, and hours; tests/test_submit.py runs methods on a small archive"
+        "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
-    r"studies\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
+    r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|verified_things": (
         "needs the YCB scans, and minutes"
     ),
     r"SceneLayout\.load": (
-        "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
+        "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
     ),
-    r"nextview-lab scenes YCB ": "needs the YCB scans; tests/test_room_scenes.py draws tables",
+    r"nextview-lab scenes YCB ": "needs the YCB scans; lab/tests/test_room_scenes.py draws tables",
     r"agent_on_things": (
-        "needs things that were taught; tests/test_thing_environment.py lets it learn"
+        "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"--ensemble runs/second": "needs the run of the line before",
