@@ -25,7 +25,12 @@ from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "lab/src").rglob("*.py")])
 SCRIPTS = [
     path
-    for folder in ("examples", "lab/src/nextview_lab/studies", "workflow")
+    for folder in (
+        "examples",
+        "lab/src/nextview_lab/studies",
+        "lab/src/nextview_lab/thesis",
+        "workflow",
+    )
     for path in sorted((ROOT / folder).glob("*.py"))
     if '__name__ == "__main__"' in path.read_text()
 ]
@@ -254,7 +259,14 @@ def test_the_help_of_every_script_shows_in_the_base_installation(base):
 
 
 def test_a_script_without_its_extra_prints_installation_advice(base):
-    ((status, said),) = runs(base, "", ["workflow/results.py"]).values()
-    assert status == 2
-    assert said.endswith(": pip install 'nextview-lab[benchmark]'\n")
-    assert said.count("\n") == 1
+    thesis = "lab/src/nextview_lab/thesis"
+    needing = {
+        "workflow/results.py": "benchmark",
+        f"{thesis}/example_maps.py": "benchmark",
+        f"{thesis}/measure_study.py": "benchmark",
+        f"{thesis}/train_grid.py": "train",
+    }
+    for name, (status, said) in runs(base, "", list(needing)).items():
+        assert status == 2, (name, said)
+        assert said.endswith(f": pip install 'nextview-lab[{needing[name]}]'\n")
+        assert said.count("\n") == 1
