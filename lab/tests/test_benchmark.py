@@ -18,6 +18,7 @@ from nextview_lab.benchmark.replay import make_specs, replay, truncate
 from nextview_lab.benchmark.report import report
 from nextview_lab.data.metrics import calibration_error
 from nextview_lab.data.predictions import Predictions
+from nextview_lab.thesis.reproduction import page
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +173,37 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
         samples=20,
     )
     assert half.predictions.names == both.names[1::2]
+
+
+def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
+    text = page(results / "p.npz", samples=200)
+    benchmark(results / "p.npz", tmp_path / "full", samples=200)
+    measures = pd.read_csv(tmp_path / "full" / "measures.csv").query("set == 'all'")
+    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
+    tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(
+        ["policy", "threshold", "measure"]
+    )
+    for name in ("lem", "oracle-gain"):
+        row = next(
+            line
+            for line in text.split("## Every policy")[1].splitlines()
+            if line.startswith(f"| {name} |")
+        )
+        for cell, measure in zip(
+            row.split("|")[2:],
+            ["accuracy", "clean_accuracy", "n_views"],
+            strict=False,
+        ):
+            assert float(cell.split()[0]) == pytest.approx(
+                summary[name, 0.97, measure],
+                abs=0.0051,
+            )
+        test = tests.loc[(name, 0.97, "accuracy")]
+        assert (
+            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}"
+            in text
+        )
+    assert "LCM from a predicted map; no such network" in text
 
 
 def test_measured_error_rates_stand_beside_the_promised_ones(

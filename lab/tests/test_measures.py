@@ -24,8 +24,13 @@ from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import MeasureError
 
 OWN = """
+from nextview_lab.data.measures import Measure
 def rows(view):
     return view.near.shape[0]
+def upright(view):
+    faces, pixels = view.pixels
+    return float(pixels.sum())
+pixels = Measure(upright, needs="mesh")
 def broken(view):
     return view.nothing
 def later(view):
@@ -138,6 +143,7 @@ def test_a_stopped_run_is_completed_by_the_next(store):
         ),
         ("own_measures:constant", "is not a function"),
         ("no_such_module:none", "cannot be imported .ModuleNotFoundError"),
+        ("own_measures:pixels", "needs the meshes"),
         ("beauty", "no measure is called 'beauty'; there are depth_entropy"),
     ],
 )

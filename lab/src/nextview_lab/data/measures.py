@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,17 +65,23 @@ class MeasuredView:
         return self.near[self.seen]
 
 
+# returns all views of an object in a store
+MeasuredViews = Callable[[ViewStore, int], Iterator[MeasuredView]]
+
+
 @dataclass(frozen=True)
 class Measure:
-    """A measure of a view.
+    """A measure of a view, and its required input.
 
     Attributes:
-        function: computes the measure of one view.
+        function: computes the measure of one ``MeasuredView``.
+        needs: "depth" if the depth image is enough, or "mesh".
         source: publication of the measure.
         good: whether high values (peak) or low values (valley) mark the better views.
     """
 
-    function: Callable[[MeasuredView], float]
+    function: Callable[[Any], float]
+    needs: Literal["depth", "mesh"] = "depth"
     source: str = "your own"
     good: Good = "peak"
 
@@ -86,9 +93,9 @@ class Measure:
 MEASURES: dict[
     str,
     Measure,
-] = {  # of the thesis; other packages add measures with entry points MEASURE_ENTRY_POINTS
+] = {  # the others are entry points MEASURE_ENTRY_POINTS of installed packages
     "depth_entropy": Measure(
-        lambda view: depth_entropy(view.depth), "Parisotto et al.; eq. 3"
+        lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
     )
 }
 MEASURE_ENTRY_POINTS = "nextview.measures"
@@ -125,27 +132,39 @@ def find_measure(name: str) -> Measure:
     return found if isinstance(found, Measure) else Measure(found)
 
 
-def names_of(names: Sequence[str]) -> tuple[str, ...]:
+def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
     """Return the measures that a user requests.
 
     Args:
-        names: of measures, or "all"; empty for all.
+        names: of measures, or "all"; empty for all that can be computed.
+        meshes: whether the meshes are available.
 
     Returns:
         Names of the measures, each once.
 
     Raises:
-        MeasureError: a name is unknown.
+        MeasureError: a name is unknown, or a measure needs the meshes.
     """
+    if not names:
+        return tuple(
+            name
+            for name, measure in all_measures().items()
+            if meshes or measure.needs == "depth"
+        )
+
     names = tuple(
         dict.fromkeys(
             each
-            for name in names or ("all",)
+            for name in names
             for each in (all_measures() if name == "all" else (name,))
         )
     )
+
     for name in names:
-        find_measure(name)
+        if find_measure(name).needs == "mesh" and not meshes:
+            raise MeasureError(
+                f"the measure {name} needs the meshes, not the depth alone (docs/add_a_measure.md)"
+            )
     return names
 
 
@@ -217,6 +236,7 @@ def measure(
     scheduler: str | None = None,
     objects: Index | None = None,
     overwrite: bool = False,
+    views: MeasuredViews = depth_views,
 ) -> Iterator[tuple[int, int]]:
     """Compute measures of rendered views and add them to their store.
 
@@ -224,19 +244,20 @@ def measure(
 
     Args:
         path: of the store.
-        names: of the measures, see ``find_measure``, or "all"; empty for all.
+        names: of the measures, see ``find_measure``, or "all"; empty for all that ``views`` allows.
         workers: number of processes; None for one per core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         objects: rows of the objects, (n,) int64; None for all.
         overwrite: whether to recompute existing values.
+        views: returns the views of an object.
 
     Yields:
         Number of finished objects, and the total.
     """
-    names = names_of(names)
+    names = names_of(names, views is not depth_views)
     # raises an error if it is missing, before any work is done
     ViewStore.open(path).array("depth")
-    function = partial(_measure, names)
+    function = partial(_measure, names, views)
     yield from keep(
         path,
         [f"measures/{name}" for name in names],
@@ -250,6 +271,7 @@ def measure(
 
 def _measure(
     names: tuple[str, ...],
+    views: MeasuredViews,
     store: ViewStore,
     i: int,
 ) -> Made:
@@ -260,7 +282,7 @@ def _measure(
     def failed(name: str, said: str) -> MeasureError:
         return MeasureError(f"measure {name} of {object_name}: {said}")
 
-    for k, view in enumerate(depth_views(store, i)):
+    for k, view in enumerate(views(store, i)):
         for name, function in functions.items():
             guard = (
                 nullcontext()
