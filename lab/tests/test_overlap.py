@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from pipeline import box
+from factories import box
 
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import make_mesh
