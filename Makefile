@@ -2,13 +2,19 @@
 PYTHON ?= python3
 
 .SECONDARY:  # what a rule makes on the way is kept
-.PHONY: demo test test-ros lint docs docs-check reproduce reproduce-small reproduce-things clean
+.PHONY: demo test test-package test-ros lint docs docs-check reproduce reproduce-small reproduce-things clean
 
 demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
 	.venv/bin/nextview demo
 
-test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
-	OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # for two cores, as tests wait, too; one file is run by one process, of one thread; what it imports is compiled once
+# One file is run by one process, of one thread; what it imports is compiled once.
+PYTEST = OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+test: .venv-test/installed  ## run the tests of both packages; NEXTVIEW_TESTS=all: also those that take long
+	$(PYTEST)
+
+test-package: .venv-test/installed  ## run the tests of nextview alone
+	$(PYTEST) tests
 
 # Folder with clones of the ten repositories in ros2/environment.py; those that are missing are cloned from GitHub.
 ROS_SOURCES ?= .venv-ros/src
@@ -55,16 +61,14 @@ reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$
 	$(LAB) benchmark things $(YCB) $(THINGS)/heavy_two --models ycb --occlusion heavy --seed 71 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark things $(YCB) $(THINGS)/half_two --models ycb --occlusion half --seed 71 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark things $(YCB) $(THINGS)/clear_two --models ycb --seed 71 $(NEXT_DRAWS) furthest
-	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_two heavy_two half_two clear_two) > $(THINGS)/joined_two.md
 	$(LAB) benchmark things $(THINGS)/look_alikes_75 $(THINGS)/pairs_three --models $(THINGS)/alike_75 --families --seed 74 $(NEXT_DRAWS) spread
 	$(LAB) benchmark things $(YCB) $(THINGS)/heavy_three --models ycb --occlusion heavy --seed 74 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark things $(YCB) $(THINGS)/half_three --models ycb --occlusion half --seed 74 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark things $(YCB) $(THINGS)/clear_three --models ycb --seed 74 $(NEXT_DRAWS) furthest
-	$(PYTHON_TEST) -m benchmarks.joined_things $(addprefix $(THINGS)/,pairs_three heavy_three half_three clear_three) > $(THINGS)/joined_three.md
 	$(LAB) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
-	$(PYTHON_TEST) -m benchmarks.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
+	$(PYTHON_TEST) -m nextview_lab.studies.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
-	$(PYTHON_TEST) -m benchmarks.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
+	$(PYTHON_TEST) -m nextview_lab.studies.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
 	mkdir -p $(THINGS)/small
 	for policy in geometry sampled predicted fixed furthest random spread; do \
 		test -f $(THINGS)/small/$$policy.json || \
@@ -73,15 +77,12 @@ reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$
 	test -f $(THINGS)/small/icp.json || \
 	$(LAB) submit $(THINGS)/nextview-bench-small $(THINGS)/small/icp.json --name "plain ICP" --version 1 --blind \
 		--command "$(abspath .venv-test/bin/python) examples/icp_method.py $(abspath $(YCB))"
-	test -f $(THINGS)/small/poses.json || \
-	$(LAB) submit $(THINGS)/nextview-bench-small $(THINGS)/small/poses.json --name "poses alone" --version 1 --blind \
-		--command "$(abspath .venv-test/bin/python) -m benchmarks.poses_alone $(abspath $(THINGS)/nextview-bench-small) --answer"
 	$(LAB) leaderboard $(THINGS)/small $(THINGS)/nextview-bench-small $(THINGS)/board --reference "nextview random" --overwrite
 
 $(THINGS)/look_alikes_%/pairs.csv: | .venv-test/installed
 	rm -rf $(@D)
 	mkdir -p $(THINGS)
-	$(PYTHON_TEST) -m benchmarks.made_things look-alikes $(YCB) $(@D) --models $(DATA) --pairs 50 --seed $*
+	$(PYTHON_TEST) -m nextview_lab.studies.look_alikes $(YCB) $(@D) --models $(DATA) --pairs 50 --seed $*
 
 $(THINGS)/alike_%/memory.json: $(THINGS)/look_alikes_%/pairs.csv
 	$(NEXTVIEW) learn $(<D) $(@D) --unit m
@@ -91,9 +92,9 @@ $(THINGS)/alike_%/memory.json: $(THINGS)/look_alikes_%/pairs.csv
 	.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	touch $@
 
-.venv-test/installed: pyproject.toml lab/pyproject.toml research/pyproject.toml constraints.txt
+.venv-test/installed: pyproject.toml lab/pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[bags,cluster,explore,large,record,dev,workflow,docs]' -e 'lab[train,benchmark,envs]' -e 'research[arm,rl]'
+	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[bags,cluster,explore,large,record,teach,dev,workflow,docs]' -e 'lab[arm,benchmark,envs,train]'
 	touch $@
 
 .venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/*/*)

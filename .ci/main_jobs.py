@@ -1,5 +1,5 @@
 """The main jobs in a base installation, on small inputs made here; each has to give the right
-result. The argument is the project whose jobs are run: nextview or nextview-lab.
+result. The argument says whose jobs are run: nextview, teach (its extra), or nextview-lab.
 
 Run by ``.ci/base_installation`` in an empty working folder that holds copies of ``samples`` and
 ``examples``.
@@ -78,6 +78,13 @@ def the_laboratory_is_not_there() -> None:
     names = ("nextview_lab", "zarr", "numcodecs", "pooch", "requests")
     there = [name for name in names if find_spec(name) is not None]
     assert not there, f"nextview brings {there}"
+
+
+def learning_names_its_extra() -> None:
+    """What only teaching needs is not there, and is named before any work."""
+    said = run("learn", "samples", "mine", "--unit", "cm", status=2)
+    assert "pip install 'nextview[teach]'" in said
+    assert said.count("\n") == 1
 
 
 def learn_and_recognise() -> None:
@@ -219,11 +226,12 @@ JOBS = {
     "nextview": (
         no_extra_is_there,
         the_laboratory_is_not_there,
-        learn_and_recognise,
+        learning_names_its_extra,
         look_at_samples,
         sessions_with_frames,
         nothing_unasked_is_written,
     ),
+    "teach": (learn_and_recognise, nothing_unasked_is_written),
     "nextview-lab": (
         no_extra_is_there,
         captures,

@@ -1,3 +1,1 @@
-"""What the pages measure: each script runs as ``python -m benchmarks.NAME`` from the root of the
-repository.
-"""
+"""What a change of the recognition is measured by: ``python -m benchmarks.gate``."""

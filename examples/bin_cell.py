@@ -7,9 +7,11 @@ have the error of a hand-eye calibration. The arm's model is the one in ``gymnas
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import mink
@@ -23,10 +25,40 @@ from nextview.geometry.ray_caster import RayCaster
 from nextview.scene.grasps import Gripper
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS, Sensor
-from research.arm import FASTEST, HOME, LONGEST, OFFSETS, RANGES, STARTS, along
-from research.arm import _assets as panda_files
-from research.arm import _triangles as triangles_of
-from research.arm import _turned_least as turned_least
+
+FASTEST = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
+"""Velocity limits of the seven joints, rad/s (Franka Control Interface, robot and interface
+specifications).
+"""
+RANGES = np.array(
+    [
+        [-2.8973, 2.8973],
+        [-1.7628, 1.7628],
+        [-2.8973, 2.8973],
+        [-3.0718, -0.0698],
+        [-2.8973, 2.8973],
+        [-0.0175, 3.7525],
+        [-2.8973, 2.8973],
+    ]
+)
+"""Limits of the joints, rad (the same source)."""
+OFFSETS = np.array([0, 0, 0, 0, 0, np.pi / 2, np.pi / 4])
+"""The model counts its last two joints from elsewhere: Franka's angles less the model's."""
+HOME = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 0.35, 0.0])
+"""Joints at rest, rad: the elbow up, the camera over the table."""
+STARTS = HOME + np.array(
+    [
+        [0, 0, 0, 0, 0, 0, 0],
+        [0.9, 0.6, 0, 0.4, 0, 0, 0],
+        [-0.9, 0.6, 0, 0.4, 0, 0, 0],
+        [0.8, 0.9, -1.2, 0, 0, 0, 0],
+        [-0.8, 0.9, 1.2, 0, 0, 0, 0],
+        [0, 1.0, 0, 0.8, 0, -0.8, 0],
+    ]
+)
+"""Where the search for joints begins if it finds none from where the arm is."""
+LONGEST = 0.9
+"""Metres from the shoulder beyond which no wrist comes: nothing is searched there."""
 
 MILLIMETRE = 0.001
 BIN = np.array([0.50, 0.0])  # centre of the bin, metres from the arm's base
@@ -91,15 +123,76 @@ WORLD = """
 """
 HAND = np.array([[1.0, 1, 0], [-1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
 """Axes of the hand in those of link 7, columns: the fingers close along y, z points forward."""
-COLOURS = np.array(
+
+
+def panda_files() -> Path:
+    """The folder of the arm's model."""
+    spec = find_spec("gymnasium_robotics")  # to import it takes a while, and prints
+    assert spec is not None
+    assert spec.origin is not None
+    return Path(spec.origin).parent / "envs/assets/kitchen_franka/franka_assets"
+
+
+def along(way: Sequence[np.ndarray], step: float) -> list[np.ndarray]:
+    """Joints along a way, no joint farther apart than a step, radians; with its first and its
+    last.
+    """
+    found = [way[0]]
+    for a, b in pairwise(way):
+        n = max(1, int(np.ceil(np.abs(b - a).max() / step)))
+        found += [a + (b - a) * k / n for k in range(1, n + 1)]
+    return found
+
+
+def turned_least(rotation: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,)
+    (Rodrigues' formula).
+    """
+    now = rotation[:, 2]
+    cosine = now @ forward
+    if cosine < -1 + 1e-9:  # it looks the other way: any axis across it will do
+        return rotation * [1, -1, -1]
+    # times a vector: its cross product with the axis
+    across = np.outer(forward, now) - np.outer(now, forward)
+    return (np.eye(3) + across + across @ across / (1 + cosine)) @ rotation
+
+
+CORNERS = np.stack(
+    np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"),
+    -1,
+).reshape(8, 3)
+SIDES = np.array(
     [
-        [0.27, 0.51, 0.71],
-        [0.85, 0.55, 0.20],
-        [0.45, 0.64, 0.35],
-        [0.70, 0.40, 0.55],
-        [0.80, 0.74, 0.35],
-    ]
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ],
+    np.int32,
 )
+
+
+def triangles_of(model: Any, geom: int, mujoco: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh or box of the model, in its own axes."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        return CORNERS * model.geom_size[geom], SIDES
+    mesh = model.geom_dataid[geom]
+    first = model.mesh_vertadr[mesh]
+    count = model.mesh_vertnum[mesh]
+    begin = model.mesh_faceadr[mesh]
+    faces = model.mesh_facenum[mesh]
+    return (
+        model.mesh_vert[first : first + count].astype(float),
+        model.mesh_face[begin : begin + faces],
+    )
 
 
 def walls(
@@ -324,7 +417,6 @@ class Cell:
     Attributes:
         joints: where the arm is sent, (7,).
         names: true name of each part.
-        watch: is called every tenth of a second of simulated time.
     """
 
     def __init__(
@@ -332,20 +424,16 @@ class Cell:
         parts: Mapping[str, BinPart],
         poured: Sequence[str],
         rng: np.random.Generator,
-        watch: Callable[[], None] = lambda: None,
     ) -> None:
         self.names = list(poured)
-        self.watch = watch
         self.planner = Planner()
         self.joints = HOME.copy()
         self.sensor: Sensor = SENSOR
         self._rng = rng
-        self._kinds = list(parts)
         self._meshes = {
             name: (MILLIMETRE * part.solid[0], part.solid[1])
             for name, part in parts.items()
         }
-        self._steps = 0
         self._build(parts, rng)
         self._rays = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(
             -1, 3
@@ -442,13 +530,9 @@ class Cell:
 
     def wait(self, seconds: float) -> None:
         """Let time pass."""
-        every = round(0.1 / TIMESTEP)
         for _ in range(round(seconds / TIMESTEP)):
             self.data.ctrl[:7] = self.joints
             mujoco.mj_step(self.model, self.data)
-            self._steps += 1
-            if self._steps % every == 0:
-                self.watch()
 
     def settle(self) -> None:
         """Wait until the parts lie still."""
@@ -510,22 +594,21 @@ class Cell:
             (np.abs(places - centre) < inside[:2] / 2).all(1)
         ).tolist()
 
-    def things(self) -> list[tuple[Any, np.ndarray]]:
-        """All that can be seen: triangles and colour, (3,); first the parts, by row."""
+    def things(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """All that can be seen: vertices, (N, 3), and faces, (F, 3); first the parts, by row."""
         found = []
         for row, name in enumerate(self.names):
             vertices, faces = self._meshes[name]
             pose = self.pose_of(row)
             placed = vertices @ pose[:3, :3].T + pose[:3, 3]
-            colour = COLOURS[self._kinds.index(name) % len(COLOURS)]
-            found.append(((placed, faces.astype(np.int32)), colour))
+            found.append((placed, faces.astype(np.int32)))
         model, data = self.model, self.data
         for k in range(model.ngeom):
             if model.geom_group[k] > 2 or model.geom_bodyid[k] in self._parts:
                 continue
             vertices, faces = triangles_of(model, k, mujoco)
             placed = vertices @ data.geom_xmat[k].reshape(3, 3).T + data.geom_xpos[k]
-            found.append(((placed, faces), model.geom_rgba[k, :3].astype(float)))
+            found.append((placed, faces))
         return found
 
     # Camera
@@ -546,7 +629,7 @@ class Cell:
         turn = Rotation.from_rotvec(rng.normal(0, SENSOR.turned, 3), degrees=True)
         true[:3, :3] = pose[:3, :3] @ turn.as_matrix()
         true[:3, 3] += rng.normal(0, SENSOR.moved, 3)
-        caster = RayCaster([triangles for triangles, _ in self.things()])
+        caster = RayCaster(self.things())
         depth, owner = caster.cast(true[:3, 3], self._rays @ true[:3, :3].T)
         depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         measured, source = SENSOR.measure(depth.reshape(SENSOR.shape), rng)

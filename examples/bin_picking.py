@@ -1,7 +1,7 @@
 """A Panda empties a bin of machine parts: look, choose a part, grasp it, drop it into a box.
 
-pip install './research[arm]'
-python examples/bin_picking.py [--parts 12] [--seed 0] [--film picking.gif]
+pip install './lab[arm]'
+python examples/bin_picking.py [--parts 12] [--seed 0]
 
 Parts of five generated kinds (``bin_parts.py``) are taught and poured into a bin (``bin_cell.py``).
 The camera on the wrist looks from above, and from elsewhere while no grasp is free; what is held is
@@ -14,7 +14,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -34,7 +34,7 @@ from nextview.sensing.object_frame import Box
 if TYPE_CHECKING:
     from bin_cell import Cell
 
-NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
+NEEDED = ("mujoco", "mink", "gymnasium_robotics")
 ACCURACY = (
     1.0,
     0.1,
@@ -125,7 +125,6 @@ class Picker:
         cell: the robot, the bin and the box.
         system: that knows the parts.
         grasps: of each part, by its name.
-        looked: is called after each frame.
     """
 
     def __init__(
@@ -133,14 +132,12 @@ class Picker:
         cell: Cell,
         system: nextview.System,
         grasps: Mapping[str, Sequence[Grasp]],
-        looked: Callable[[nextview.Scene], None] = lambda scene: None,
     ) -> None:
         from bin_cell import BIN, BIN_INSIDE
 
         self.cell = cell
         self.system = system
         self.grasps = grasps
-        self.looked = looked
         half = np.array([*BIN_INSIDE[:2] / 2, 0])
         middle = np.array([*BIN, 0.0])
         top = np.array([0, 0, ROOM_ABOVE])
@@ -204,7 +201,6 @@ class Picker:
             self._motions.clear()
             free = scene.grasps(self.grasps, GRIPPER, self.can_grasp, most=1)
             self.thinking += time.process_time() - begin
-            self.looked(scene)
             if free:
                 return scene, free[0]
             if len(scene.frames) >= MOST_LOOKS or (scene.done and not scene.objects):
@@ -316,22 +312,19 @@ def table(picker: Picker, poured: int) -> str:
 def main(
     parts: int = 12,
     seed: int = 0,
-    film: Path | None = None,
 ) -> None:
     """Empty a bin.
 
     Args:
         parts: number of parts in the bin.
         seed: of their kinds and places, and of all errors.
-        film: GIF that is written; one of that name is replaced.
     """
     for package in NEEDED:
         if find_spec(package) is None:
             raise MissingExtraError(
-                f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'"
+                f"{sys.argv[0]} needs the package {package}: pip install './lab[arm]'"
             )
     from bin_cell import Cell
-    from films import BinFilm
 
     with tempfile.TemporaryDirectory() as folder:
         system, grasps = teach(Path(folder))
@@ -339,12 +332,10 @@ def main(
     known = bin_parts()
     poured = [str(name) for name in rng.choice(sorted(known), parts)]
     cell = Cell(known, poured, rng)
-    shown = BinFilm(cell, film)
-    picker = Picker(cell, system, grasps, shown.looked)
+    picker = Picker(cell, system, grasps)
     poured_in = len(picker.still_inside)
     picker.run()
     print(table(picker, poured_in))
-    shown.save()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECTS = {
     "nextview": (".", "src"),
     "nextview-lab": ("lab", "lab/src"),
-    "nextview-research": ("research", "."),
 }
 COMMANDS = {"nextview": "nextview_command", "nextview-lab": "nextview_lab_command"}
 
@@ -37,8 +36,7 @@ def empty_environment(folder: Path) -> tuple[Path, Path]:
 
 
 def asked_for(
-    requirements: Iterable[tuple[str, str]],
-    found: Found | None = None,
+    requirements: Iterable[tuple[str, str]], found: Found | None = None
 ) -> Found:
     """The installed distributions that requirements need, theirs included.
 
@@ -87,8 +85,7 @@ def link(installed: Distribution, packages: Path) -> None:
 
 
 def installation(
-    folder: Path,
-    projects: Mapping[str, Iterable[str]] = {"nextview": ()},
+    folder: Path, projects: Mapping[str, Iterable[str]] = {"nextview": ()}
 ) -> Path:
     """Make an environment in which this clone is installed, with its commands; returns its Python.
 

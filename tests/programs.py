@@ -1,31 +1,17 @@
-"""Run a command line in this process, by the program that has the command."""
+"""Run a command line in this process."""
 
 from collections.abc import Sequence
 
-from nextview.cli.commands import LAB, NEXTVIEW
+from nextview.cli.commands import NEXTVIEW
 from nextview.cli.main import run
-from nextview_lab.cli.commands import LABORATORY
 
-PROGRAMS = (NEXTVIEW, LABORATORY)
-COMMANDS = {  # by how they are called, such as "nextview-lab train map"
-    f"{program.name} {name}": command
-    for program in PROGRAMS
-    for name, command in program.commands.items()
-}
+COMMANDS = {f"nextview {name}": command for name, command in NEXTVIEW.commands.items()}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run ``nextview`` or ``nextview-lab``; a command that both have is that of ``nextview``.
-
-    Args:
-        arguments: of the command; the name of the program may stand before them.
-    """
-    named = {program.name: program for program in PROGRAMS}
-    first, *rest = arguments or ("",)
-    if first in named:
-        run(named[first], rest)
-    else:
-        run(LABORATORY if first in LAB else NEXTVIEW, list(arguments))
+    """Run ``nextview``; the name of the program may stand before the arguments."""
+    named = list(arguments[:1]) == [NEXTVIEW.name]
+    run(NEXTVIEW, list(arguments[1:] if named else arguments))
 
 
 def called(line: str) -> None:

@@ -6,12 +6,7 @@ from io import BytesIO
 
 import numpy as np
 from PIL import Image
-from rosbags.rosbag2 import (
-    CompressionFormat,
-    CompressionMode,
-    StoragePlugin,
-    Writer,
-)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -33,9 +28,7 @@ def message(kind, **fields):
 
 def header(frame, time=12.5):
     stamp = message(
-        "builtin_interfaces/msg/Time",
-        sec=int(time),
-        nanosec=round(1e9 * (time % 1)),
+        "builtin_interfaces/msg/Time", sec=int(time), nanosec=round(1e9 * (time % 1))
     )
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
@@ -47,9 +40,7 @@ def image_message(depth, encoding, big=False, padding=0, **more):
     )
     rows = np.ascontiguousarray(depth, kind).view(np.uint8)
     rows = np.pad(
-        rows.reshape(len(depth), -1),
-        ((0, 0), (0, padding)),
-        constant_values=7,
+        rows.reshape(len(depth), -1), ((0, 0), (0, padding)), constant_values=7
     )
     fields = {
         "height": depth.shape[0],
@@ -100,9 +91,7 @@ def transform_message(pose, child="optical", time=12.5, parent="world"):
     )
     rotation = message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
     transform = message(
-        "geometry_msgs/msg/Transform",
-        translation=translation,
-        rotation=rotation,
+        "geometry_msgs/msg/Transform", translation=translation, rotation=rotation
     )
     fields = {
         "header": header(parent, time),

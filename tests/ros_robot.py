@@ -21,13 +21,13 @@ pytest.importorskip("nextview_msgs")
 PACKAGE = Path(__file__).parents[1] / "ros2" / "nextview_ros"
 sys.path.insert(0, str(PACKAGE))
 
+from factories import pose_at
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped
 from moveit_msgs.msg import PlanningScene
 from nextview_msgs.action import LookUntilSettled, Recognise
 from nextview_msgs.srv import Learn
 from nextview_ros.conversion import fill_transform
 from nextview_ros.node import LATCHED, NextviewNode
-from pipeline import pose_at
 from rclpy.action import ActionClient
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
@@ -71,11 +71,7 @@ class Robot(Node):
     """
 
     def __init__(
-        self,
-        see: Callable,
-        k: np.ndarray,
-        start: dict[str, np.ndarray],
-        **options,
+        self, see: Callable, k: np.ndarray, start: dict[str, np.ndarray], **options
     ):
         super().__init__("robot", **options)
         self.see, self.k, self.start = see, k, start

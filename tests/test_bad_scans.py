@@ -53,9 +53,7 @@ def with_holes(scan: trimesh.Trimesh) -> trimesh.Trimesh:
 def shell(scan: trimesh.Trimesh) -> trimesh.Trimesh:
     """What a scanner above a table saw of it: nothing of what points down."""
     return trimesh.Trimesh(
-        scan.vertices,
-        scan.faces[scan.face_normals[:, 2] > -0.5],
-        process=False,
+        scan.vertices, scan.faces[scan.face_normals[:, 2] > -0.5], process=False
     )
 
 
@@ -67,8 +65,7 @@ def double_walled(scan: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize(
-    "fault",
-    [inverted, half_inverted, with_holes, shell, double_walled],
+    "fault", [inverted, half_inverted, with_holes, shell, double_walled]
 )
 @pytest.mark.parametrize("thing", [0, 1])
 def test_a_scan_with_faults_is_recognised(thing, fault):
@@ -114,9 +111,7 @@ def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(thing, share):
     if share < 0.2:
         assert found.belief.argmax() == thing
         degrees, _ = off_by(
-            found.poses[0],
-            true_pose(things[thing], YAW),
-            things[thing].centre,
+            found.poses[0], true_pose(things[thing], YAW), things[thing].centre
         )
         if thing == 1:
             degrees = min(degrees, 180 - degrees)  # the same upside down

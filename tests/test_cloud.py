@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chisquare
 
 from nextview.geometry.depth import CLOUD_POINTS, visible_points
 from nextview.geometry.observation import pinhole
@@ -17,9 +16,7 @@ POSES = ViewSphere.named("40").poses
 
 
 def unprojected(
-    depth: np.ndarray,
-    pose: np.ndarray,
-    intrinsics: np.ndarray,
+    depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
     """The point under every pixel, one after the other, object frame, (H, W, 3)."""
     points = np.zeros((*depth.shape, 3))
@@ -30,9 +27,7 @@ def unprojected(
 
 
 def pixels_of(
-    points: np.ndarray,
-    pose: np.ndarray,
-    intrinsics: np.ndarray,
+    points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
     """(row, column) in which each point appears."""
     seen = (points - pose[:3, 3]) @ pose[:3, :3] @ intrinsics.T
@@ -56,9 +51,7 @@ def test_every_point_is_under_a_visible_pixel(share, view):
     row, column = pixels_of(points, POSES[view], intrinsics).T
     assert (depth[row, column] > 0).all()
     np.testing.assert_allclose(
-        points,
-        unprojected(depth, POSES[view], intrinsics)[row, column],
-        atol=1e-6,
+        points, unprojected(depth, POSES[view], intrinsics)[row, column], atol=1e-6
     )
 
 
@@ -73,27 +66,10 @@ def test_pixels_are_drawn_without_replacement_and_repeat_evenly_when_few(visible
         assert (points == 0).all()
         return
     drawn, times = np.unique(
-        pixels_of(points, POSES[10], intrinsics),
-        axis=0,
-        return_counts=True,
+        pixels_of(points, POSES[10], intrinsics), axis=0, return_counts=True
     )
     assert len(drawn) == min(visible, CLOUD_POINTS)
     assert np.ptp(times) <= 1
-
-
-def test_every_visible_pixel_has_the_same_chance():
-    depth, intrinsics = np.full((48, 48), 3.0, np.float32), pinhole(48, 3.0)
-    drawn = np.zeros((4, 4))
-    for seed in range(60):
-        row, column = pixels_of(
-            visible_points(depth, POSES[0], intrinsics, seed),
-            POSES[0],
-            intrinsics,
-        ).T
-        np.add.at(drawn, (row // 12, column // 12), 1)
-    # Without replacement the counts vary less than in chisquare's model: a p-value near 0 would
-    # still tell of a bias.
-    assert chisquare(drawn.ravel()).pvalue > 1e-3
 
 
 # What the map networks are given
@@ -108,9 +84,7 @@ def test_clouds_are_scaled_by_their_own_global_extent():
     for cloud, raw in zip(clouds, points, strict=True):
         assert (cloud.min(), cloud.max()) == (0, 1)
         np.testing.assert_allclose(
-            cloud,
-            np.interp(raw, [raw.min(), raw.max()], [0, 1]),
-            atol=1e-5,
+            cloud, np.interp(raw, [raw.min(), raw.max()], [0, 1]), atol=1e-5
         )
 
 
@@ -122,20 +96,6 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
     turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     ahead = cloud_input(points.astype(np.float32), look_at_origin([elevation], [0.0]))
     found = cloud_input(
-        turned.astype(np.float32),
-        look_at_origin([elevation], [azimuth]),
+        turned.astype(np.float32), look_at_origin([elevation], [azimuth])
     )
     np.testing.assert_allclose(found, ahead, atol=1e-5)
-
-
-def test_the_camera_stands_at_azimuth_zero():
-    # A marker towards the camera has the largest x, one on the camera's right the largest y, one
-    # above the largest z.
-    for azimuth in np.linspace(0, 6, 7):
-        pose = look_at_origin(0.0, azimuth)
-        towards, right, up = -pose[:3, 2], pose[:3, 0], -pose[:3, 1]
-        cloud = cloud_input(
-            np.stack([towards, right, up])[None].astype(np.float32),
-            pose[None],
-        )[0]
-        assert cloud.argmax(0).tolist() == [0, 1, 2]

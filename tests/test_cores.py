@@ -1,16 +1,12 @@
 """How many cores are used: one setting, on which no answer depends."""
 
-import os
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from programs import COMMANDS, called, main
-from small_tables import camera_over, meshes_of, view
+from factories import camera_over, meshes_of, view
+from programs import main
 
 import nextview
-from nextview.cores import CORES, cores, limit_blas
-from nextview.data import pool
+from nextview.cores import CORES, cores
 from nextview.data.samples import sample_mesh
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
@@ -22,15 +18,6 @@ from nextview.things.view_templates import ViewTemplates
 COUNTS = (1, 2, 5)
 
 
-def test_by_default_there_are_as_many_as_the_process_may_use(monkeypatch):
-    monkeypatch.delenv(CORES, raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {3, 7, 8})
-    monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    assert (cores(), pool.count(None), pool.count(2)) == (3, 3, 2)
-    monkeypatch.setenv(CORES, " 11 ")
-    assert (cores(), pool.count(None), pool.count(2)) == (11, 11, 2)
-
-
 @pytest.mark.parametrize("wrong", ["0", "-2", "2.5", "all", "99999"])
 def test_what_is_no_number_of_cores_is_refused(monkeypatch, capsys, wrong):
     monkeypatch.setenv(CORES, wrong)
@@ -39,35 +26,6 @@ def test_what_is_no_number_of_cores_is_refused(monkeypatch, capsys, wrong):
     with pytest.raises(SystemExit):
         main(["recognise", "nothing.off"])
     assert "NEXTVIEW_CORES" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "nextview look",
-        "nextview learn",
-        "nextview explore",
-        "nextview-lab benchmark things",
-    ],
-)
-def test_the_help_of_what_computes_names_the_setting(capsys, command):
-    with pytest.raises(SystemExit):
-        called(f"{command} --help")
-    assert CORES in capsys.readouterr().out
-    assert COMMANDS[command].computes
-    assert not COMMANDS["nextview completion"].computes
-
-
-def test_matrix_products_of_a_command_are_limited(monkeypatch):
-    asked = []
-    blas = SimpleNamespace(threadpool_limits=lambda *limit: asked.append(limit))
-    monkeypatch.setitem(__import__("sys").modules, "threadpoolctl", blas)
-    monkeypatch.delenv(CORES, raising=False)
-    limit_blas()
-    assert not asked
-    monkeypatch.setenv(CORES, "4")
-    limit_blas()
-    assert asked == [(4, "blas")]
 
 
 def with_each_count(monkeypatch, answer):

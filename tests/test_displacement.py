@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.displacement import displacement
-from nextview.sensing.lean import FRAME_LEAN, lean_of
+from nextview.sensing.lean import lean_of
 from nextview.sensing.planes import Plane
 from nextview.session.pose_frame import PoseFrame
 
@@ -212,29 +212,10 @@ def test_depth_that_leans_every_plane_with_the_camera_is_no_lean(turns, forward,
     assert not found.noticed
 
 
-def test_from_all_sides_the_lean_is_the_mean():
-    """From opposite sides what the camera errs cancels: what is left is the mean, nearly exact."""
-    poses = [pose_at(40, azimuth, 0.5) for azimuth in range(0, 360, 45)]
-    lean = np.array([0.03, -0.02])
-    error = [0.02 * pose[:2, 2] / np.linalg.norm(pose[:2, 2]) for pose in poses]
-    found = lean_of([plane_of(lean + e) for e in error], poses, np.eye(3))
-    np.testing.assert_allclose(found.lean, lean, atol=1e-4)
-    assert found.deviation == pytest.approx(FRAME_LEAN / np.sqrt(len(poses)), rel=0.01)
-
-
-def test_frames_that_disagree_say_less_of_the_lean():
-    poses = [pose_at(40, azimuth, 0.5) for azimuth in (0, 120, 240)]
-    alike = [plane_of((0.03, 0))] * 3
-    scattered = [plane_of(lean) for lean in ((0.09, 0), (0, -0.06), (0, 0.06))]
-    assert lean_of(alike, poses, np.eye(3)).noticed
-    assert not lean_of(scattered, poses, np.eye(3)).noticed
-    noisy = [replace(plane, lean_error=0.03) for plane in alike]
-    assert not lean_of(noisy, poses, np.eye(3)).noticed
-
-
 # In a session
 
 
+@pytest.mark.long
 def test_what_is_allowed_for_takes_no_certainty():
     """A nudged taught thing is named with confidence, and the result warns of the nudge."""
     session = nextview.load("ycb", max_views=3, threshold=1.0).session(

@@ -35,11 +35,7 @@ def test_the_example_of_a_name_runs(name, tmp_path, monkeypatch):
         "Path": Path,
     }
     test = doctest.DocTestParser().get_doctest(
-        inspect.getdoc(found) or "",
-        names,
-        name,
-        module.__file__,
-        None,
+        inspect.getdoc(found) or "", names, name, module.__file__, None
     )
     run = [example for example in test.examples if doctest.SKIP not in example.options]
     assert test.examples if name in NOT_RUN else run, (

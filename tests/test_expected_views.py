@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.errors import PolicyError, UsageError
+from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import (
@@ -18,7 +18,7 @@ from nextview.geometry.viewsphere import (
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
-from nextview.session.ranked import camera_poses, rank_views
+from nextview.session.ranked import rank_views
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
@@ -306,20 +306,6 @@ def test_without_informative_views_the_farthest_view_is_chosen():
     np.testing.assert_allclose(values[0], free[0] - 0.3)
 
 
-def test_a_policy_without_known_geometry_says_so():
-    state = EpisodeState(
-        current=np.zeros(1, np.int64),
-        visited=np.zeros((1, 40), bool),
-        belief=np.ones((1, 1)),
-        evidence=Evidence(np.zeros((1, 1))),
-        step=1,
-    )
-    with pytest.raises(PolicyError, match="needs things of known geometry"):
-        DiscriminateGeometry(SPHERE).view_values(state)
-    with pytest.raises(PolicyError, match="travel weight"):
-        DiscriminateGeometry(SPHERE, travel_weight=-1.0)
-
-
 def test_an_outlook_combines_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
     verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)])
@@ -350,20 +336,6 @@ def test_an_outlook_combines_the_views_and_the_verifier():
     assert around.obstacles[:, 0].min() > 1.6 * metres
 
 
-def test_views_cannot_be_predicted_without_geometry():
-    visited = np.arange(40) == 0
-    state = EpisodeState(
-        current=np.zeros(1, np.int64),
-        visited=visited[None],
-        belief=np.ones((1, 1)),
-        evidence=Evidence(np.zeros((1, 1))),
-        step=1,
-        outlook=[None],
-    )
-    chosen = DiscriminateGeometry(SPHERE).next_views(state, np.random.default_rng(0))[0]
-    assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
-
-
 def test_poses_of_a_robot_are_ranked():
     outlook = outlook_of((0.5, 0.5))
     behind, aside, ahead = (
@@ -381,39 +353,6 @@ def test_poses_of_a_robot_are_ranked():
     assert rank_views(outlook, inside[:0], inside[:0], np.arange(0), "thing") == ()
     with pytest.raises(UsageError, match="the goal is thing or pose, not 'name'"):
         rank_views(outlook, inside, inside, np.arange(3), "name")
-
-
-@pytest.mark.parametrize(
-    ("poses", "what"),
-    [
-        (np.eye(4), r"\(V, 4, 4\), not \(4, 4\)"),
-        ("here", r"camera-to-world matrices"),
-        (np.zeros((2, 4, 4)), "pose 0 of those to rank: the last row"),
-        (
-            np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]),
-            "pose 1 of those to rank: .*mirrored",
-        ),
-        (np.full((1, 4, 4), np.nan), "pose 0 of those to rank"),
-        (np.zeros((0, 4, 4)), "camera-to-world matrices"),
-    ],
-)
-def test_an_invalid_list_of_poses_is_rejected(poses, what):
-    with pytest.raises(UsageError, match=what):
-        camera_poses(poses)
-
-
-def test_words_name_the_rivals_and_how_much_is_settled():
-    found = knob_or_not((0.6, 0.4))
-    best = int(found.information().argmax())
-    worst = int(found.information().argmin())
-    names = ("box", "knob")
-    assert found.words(best, names).startswith(
-        "would settle box or knob: they differ in "
-    )
-    assert found.words(worst, names).startswith("would tell little of box or knob")
-    alone = expected(np.zeros((1, 1, 1)), (1.0,), (1,))
-    assert alone.words(0, names) == "there is no rival of knob"
-    assert found.told_apart(best) == (0, 1)
 
 
 def half_a_wall() -> MeasuredDepth:

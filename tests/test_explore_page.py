@@ -1,8 +1,6 @@
 """The explorer's page, driven from Python."""
 
-import gzip
 import http.client
-import re
 import time
 from contextlib import closing
 
@@ -15,8 +13,7 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from nextview.data.samples import sample_mesh
-from nextview.viewers.exploration import Exploration, ShownObject, shown_objects
+from nextview.viewers.exploration import Exploration, shown_objects
 from nextview.viewers.page import NO_ANSWER, Page
 
 PATIENCE = 60_000
@@ -69,31 +66,6 @@ def test_what_is_chosen_is_done_and_shown(page):
         "a view from where the camera was let go",
     )
     assert not page._preview.visible
-
-
-def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
-    shown = ShownObject(
-        "<img src=x>", lambda: sample_mesh("chair"), "<img src=x onerror=alert(1)>"
-    )
-    page = Page(Exploration([shown], sensor="mix:0.5", threads=1), port=8790)
-    try:
-        assert (page._sensor.value, page._strength.value) == ("mix", 0.5)
-        assert "&lt;img src=x onerror=alert(1)&gt;" in page._label.content
-        assert "<img" not in page._label.content
-    finally:
-        page.stop()
-
-
-@pytest.mark.parametrize("encoding", ["identity", "gzip"])
-def test_the_tab_of_the_browser_says_whose_page_it_is(page, encoding):
-    port = page.server.get_port()
-    with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
-        connection.request("GET", "/", headers={"Accept-Encoding": encoding})
-        with connection.getresponse() as response:
-            body = response.read()
-            assert response.headers["Content-Encoding"] == encoding
-    shown = (gzip.decompress(body) if encoding == "gzip" else body).decode()
-    assert re.findall(r"<title>(.*?)</title>", shown) == ["nextview explore"]
 
 
 def sockets(page, **headers):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from factories import ball_depth, rays
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import ball_depth, rays
 
 from nextview.data.samples import sample_mesh
 from nextview.geometry.observation import pinhole
@@ -24,10 +24,7 @@ STEP = 1 / 127
 def channels_of(depth: np.ndarray, pose: np.ndarray) -> dict[str, np.ndarray]:
     """The channels in their own scale; NaN where there is background."""
     coded = geometry_input(
-        depth[None].astype(np.float32),
-        pose[None],
-        INTRINSICS,
-        SIZE,
+        depth[None].astype(np.float32), pose[None], INTRINSICS, SIZE
     )[0]
     values = np.where(coded > 0, (coded.astype(float) - 1) / 127 - 1, np.nan)
     named = dict(zip(CHANNELS, values, strict=True))
@@ -69,10 +66,7 @@ def test_the_ball():
             # Positions are exact; a normal is taken over one pixel's width, on a curved surface.
             limit = STEP if name in ("height", "nearness") else 0.03
             np.testing.assert_allclose(
-                found[name][inner],
-                expected[inner],
-                atol=limit,
-                err_msg=name,
+                found[name][inner], expected[inner], atol=limit, err_msg=name
             )
 
 
@@ -101,10 +95,7 @@ def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
             inside &= expected["facing"] > 0.3
         limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
         np.testing.assert_allclose(
-            found[name][inside],
-            expected[name][inside],
-            atol=limit,
-            err_msg=name,
+            found[name][inside], expected[name][inside], atol=limit, err_msg=name
         )
 
 
@@ -119,14 +110,10 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
 
     def slope(axis):
         back = np.where(
-            np.roll(depth, 1, axis) > 0,
-            depth - np.roll(depth, 1, axis),
-            np.inf,
+            np.roll(depth, 1, axis) > 0, depth - np.roll(depth, 1, axis), np.inf
         )
         forth = np.where(
-            np.roll(depth, -1, axis) > 0,
-            np.roll(depth, -1, axis) - depth,
-            np.inf,
+            np.roll(depth, -1, axis) > 0, np.roll(depth, -1, axis) - depth, np.inf
         )
         least = np.where(np.abs(back) < np.abs(forth), back, forth)
         return np.where(np.isfinite(least), least, 0).astype(np.float32)
@@ -134,9 +121,7 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     focal = np.float32(focal)
     across, down = slope(2), slope(1)
     x = ((np.arange(depth.shape[2]) + 0.5 - centre) / focal).astype(np.float32)[
-        None,
-        None,
-        :,
+        None, None, :
     ]
     y = x.reshape(1, -1, 1)
     through = depth / focal + x * across + y * down
@@ -148,9 +133,7 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     nearness = np.linalg.norm(origin, axis=1)[:, None, None] - depth
     channels = np.stack([2 * facing - 1, up, height, nearness], 1)
     return np.where(
-        depth[:, None] > 0,
-        1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5,
-        0,
+        depth[:, None] > 0, 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5, 0
     ).astype(np.uint8)
 
 

@@ -4,9 +4,16 @@ import pickle
 
 import numpy as np
 import pytest
-from pipeline import box
+from factories import (
+    SimulatedTable,
+    TableCamera,
+    box,
+    leaning,
+    meshes_of,
+    poses_around,
+    view,
+)
 from scipy.spatial.transform import Rotation
-from small_tables import leaning, meshes_of, view
 
 import nextview
 from nextview.errors import ModelError, ObservationError
@@ -14,7 +21,6 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.sensing import Frame, ObservedObject
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 PLACE = np.array([0.1, 0.0, 0.35])  # of the thing, above a table
 SENSOR = SENSORS["stereo"]
@@ -124,6 +130,7 @@ def named(scene, name):
     )
 
 
+@pytest.mark.long
 def test_a_thing_that_leans_is_confident_in_a_scene_of_any_orientation(leans, ycb):
     frames, truth = leans
     resting = nextview.Scene(ycb)

@@ -5,7 +5,7 @@ and what is not.
 import numpy as np
 import pytest
 import trimesh
-from pipeline import box
+from factories import box
 
 import nextview
 from nextview.teaching.learn import learn

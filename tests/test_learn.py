@@ -3,44 +3,31 @@ recognises them then.
 """
 
 import shutil
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from pipeline import refused, write_off
+from factories import SimulatedTable, TableCamera, poses_around, refused, write_off
 from scipy.special import logsumexp
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.errors import NextviewError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
-from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
-from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
+from nextview.recognition.belief import Calibration, log_evidence_of, reorient
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.sensor import SENSORS
-from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.learn import learn
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
-from nextview.viewers.card import preview_card, walk_card
-from nextview.viewers.exploration import Exploration, remembered_picture, shown_objects
-from nextview_lab.benchmark.replay import make_specs, replay, truncate
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 THINGS = ("chair", "monitor", "table")
 FORTY = ViewSphere.named("40")
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_taught_things_are_recognised_through_a_sensor(taught, scans):
@@ -53,70 +40,14 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
         np.testing.assert_allclose(result.views[-1].belief.sum(), 1)
 
 
-def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans):
-    exploration = Exploration(
-        shown_objects(scans / "chair.off"),
-        models=taught,
-        start=11,
-        threads=1,
-    )
-    walk = exploration.walks[0]
-    assert walk.rivals is None
-    walk.step()
-    rivals, belief = walk.rivals, walk.views[0].belief
-    np.testing.assert_array_equal(rivals.classes, np.argsort(-belief)[:2])
-    view = 33
-    assert FORTY.azimuth[view] == pytest.approx(
-        2 * np.pi / AZIMUTHS * rivals.azimuths[0, view]
-    )
-    (name, picture), (other, _) = walk.remembered(rivals, view)
-    assert (name, other) == tuple(walk.system.classes[c] for c in rivals.classes)
-    pose = look_at_origin(np.radians(RINGS[rivals.rings[view]]), FORTY.azimuth[view])
-    seen = SimulatedCamera(load_mesh(scans / "chair.off"), 64).observe(pose)
-    np.testing.assert_array_equal(picture, seen.picture)
-    shown = walk_card(walk)
-    assert f"as view {walk.next_view} would show them" in shown
-    assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
-    assert f"The two likeliest, as view {view} would show them" in preview_card(
-        seen,
-        walk,
-    )
-    # its meshes are not here, but their surfaces
-    bundled = nextview.load(models="ycb", threads=1).models.recogniser
-    thing = bundled.memory.thing[40]
-    surface = bundled.memory.surfaces.surface(
-        thing,
-        bundled.card.memory.things[thing].name,
-    )
-    standing = rotated(
-        make_mesh(surface.vertices, surface.faces),
-        bundled.memory.rotations[40].astype(float),
-    )
-    drawn = SimulatedCamera(standing, 64).observe(
-        look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS)
-    )
-    np.testing.assert_array_equal(remembered_picture(bundled, 40, 1, 3), drawn.picture)
-
-
-def test_predictions_of_taught_things_replay_with_their_policy(taught, shown):
-    specs = make_specs(Predictions.load(shown / "predictions.npz"), 4, 0)
-    for policy in ("random-all", str(taught / "memory.json")):
-        ends = truncate(replay(policy, specs, 3, 0), Stopping(0.999, 3))
-        assert (ends.answer == specs.labels).mean() > 0.9
-
-
 def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
-    tmp_path,
-    taught,
-    scans,
-    capsys,
+    tmp_path, taught, scans, capsys
 ):
     more, models = tmp_path / "more", tmp_path / "models"
     more.mkdir()
     shutil.copytree(taught, models)
     slab = make_mesh(
-        sample_mesh("table").vertices * (1, 0.2, 1),
-        sample_mesh("table").faces,
+        sample_mesh("table").vertices * (1, 0.2, 1), sample_mesh("table").faces
     )
     write_off(more / "bench.off", slab)
     before = open_memory(taught / "memory.json")[1]
@@ -124,35 +55,27 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
     card = read_card(models / "memory.json")
     assert card.classes == ("bench", *THINGS)
     np.testing.assert_array_equal(
-        open_memory(card.card_path)[1].views[1:],
-        before.views,
+        open_memory(card.card_path)[1].views[1:], before.views
     )
     learn(models, models, remove=("bench",))
     card = read_card(models / "memory.json")
     assert card.classes == THINGS
     np.testing.assert_array_equal(
-        open_memory(card.card_path)[1].held_out,
-        before.held_out,
+        open_memory(card.card_path)[1].held_out, before.held_out
     )
     alone = learn(models, models, remove=THINGS[1:]).notes[0]
     assert f"whatever is shown is {THINGS[0]} or unknown" in alone
-    with pytest.raises(UsageError, match="knows nothing called 'mug'"):
+    with pytest.raises(UsageError):
         learn(models, models, remove=("mug",))
-    with pytest.raises(UsageError, match=r"chair is known already"):
+    with pytest.raises(UsageError):
         learn(scans, models, add=True)
     assert "already knows things; --add adds others, --overwrite" in refused(
-        capsys,
-        "learn",
-        str(scans),
-        str(models),
+        capsys, "learn", str(scans), str(models)
     )
 
 
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
-    tmp_path,
-    knobs,
-    knobs_memory,
-    taught_afresh,
+    tmp_path, knobs, knobs_memory, taught_afresh
 ):
     again = []
 
@@ -184,46 +107,6 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 
-def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(
-    tmp_path,
-    scans,
-    capsys,
-):
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert "holds no mesh" in refused(
-        capsys,
-        "learn",
-        str(empty),
-        str(tmp_path / "out"),
-    )
-    (empty / "view.png").write_bytes(b"")
-    assert "holds no mesh" in refused(
-        capsys,
-        "learn",
-        str(empty),
-        str(tmp_path / "out"),
-    )
-    mixed = tmp_path / "mixed"
-    mixed.mkdir()
-    for name in ("chair", "seat"):
-        shutil.copy(scans / "chair.off", mixed / f"{name}.off")
-    (mixed / "broken.off").write_text("OFF\n3 1 0\n0 0 0\n")
-    small = load_mesh(scans / "chair.off")
-    write_off(mixed / "small.off", replace(small, vertices=small.vertices / 1000))
-    how = {"unit": "cm", "upright": True, "workers": 0}
-    with pytest.raises(
-        DatasetError,
-        match=r"small\.off: is .* times smaller than most others; is it in another unit",
-    ):
-        learn(mixed, tmp_path / "out", **how)
-    found = learn(mixed, tmp_path / "out", any_size=True, **how)
-    assert found.things == 3
-    assert any("chair and seat look the same" in note for note in found.notes)
-    assert [phrase for phrase in found.left_out if "broken.off" in phrase]
-    assert "broken" in str(found)
-
-
 def test_what_lies_too_flat_for_depth_is_told_when_it_is_taught(tmp_path):
     scans = tmp_path / "scans"
     scans.mkdir()
@@ -250,24 +133,6 @@ def test_what_lies_too_flat_for_depth_is_told_when_it_is_taught(tmp_path):
         assert len(scene.objects) == count
 
 
-def test_classes_of_several_things_and_one_alone(tmp_path, scans):
-    folder = tmp_path / "classes"
-    for name, stretch in (("chair", 0.8), ("chair", 1.2), ("monitor", 1.0)):
-        mesh = sample_mesh(name)
-        write_off(
-            folder / name / f"{name}_{stretch}.off",
-            make_mesh(mesh.vertices * (1, stretch, 1), mesh.faces),
-        )
-    found = learn(folder, tmp_path / "two", upright=True, workers=0)
-    assert (found.things, found.classes) == (3, 2)
-    assert found.accuracy[2] > 0.9  # by the other things of the class
-    assert read_card(tmp_path / "two/memory.json").calibration.hypotheses == (
-        0,
-        0,
-        1,
-    )
-
-
 def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
     rng = np.random.default_rng(0)
     calibration = Calibration(1.0, 1.0, None, 0.4, (0, 0, 1, 2, 2, 2))
@@ -288,9 +153,7 @@ def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
     np.testing.assert_allclose(np.log(belief), by_hand - logsumexp(by_hand), atol=1e-9)
     marginal = joint.sum(1)
     np.testing.assert_allclose(
-        [marginal[:2].sum(), marginal[2], marginal[3:].sum()],
-        belief,
-        atol=1e-12,
+        [marginal[:2].sum(), marginal[2], marginal[3:].sum()], belief, atol=1e-12
     )
     with pytest.raises(NextviewError, match="not of every class"):
         Calibration(hypotheses=(0, 2))
@@ -302,9 +165,7 @@ def test_similarity_is_a_cosine_between_rings_interpolated():
     seen = rng.normal(size=(2, 5)).astype(np.float32)
     found = similarities(by_ring(views), seen, np.radians([27.0, 80.0]))
     np.testing.assert_allclose(
-        found[0],
-        (views[:, 1] + views[:, 2]) @ seen[0] / 2,
-        rtol=1e-4,
+        found[0], (views[:, 1] + views[:, 2]) @ seen[0] / 2, rtol=1e-4
     )
     np.testing.assert_allclose(found[1], views[:, 4] @ seen[1], rtol=1e-4)
 
@@ -347,12 +208,7 @@ def test_the_policy_goes_where_two_things_differ(place):
     visited = np.arange(40)[None] == current
     evidence = Evidence(np.zeros((1, 2)))
     state = EpisodeState(
-        np.array([current]),
-        visited,
-        np.full((1, 2), 0.5),
-        evidence,
-        1,
-        joint=joint,
+        np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint
     )
     assert policy.next_views(state, np.random.default_rng(0)).tolist() == [place]
     rivals = policy.rivals(joint[0], FORTY.azimuth[current])

@@ -15,7 +15,6 @@ from programs import main
 
 import nextview.teaching.learn as teaching
 from nextview import learn
-from nextview.data.progress import silently
 from nextview.errors import DatasetError, UsageError
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
@@ -81,18 +80,6 @@ def test_frames_meshes_and_classes_are_found_together(tmp_path):
     )
 
 
-def test_what_is_for_tests_is_not_taught(tmp_path):
-    scans_in(tmp_path, "cup/train/a.ply", "cup/test/b.ply", "box.ply")
-    found = find_things(tmp_path)
-    assert [thing.name for thing in found.things] == ["box", "a"]
-    assert found.left_out == ["cup/test/b.ply: of the split test"]
-    with pytest.raises(
-        DatasetError,
-        match=r"holds no mesh .*; left out: a\.step: of a format that is not read",
-    ):
-        find_things(scans_in(tmp_path / "drawings", "a.step"))
-
-
 @pytest.mark.parametrize(
     ("places", "inside"),
     [
@@ -114,25 +101,6 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
     assert learn(root, tmp_path / "mine", one_class=True, workers=0).classes == 1
 
 
-def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickly):
-    learn(
-        scans_in(tmp_path / "first", "box.ply", "tin.ply"),
-        tmp_path / "mine",
-        workers=0,
-    )
-    learned = learn(
-        scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"),
-        tmp_path / "mine",
-        add=True,
-        workers=0,
-    )
-    assert (learned.things, learned.classes) == (4, 3)
-    assert [
-        thing.label
-        for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things
-    ] == ["cup"]
-
-
 @pytest.mark.parametrize(
     ("option", "value"),
     [
@@ -149,10 +117,7 @@ def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickl
     ],
 )
 def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
-    tmp_path,
-    monkeypatch,
-    option,
-    value,
+    tmp_path, monkeypatch, option, value
 ):
     def teach(*arguments):
         raise AssertionError("a thing was taught")
@@ -161,63 +126,16 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
     scans_in(tmp_path / "things", "box.ply", "tin.ply")
     with pytest.raises(UsageError, match=re.escape(str(value).rpartition(":")[2])):
         learn(
-            tmp_path / "things",
-            tmp_path / "mine",
-            **({"workers": 0} | {option: value}),
+            tmp_path / "things", tmp_path / "mine", **({"workers": 0} | {option: value})
         )
     assert not (tmp_path / "mine").exists()
 
 
-@pytest.mark.parametrize(
-    ("folder", "out"),
-    [(".", "mine"), ("../things", "."), ("../things", "../things/mine")],
-)
-def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
-    tmp_path,
-    monkeypatch,
-    capsys,
-    quickly,
-    folder,
-    out,
-):
-    scans_in(tmp_path / "things", "box.ply", "tin.ply")
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path / ("things" if folder == "." else "empty"))
-    for again in ([], ["--overwrite"]):
-        main(["learn", folder, out, "--workers", "0", *again])
-        assert read_card(Path(out) / "memory.json").classes == ("box", "tin")
-    printed = " ".join("".join(capsys.readouterr()).split())
-    assert f"in {folder}: 2 meshes" in printed
-    assert ("mine: is where the result goes" in printed) == (out != ".")
-
-
-def test_from_python_it_tells_how_far_it_is_and_how_a_memory_is_replaced(
-    tmp_path,
-    capsys,
-    quickly,
-):
-    root = scans_in(tmp_path / "things", "box.ply", "tin.ply")
-    out = tmp_path / "mine"
-    learn(root, out, workers=0)
-    assert "teaching things: 2 to do\n" in capsys.readouterr().err
-    with pytest.raises(UsageError, match=r"add=True adds others, overwrite=True"):
-        learn(root, out, workers=0)
-    assert capsys.readouterr().err == ""
-
-    (root / "tin.ply").unlink()
-    learn(root, out, workers=0, overwrite=True, track=silently)
-    assert capsys.readouterr().err == ""
-    assert read_card(out / "memory.json").classes == ("box",)
-
-
 @pytest.mark.skipif(
-    sys.platform != "linux",
-    reason="names of files are bytes on Linux alone",
+    sys.platform != "linux", reason="names of files are bytes on Linux alone"
 )
 def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(
-    tmp_path,
-    quickly,
-    capsys,
+    tmp_path, quickly, capsys
 ):
     long = "n" * 251
     root = scans_in(tmp_path / "things", "box.ply", f"{long}.ply", "tin.ply")
@@ -257,14 +175,10 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
 
 
 @pytest.mark.parametrize(
-    ("count", "shown"),
-    [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)],
+    ("count", "shown"), [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)]
 )
 def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(
-    tmp_path,
-    monkeypatch,
-    count,
-    shown,
+    tmp_path, monkeypatch, count, shown
 ):
     pages = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: pages.append(self))

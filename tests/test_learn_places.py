@@ -8,19 +8,14 @@ import shutil
 
 import numpy as np
 import pytest
-from pipeline import SAMPLE_FILES
+from factories import SAMPLE_FILES
 
-from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
+from nextview.errors import DatasetError, ModelError, ResultsError
 from nextview.files import MARKER, new_folder, only_one
-from nextview.geometry.viewsphere import ViewSphere
-from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.teaching import learn as module
 from nextview.teaching.learn import learn
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
-from nextview_lab.data.predicting import predict
-from nextview_lab.data.writing import write_capture
 
 
 @pytest.fixture
@@ -83,16 +78,10 @@ def contents(folder):
 RUNS = {
     "add": lambda place: learn(place / "more", place / "mine", add=True, workers=0),
     "remove": lambda place: learn(
-        place / "mine",
-        place / "mine",
-        remove=("box",),
-        workers=0,
+        place / "mine", place / "mine", remove=("box",), workers=0
     ),
     "overwrite": lambda place: learn(
-        place / "more",
-        place / "mine",
-        overwrite=True,
-        workers=0,
+        place / "more", place / "mine", overwrite=True, workers=0
     ),
 }
 AFTER = {"add": ["ball", "box", "cup"], "remove": ["ball"], "overwrite": ["cup"]}
@@ -105,47 +94,17 @@ def link_away(path, place):
     return target
 
 
-@pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
-def test_an_output_path_that_is_a_link_is_rejected_early(
-    place,
-    looked_at,
-    run,
-    linked,
-):
+@pytest.mark.parametrize(
+    ("run", "linked"),
+    [("add", "memory.json"), ("remove", "learned.png"), ("overwrite", ".")],
+)
+def test_an_output_path_that_is_a_link_is_rejected_early(place, looked_at, run, linked):
     link_away(place / "mine" / linked if linked != "." else place / "mine", place)
     before = contents(place)
-    with pytest.raises(ResultsError, match="is a link; give what it points to"):
+    with pytest.raises(ResultsError):
         RUNS[run](place)
     assert contents(place) == before
     assert not looked_at
-    assert known(place / "mine") == ["ball", "box"]
-
-
-@pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("layout", ["now", "earlier"])
-def test_linked_weights_are_replaced_and_the_link_target_is_kept(
-    place,
-    run,
-    layout,
-):
-    weights = read_card(place / "mine/memory.json").path
-    if layout == "earlier":
-        weights = weights.rename(place / "mine/memory.safetensors")
-    target = link_away(weights, place)
-    content = target.read_bytes()
-    assert known(place / "mine") == ["ball", "box"]
-    RUNS[run](place)
-    assert known(place / "mine") == AFTER[run]
-    assert not weights.is_symlink()
-    assert target.read_bytes() == content
-
-
-def test_the_very_same_memory_again_keeps_its_file_though_that_is_a_link(place):
-    weights = read_card(place / "mine/memory.json").path
-    target = link_away(weights, place)
-    learn(place / "first", place / "mine", overwrite=True, workers=0)
-    assert weights.readlink() == target
     assert known(place / "mine") == ["ball", "box"]
 
 
@@ -173,46 +132,10 @@ def test_foreign_files_next_to_the_output_are_kept(place, run):
     }
 
 
-def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
-    (tmp_path / ".p.npz.part").mkdir()
-    (tmp_path / ".p.npz.part/thesis.txt").write_text("mine")
-    list(
-        predict(
-            views,
-            tmp_path / "p.npz",
-            read_card(models / "tiny.json"),
-            {},
-            "test",
-            workers=0,
-        )
-    )
-    assert {path.name for path in tmp_path.iterdir()} == {".p.npz.part", "p.npz"}
-    assert (tmp_path / ".p.npz.part/thesis.txt").read_text() == "mine"
-
-
-def test_a_lock_file_of_another_program_is_respected(tmp_path):
-    (tmp_path / ".mine.lock").write_text("poetry")
-    with (
-        pytest.raises(
-            DatasetError,
-            match=r"cannot be written while \S+/\.mine\.lock is there",
-        ),
-        only_one(tmp_path / "mine"),
-    ):
-        pass
-    assert (tmp_path / ".mine.lock").read_text() == "poetry"
-
-
-def test_concurrent_runs_are_rejected_without_loss_of_data(
-    place,
-    monkeypatch,
-):
+def test_concurrent_runs_are_rejected_without_loss_of_data(place, monkeypatch):
     shutil.copytree(place / "more", place / "third")
     (place / "third/cup.off").rename(place / "third/jug.off")
-    with (
-        only_one(place / "mine"),
-        pytest.raises(DatasetError, match="another run is writing it"),
-    ):
+    with only_one(place / "mine"), pytest.raises(DatasetError):
         learn(place / "more", place / "mine", add=True, workers=0)
 
     find = module.find_things
@@ -236,23 +159,11 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
     about["memory"]["features_sha256"] = "0" * 64
     card.write_text(json.dumps(about))
     before = contents(place / "mine")
-    with pytest.raises(
-        ModelError,
-        match=r"^\S+/memory\.json: was taught with other features",
-    ):
+    with pytest.raises(ModelError):
         RUNS[run](place)
     assert contents(place / "mine") == before
     assert not looked_at
     assert {path.name for path in place.iterdir()} == {"first", "more", "mine"}
-
-
-def test_an_empty_memory_is_not_written(place):
-    with pytest.raises(
-        UsageError,
-        match="no thing would be left; delete the folder instead",
-    ):
-        learn(place / "mine", place / "mine", remove=("box", "ball"), workers=0)
-    assert known(place / "mine") == ["ball", "box"]
 
 
 CHANGES = {
@@ -280,9 +191,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_frames_that_were_changed_in_place_are_processed_again(
-    tmp_path,
-    looked_at,
-    what,
+    tmp_path, looked_at, what
 ):
     folder = tmp_path / "scans/thing"
     (folder / "depth").mkdir(parents=True)
@@ -325,37 +234,9 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
     (out / "linked").symlink_to(tmp_path / "away")
     before = contents(out)
     for taken in ("b", "linked/x.txt"):
-        with (
-            pytest.raises(ResultsError, match=r"is a (folder|link)"),
-            new_folder(out, overwrite=True) as part,
-        ):
+        with pytest.raises(ResultsError), new_folder(out, overwrite=True) as part:
             for name in ("a.txt", "c.txt", taken):
                 (part / name).parent.mkdir(exist_ok=True)
                 (part / name).write_text("new")
         assert contents(out) == before
     assert not any((tmp_path / "away").iterdir())
-
-
-@pytest.mark.parametrize(
-    "image",
-    ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"],
-)
-def test_capture_rejects_a_folder_with_conflicting_images(
-    tmp_path,
-    image,
-):
-    sphere = ViewSphere((30.0,), 3)
-    (tmp_path / image).parent.mkdir()
-    (tmp_path / image).write_bytes(b"mine")
-    with pytest.raises(ResultsError, match="would be taken for one of the new views"):
-        list(
-            write_capture(
-                sample_mesh("chair"),
-                tmp_path,
-                sphere,
-                0.4,
-                masks=False,
-                overwrite=True,
-            )
-        )
-    assert contents(tmp_path) == {image: b"mine"}

@@ -5,7 +5,6 @@ one sentence.
 import json
 import re
 import shutil
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +16,8 @@ from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
-from nextview.recognition.model_card import find_models, read_card
-from nextview.things.memory import open_memory, taught_meshes
+from nextview.recognition.model_card import read_card
+from nextview.things.memory import open_memory
 from nextview.things.recogniser import open_recogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
@@ -49,22 +48,26 @@ def features():
     return Features(threads=1)
 
 
-def rewrite(models, change):
-    """Change the arrays of a memory; the card has the new hash, and the file's name of earlier
+def open_weights(models):
+    return load_file(read_card(models / "memory.json").path)
+
+
+def write_weights(models, arrays):
+    """Replace the arrays of a memory; the card has the new hash, and the file's name of earlier
     versions.
     """
-    card = models / "memory.json"
-    weights = read_card(card).path
-    arrays = load_file(weights)
-    change(arrays)
-    weights.unlink()
-    weights = models / "memory.safetensors"
-    save_file(
-        {name: np.array(values, order="C") for name, values in arrays.items()},
-        weights,
-    )
+    weights, card = models / "memory.safetensors", models / "memory.json"
+    ordered = {name: np.array(values, order="C") for name, values in arrays.items()}
+    save_file(ordered, weights)
     about = json.loads(card.read_text())
     card.write_text(json.dumps(about | {"sha256": sha256_of(weights)}))
+
+
+def rewrite(models, change):
+    """Change the arrays of a memory."""
+    arrays = open_weights(models)
+    change(arrays)
+    write_weights(models, arrays)
 
 
 def with_value(values, value):
@@ -91,75 +94,40 @@ OF_EACH = {
 OF_FLOATS = {
     "NaN": lambda values: with_value(values, np.nan),
     "infinite": lambda values: with_value(values, np.inf),
-    "minus infinite": lambda values: with_value(values, -np.inf),
 }
 OF_ONE = {
     ("views", "twice as long"): lambda values: values * 2,
-    ("views", "half as long"): lambda values: values / 2,
-    ("held_out", "half as long"): lambda values: values / 2,
     ("rotations", "mirrored"): lambda values: -values,
     ("rotations", "sheared"): lambda values: (
         values + np.eye(3, k=1, dtype=np.float32) / 10
     ),
-    ("rotations", "zero"): lambda values: values * 0,
     ("held_out_views", "in degrees"): np.degrees,
     ("radii", "negative"): lambda values: values * 0 - 0.1,
-    ("radii", "zero"): lambda values: np.zeros_like(values),
     ("radii", "finite, but absurd"): lambda values: values * 0 + 1e30,
-    ("head", "finite, but absurd"): lambda values: with_value(values, -1e30),
     ("head", "too large in all of a column"): lambda values: (
         values * 0 + 701 / np.sqrt(len(values))
     ),
     ("head_bias", "finite, but absurd"): lambda values: with_value(values, 1e30),
-    ("thing", "negative"): lambda values: values - 1,
     ("thing", "beyond the last"): lambda values: values + 1,
-    ("thing", "all one"): lambda values: values * 0,
     ("thing", "descending"): lambda values: values[::-1],
     ("faces", "beyond the last"): lambda values: with_value(values, len(values)),
-    ("faces", "signed"): lambda values: values.astype(np.int32),
     ("places", "of floats"): lambda values: values.astype(np.float32),
     ("places", "all in one corner"): lambda values: values * 0 + np.uint16(65535),
-    ("places", "in half of the box"): lambda values: values // 2,
     ("faces", "all of one vertex"): lambda values: values * 0,
     ("counts", "negative"): lambda values: values * (-1, 1),
-    ("counts", "of other things"): lambda values: values[::-1],
-    ("counts", "without faces"): lambda values: values * (1, 0),
     ("counts", "beyond all numbers"): lambda values: values * 0 + 2**62,
     ("boxes", "mirrored"): lambda values: -values,
-    ("boxes", "far away"): lambda values: values + 1e5,
     ("boxes", "without extent"): lambda values: values * 0,
-}
-
-
-AXES = {
-    "views": 4,
-    "held_out": 3,
-    "held_out_views": 3,
-    "rotations": 3,
-    "pictures": 3,
-    "head": 2,
-    "places": 2,
-    "faces": 2,
-    "counts": 2,
-    "boxes": 3,
 }
 
 
 def array_mutations():
     for name in ARRAYS:
+        yield name, "one less", lambda values: values[:-1]
+        yield name, "one more", lambda values: lengthened(values, 0)
+        yield name, "gone", lambda values: None
         for how, change in OF_EACH.items():
             yield name, how, change
-        for axis in range(AXES.get(name, 1)):
-            yield (
-                name,
-                f"one less along axis {axis}",
-                lambda values, axis=axis: np.delete(values, -1, axis),
-            )
-            yield (
-                name,
-                f"one more along axis {axis}",
-                lambda values, axis=axis: lengthened(values, axis),
-            )
     for name in FLOATS:
         for how, change in OF_FLOATS.items():
             yield name, how, change
@@ -167,51 +135,25 @@ def array_mutations():
         yield name, how, change
 
 
-@pytest.mark.parametrize(
-    ("name", "how", "change"),
-    [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()],
-)
-def test_every_array_is_checked(models, name, how, change):
-    rewrite(models, lambda arrays: arrays.update({name: change(arrays[name])}))
-    with pytest.raises(
-        ModelError,
-        match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+",
-    ):
-        open_memory(models / "memory.json")
-
-
-@pytest.mark.parametrize("name", ARRAYS)
-def test_every_array_has_to_be_there(models, name):
-    rewrite(models, lambda arrays: arrays.pop(name))
-    with pytest.raises(
-        ModelError,
-        match=rf"memory\.safetensors: not a memory \(it holds no {name}\)",
-    ):
-        open_memory(models / "memory.json")
-
-
-def test_a_memory_of_an_earlier_version_is_rejected_with_advice(
-    models,
-):
-    rewrite(
-        models,
-        lambda arrays: [
-            arrays.pop(name) for name in ("places", "faces", "counts", "boxes")
-        ],
-    )
-    with pytest.raises(
-        ModelError,
-        match=r"memory\.safetensors: is of an earlier version; teach it again",
-    ):
-        open_memory(models / "memory.json")
+@pytest.mark.parametrize("array", ARRAYS)
+def test_every_array_is_checked(models, array):
+    card, weights = (models / "memory.json").read_bytes(), open_weights(models)
+    for name, how, change in array_mutations():
+        if name == array:
+            changed = change(weights[name])
+            arrays = {key: values for key, values in weights.items() if key != name}
+            write_weights(models, arrays | ({} if changed is None else {name: changed}))
+            with pytest.raises(ModelError):
+                open_memory(models / "memory.json")
+                pytest.fail(how)
+            (models / "memory.json").write_bytes(card)
 
 
 def fewer_features(arrays):
     for name in ("views", "held_out"):
         kept = arrays[name].astype(np.float32)[..., :-1]
         arrays[name] = kept / np.maximum(
-            np.linalg.norm(kept, axis=-1, keepdims=True),
-            1e-9,
+            np.linalg.norm(kept, axis=-1, keepdims=True), 1e-9
         )
     arrays["head"] = arrays["head"][:-1]
 
@@ -247,17 +189,14 @@ def fewer_things(arrays):
     ],
 )
 def test_arrays_that_fit_together_have_to_fit_card_and_features(
-    models,
-    change,
-    sentence,
+    models, change, sentence
 ):
     rewrite(models, change)
     with pytest.raises(
-        ModelError,
-        match=rf"^\S+/mine/memory\.safetensors: {re.escape(sentence)}",
+        ModelError, match=rf"^\S+/mine/memory\.safetensors: {re.escape(sentence)}"
     ):
         open_recogniser(models / "memory.json")
-    with pytest.raises(ModelError, match=r"memory\.safetensors"):
+    with pytest.raises(ModelError):
         nextview.learn(models, models, remove=("block",))
 
 
@@ -291,99 +230,65 @@ VERIFIED = {
 }
 REFUSED = {
     "one class more": set_at("classes", lambda names: [*names, "mug"]),
-    "one class less": set_at("classes", lambda names: names[:-1]),
-    "a class twice": set_at("classes", lambda names: [*names[:-1], names[0]]),
     "no azimuth bins": set_at("azimuth_bins", 0),
-    "other azimuth bins": set_at("azimuth_bins", 8),
     "other input": set_at("input", {"kind": "geometry", "size": 64}),
     "a map network": set_at("kind", "lem"),
     "one hypothesis more": set_at("calibration/hypotheses", lambda h: [*h, h[-1]]),
-    "one hypothesis less": set_at("calibration/hypotheses", lambda h: h[:-1]),
     "no hypotheses": set_at("calibration/hypotheses", []),
-    "a negative hypothesis": set_at("calibration/hypotheses", lambda h: [-1, *h[1:]]),
     "no calibration": lambda about: about.pop("calibration"),
     "no calibration of the bins": lambda about: about["calibration"].pop(
         "bin_correlation"
     ),
     "negative correlation": set_at("calibration/bin_correlation", -0.1),
-    "absurd correlation": set_at("calibration/bin_correlation", 1e30),
     "a temperature of next to nothing": set_at("calibration/temperature", 1e-30),
-    "an absurd temperature": set_at("calibration/temperature", 1e30),
     "endless densities of sizes": set_at("size/log_density/0/0", 1e300),
-    "an endless score": set_at("scores", {"accuracy": -1e300}),
     "sizes of one class less": set_at("size/log_density", lambda rows: rows[:-1]),
-    "ragged sizes": set_at("size/log_density/0", lambda row: row[:-1]),
     "descending sizes": set_at("size/radii_m", lambda radii: radii[::-1]),
-    "negative weight of sizes": set_at("size/weight", -1.0),
     "one thing more": set_at("memory/things", lambda t: [*t, t[-1] | {"name": "mug"}]),
-    "one thing less": set_at("memory/things", lambda t: t[:-1]),
     "a thing twice": set_at("memory/things", lambda t: [*t[:-1], t[0]]),
     "no things": set_at("memory/things", []),
     "a thing without a name": set_at("memory/things/0/name", ""),
-    "no poses": set_at("memory/things/0/poses", 0),
     "negative poses": set_at("memory/things/0/poses", -1),
-    "one pose more": set_at("memory/things/0/poses", 2),
     "other features": set_at("memory/features_sha256", "0" * 64),
-    "no hash": set_at("memory/features_sha256", ""),
     "no weight": set_at("memory/weight", 0.0),
-    "negative weight": set_at("memory/weight", -30.0),
     "endless weight": set_at("memory/weight", 1e300),
     "an empty row of novelty": set_at("memory/novelty", [[]]),
-    "one level of novelty": set_at(
-        "memory/novelty", lambda rows: [row[:1] for row in rows]
-    ),
     "ragged novelty": set_at("memory/novelty/0", lambda row: row[:-1]),
-    "descending novelty": set_at("memory/novelty/0", lambda row: row[::-1]),
     "novelty of text": set_at("memory/novelty/0/0", "NaN"),
-    "novelty of nothing": set_at("memory/novelty/0/0", None),
     "an empty row of usual": set_at("memory/usual", [[]]),
-    "ragged usual": set_at("memory/usual/0", lambda row: row[:-1]),
     "usual of one class more": set_at(
         "memory/usual", lambda rows: [[*row, 0.0] for row in rows]
     ),
     "a symmetry of order one": set_at(
-        "memory/things/0/symmetries",
-        [{"axis": [0, 0, 1], "order": 1}],
-    ),
-    "a symmetry of negative order": set_at(
-        "memory/things/0/symmetries",
-        [{"axis": [0, 0, 1], "order": -2}],
+        "memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": 1}]
     ),
     "a symmetry about no axis": set_at(
-        "memory/things/0/symmetries",
-        [{"axis": [0, 0, 0], "order": 2}],
-    ),
-    "a symmetry about half an axis": set_at(
-        "memory/things/0/symmetries",
-        [{"axis": [0, 1], "order": 2}],
+        "memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]
     ),
     "negative weights": set_at(
-        "memory/verification",
-        {"weights": {"geometry": -1}, "things": 3},
+        "memory/verification", {"weights": {"geometry": -1}, "things": 3}
     ),
     "descending residuals": set_at(
-        "memory/verification",
-        VERIFIED | {"excess": [[0.2, 0.1]]},
+        "memory/verification", VERIFIED | {"excess": [[0.2, 0.1]]}
     ),
     "no residuals": set_at("memory/verification", VERIFIED | {"excess": [[]]}),
-    "half of the residuals": set_at("memory/verification", VERIFIED | {"excess": []}),
     "residuals of one thing less": set_at(
-        "memory/verification",
-        VERIFIED | {"usual": [0.1]},
+        "memory/verification", VERIFIED | {"usual": [0.1]}
     ),
     "an unknown field": set_at("memory/things/0/colour", "red"),
 }
 
 
-@pytest.mark.parametrize("how", REFUSED)
-def test_a_card_that_does_not_fit_is_refused_by_its_name(models, how):
-    change = REFUSED[how]
-    card = changed_card(
-        models,
-        lambda about: change(Missing(about) if how == "an unknown field" else about),
-    )
-    with pytest.raises(ModelError, match=r"^\S+/mine/memory\.(json|safetensors): .+"):
-        open_recogniser(card)
+def test_a_card_that_does_not_fit_is_refused_by_its_name(models):
+    card = models / "memory.json"
+    content = card.read_text()
+    for how, change in REFUSED.items():
+        about = json.loads(content)
+        change(Missing(about) if how == "an unknown field" else about)
+        card.write_text(json.dumps(about))
+        with pytest.raises(ModelError):
+            open_recogniser(card)
+            pytest.fail(how)
 
 
 class Missing(dict):
@@ -391,90 +296,14 @@ class Missing(dict):
         return self.get(key)
 
 
-def fields_of(value, path=()):
-    """The paths of all fields of a card, of long lists the first and the last."""
-    if path:
-        yield path
-    if isinstance(value, dict):
-        for key, inside in value.items():
-            yield from fields_of(inside, (*path, key))
-    elif isinstance(value, list):
-        for index in {0, len(value) - 1} if value else ():
-            yield from fields_of(value[index], (*path, index))
-
-
-def holder(about, path):
-    for key in path[:-1]:
-        about = about[key]
-    return about
-
-
-VALUES = {
-    "null": lambda value: None,
-    "text": lambda value: "\x00",
-    "number": lambda value: -1,
-    "large": lambda value: 10**30,
-    "not a number": lambda value: np.nan,
-    "list": lambda value: [],
-    "object": lambda value: {},
-    "shorter": lambda value: (
-        value[:-1] if isinstance(value, list | str) and value else {}
-    ),
-    "longer": lambda value: (
-        [*value, value[-1]] if isinstance(value, list) and value else [[]]
-    ),
-}
-
-
-@pytest.mark.parametrize("how", ["dropped", *VALUES])
-def test_any_other_field_is_refused_by_name_or_the_memory_works(
-    models,
-    features,
-    monkeypatch,
-    how,
-):
-    monkeypatch.setattr("nextview.things.memory.Features", lambda threads: features)
-    card = models / "memory.json"
-    original = json.loads(card.read_text())
-    refused = 0
-    for path in fields_of(original):
-        about = deepcopy(original)
-        where = holder(about, path)
-        if how == "dropped":
-            del where[path[-1]]
-        else:
-            where[path[-1]] = VALUES[how](where[path[-1]])
-        card.write_text(json.dumps(about))
-        sentence = None
-        try:
-            recogniser = open_recogniser(find_models(models).recogniser)
-        except ModelError as error:
-            sentence = str(error)
-        if sentence is not None:
-            assert re.match(r"\S+/mine\S*: .+", sentence), (path, sentence)
-            refused += 1
-            continue
-        seen = recogniser.memory.held_out[:, 0].astype(np.float32)
-        evidence = recogniser.evidence(seen, recogniser.memory.held_out_views[:, 0, 0])
-        assert np.isfinite(evidence.logits).all(), path
-        assert np.isfinite(evidence.azimuth_bins).all(), path
-        if recogniser.novelty is not None:
-            score = recogniser.novelty.of_belief(np.zeros(2), 1)
-            assert 0 <= recogniser.novelty.of_views([score]) <= 1, path
-    assert refused > 20
-
-
 def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
-    knobs_memory,
-    knobs,
+    knobs_memory, knobs
 ):
     things = TaughtThings.of(open_recogniser(knobs_memory / "memory.json"))
     meshes = {path.stem: load_mesh(path, unit="m") for path in sorted(knobs.iterdir())}
     assert things.names == tuple(meshes)
     for surface, mesh in zip(
-        things.verifier.caster.surfaces,
-        meshes.values(),
-        strict=True,
+        things.verifier.caster.surfaces, meshes.values(), strict=True
     ):
         in_file = mesh.vertices * mesh.radius + mesh.centre
         step = np.ptp(in_file, axis=0).max() / 65535
@@ -482,36 +311,19 @@ def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
         np.testing.assert_array_equal(surface.faces, mesh.faces)
 
 
-def test_things_of_known_geometry_hold_no_features(knobs_memory):
-    card, memory = open_memory(knobs_memory / "memory.json")
-    assert card.memory.features_sha256 is None
-    assert not memory.has_features
-    assert memory.views.size == memory.held_out.size == 0
-
-
-def test_removing_from_a_memory_without_features_shows_nothing_and_says_so(
-    knobs_memory, tmp_path
-):
-    mine = shutil.copytree(knobs_memory, tmp_path / "mine")
-    learned = nextview.learn(mine, mine, remove=("can",), workers=0)
-    assert learned.accuracy == ()
-    assert str(learned).splitlines()[0] == "2 things learned"
-    assert (mine / "learned.png").stat().st_size > 0
-
-
 def test_a_card_says_whether_there_are_features(knobs_memory, mixed_memory, tmp_path):
     features = read_card(mixed_memory / "memory.json").memory.features_sha256
     said = shutil.copytree(knobs_memory, tmp_path / "said")
     set_features = set_at("memory/features_sha256", features)
     card = changed_card(said, set_features)
-    with pytest.raises(ModelError, match="a memory of views has a calibration"):
+    with pytest.raises(ModelError):
         open_memory(card)
     denied = shutil.copytree(mixed_memory, tmp_path / "denied")
     card = changed_card(denied, set_at("memory/features_sha256", None))
-    with pytest.raises(ModelError, match="has 16 azimuth bins, not 0"):
+    with pytest.raises(ModelError):
         open_memory(card)
     card = changed_card(denied, set_at("azimuth_bins", 0))
-    with pytest.raises(ModelError, match="holds features, and its card"):
+    with pytest.raises(ModelError):
         open_memory(card)
 
 
@@ -530,25 +342,6 @@ def test_things_get_features_when_one_is_added_that_needs_them(
     assert memory.surfaces.counts[1].tolist() == before.surfaces.counts[knob].tolist()
 
 
-def test_things_of_unknown_size_hold_no_geometry(taught):
-    assert TaughtThings.of(open_recogniser(taught / "memory.json")) is None
-
-
-def test_a_size_that_is_no_number_is_damage_and_not_an_unknown_size(taught, tmp_path):
-    """Also of things without geometry, whose unit of length nobody said."""
-    models = shutil.copytree(taught, tmp_path / "mine")
-    _, memory = open_memory(models / "memory.json")
-    assert np.isnan(memory.radii).all()
-    rewrite(models, lambda arrays: None)
-    assert np.isnan(open_memory(models / "memory.json")[1].radii).all()
-    rewrite(
-        models,
-        lambda arrays: arrays.update(radii=with_value(arrays["radii"], np.nan)),
-    )
-    with pytest.raises(ModelError, match="its radii are not all numbers"):
-        open_memory(models / "memory.json")
-
-
 def test_weights_and_residuals_are_those_on_the_card(models):
     card = changed_card(models, set_at("memory/verification", VERIFIED))
     things = TaughtThings.of(open_recogniser(card))
@@ -557,32 +350,13 @@ def test_weights_and_residuals_are_those_on_the_card(models):
     assert things.residuals.p_value(0.1, 0, 1) == pytest.approx(2 / 3)
 
 
-@pytest.mark.parametrize(
-    ("weights", "sentence"),
-    [
-        ({"colour": 1.0}, "colour"),
-        ({"doubt": 2.0}, "doubt"),
-        ({"correlation": 1.5}, "correlation"),
-    ],
-)
-def test_invalid_weights_are_rejected(models, weights, sentence):
-    card = changed_card(
-        models,
-        set_at("memory/verification", VERIFIED | {"weights": weights}),
-    )
-    with pytest.raises(ModelError, match=rf"mine/memory\.json: .*{sentence}"):
-        TaughtThings.of(open_recogniser(card))
-
-
 def square(size, origin, name="square"):
     corners = (
         np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32) * size
         + origin
     )
     return Surface(
-        name,
-        corners.astype(np.float32),
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        name, corners.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     )
 
 
@@ -597,21 +371,6 @@ def test_stored_surfaces_come_back_as_they_were(many):
     for number, surface in ((0, square(0.3, (1, 2, 3))), (2, cloud)):
         again = stored.surface(number, surface.name)
         np.testing.assert_allclose(
-            again.vertices,
-            surface.vertices,
-            atol=np.ptp(points) / 65535,
+            again.vertices, surface.vertices, atol=np.ptp(points) / 65535
         )
         np.testing.assert_array_equal(again.faces, surface.faces)
-
-
-def test_the_surfaces_of_things_are_meshes_in_metres(knobs_memory):
-    path = knobs_memory / "memory.json"
-    card, memory = open_memory(path)
-    name = card.memory.things[-1].name
-    surface = memory.surfaces.surface(len(card.memory.things) - 1, name)
-    (mesh,) = taught_meshes(path, [name])
-    assert mesh.name == name
-    extent = np.ptp(mesh.vertices, axis=0) * mesh.radius
-    np.testing.assert_allclose(extent, np.ptp(surface.vertices, axis=0), atol=1e-6)
-    with pytest.raises(ModelError, match="knows no mugg; did you mean 'mug'"):
-        taught_meshes("ycb", ["mugg"])

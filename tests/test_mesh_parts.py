@@ -4,21 +4,16 @@ their origin.
 
 import itertools
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-import nextview
-from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.errors import MeshError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
-from nextview.geometry.mesh_parts import mesh_doubts, thickness
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.mesh_parts import mesh_doubts
 from nextview.teaching import thing_views
-from nextview_lab.data.rendering import RenderOptions, render
-from nextview_lab.data.store import ViewStore
 
 NOISE = np.random.default_rng(0)
 
@@ -94,8 +89,7 @@ SCANS = {
 }
 
 
-@pytest.mark.parametrize("turn", [False, True])
-@pytest.mark.parametrize("kind", ["ply", "stl"])
+@pytest.mark.parametrize(("kind", "turn"), [("ply", True), ("stl", False)])
 @pytest.mark.parametrize("name", SCANS)
 def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, turn):
     parts, connected, sentence = SCANS[name]
@@ -136,15 +130,6 @@ def test_a_base_plate_is_asked_about_however_the_scan_is_turned():
         assert len(set(doubts)) == 1  # also how many times as large it is
 
 
-@pytest.mark.parametrize("points", [4, 40])
-def test_the_thickness_of_points_is_that_of_the_thinnest_slab(points):
-    cloud = np.random.default_rng(points).normal(size=(points, 2)) * (3, 1)
-    angles = np.linspace(0, np.pi, 20_000)
-    slabs = np.ptp(cloud @ np.stack([np.cos(angles), np.sin(angles)]), axis=0)
-    assert thickness(cloud) == pytest.approx(slabs.min(), rel=1e-3)
-    assert thickness(np.stack([cloud[:, 0], cloud[:, 0]], 1)) == pytest.approx(0)
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -177,32 +162,6 @@ def test_nothing_is_asked_about_an_object(shape):
     assert mesh_doubts(np.asarray(shape.vertices), np.asarray(shape.faces)) == ()
 
 
-def test_a_plate_alone_is_its_own_largest_part(tmp_path):
-    path = saved(
-        tmp_path / "plate.ply",
-        joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0))),
-    )
-    assert len(load_mesh(path, largest_part=True).faces) == len(disc(0.2).faces)
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"],
-)
-def test_a_broken_file_is_refused_with_the_option_too(tmp_path, content):
-    (tmp_path / "broken.obj").write_text(content)
-    with pytest.raises(MeshError, match=r"broken\.obj: .*vert"):
-        load_mesh(tmp_path / "broken.obj", largest_part=True)
-
-
-def test_a_mesh_of_one_part_is_the_same_with_the_option(tmp_path):
-    path = saved(tmp_path / "egg.ply", thing())
-    plain = load_mesh(path)
-    taken = load_mesh(path, largest_part=True)
-    np.testing.assert_array_equal(taken.vertices, plain.vertices)
-    assert taken.notes == ()
-
-
 @pytest.mark.parametrize(("unit", "radius"), [("m", 70), ("mm", 0.5)])
 def test_an_odd_size_is_asked_about(unit, radius):
     egg = thing(radius)
@@ -218,127 +177,22 @@ def test_an_odd_size_is_asked_about(unit, radius):
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "obj"])
 @pytest.mark.parametrize(
-    ("offset", "lost"),
-    [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)],
+    ("offset", "lost"), [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)]
 )
 def test_a_scan_far_from_its_origin_in_single_precision(tmp_path, kind, offset, lost):
     egg = thing()
     egg.vertices = (egg.vertices + np.array((offset, 10, -20))).astype(np.float32)
     path = saved(tmp_path / f"far.{kind}", egg)
     if lost:
-        with pytest.raises(
-            MeshError,
-            match=r"far\.\w+: .*(single precision has steps of .* has lost its shape|no extent)",
-        ):
+        with pytest.raises(MeshError):
             load_mesh(path)
     else:
         assert load_mesh(path).radius == pytest.approx(
-            make_mesh(thing().vertices, thing().faces).radius,
-            rel=0.05,
+            make_mesh(thing().vertices, thing().faces).radius, rel=0.05
         )
-
-
-@pytest.mark.parametrize(
-    "exact",
-    [True, False],
-    ids=["whole metres", "double precision"],
-)
-def test_a_building_in_a_country_s_coordinates_has_its_shape(tmp_path, exact):
-    house = trimesh.creation.box((8, 6, 4)).apply_translation(
-        (0 if exact else 0.123, 0, 0)
-    )
-    house.vertices += (4_400_004, 5_300_003, 2)
-    text = "".join("v {!r} {!r} {!r}\n".format(*map(float, p)) for p in house.vertices)
-    text += "".join("f {} {} {}\n".format(*(face + 1)) for face in house.faces)
-    (tmp_path / "house.obj").write_text(text)
-    assert load_mesh(tmp_path / "house.obj").radius == pytest.approx(np.sqrt(116) / 2)
 
 
 # The option everywhere
-
-
-def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
-    scans = tmp_path / "scans" / "eggs"
-    scans.mkdir(parents=True)
-    saved(scans / "one.ply", joined(thing(), disc(0.4)))
-    radii = []
-    for largest in (False, True):
-        options = RenderOptions(largest_part=largest)
-        done = dict(
-            render(
-                scans.parent,
-                tmp_path / f"{largest}.zarr",
-                ViewSphere.named("12"),
-                32,
-                options,
-                workers=0,
-            )
-        )
-        assert list(done.values()) == [None]
-        radii.append(
-            float(ViewStore.open(tmp_path / f"{largest}.zarr").array("radius")[0])
-        )
-    assert radii[0] / radii[1] == pytest.approx(0.4 / 0.065, rel=0.2)
-    with pytest.raises(DatasetError, match="begun with other largest_part"):
-        list(
-            render(
-                scans.parent,
-                tmp_path / "False.zarr",
-                ViewSphere.named("12"),
-                32,
-                options,
-                workers=0,
-            )
-        )
-    with pytest.raises(UsageError, match="scenes are rendered as they are"):
-        list(
-            render(
-                scans.parent,
-                tmp_path / "x.zarr",
-                ViewSphere.named("12"),
-                32,
-                replace(options, meshes=scans),
-            )
-        )
-
-
-def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("nextview_lab.data.rendering.ODD_MESHES", 2)
-    scans = tmp_path / "scans" / "eggs"
-    scans.mkdir(parents=True)
-    saved(scans / "plain.ply", thing())
-    for name in ("a", "b", "c"):
-        saved(scans / f"{name}.ply", joined(thing(), disc(0.4)))
-    done = dict(
-        render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0)
-    )
-    assert set(done.values()) == {None}
-    said = [record.getMessage() for record in caplog.records]
-    assert [line.partition(":")[0] for line in said[:2]] == [
-        str(scans / "a.ply"),
-        str(scans / "b.ply"),
-    ]
-    assert all("times as large" in line for line in said[:2])
-    assert said[2].startswith("and 1 more meshes look odd")
-    assert len(said) == 3
-
-
-def test_recognise_warns_and_takes_the_largest_part(tmp_path):
-    path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
-    with pytest.warns(UserWarning, match=r"scan\.ply: it has 2 parts"):
-        whole = nextview.recognise(path, start=9)
-    with pytest.warns(
-        UserWarning,
-        match=r"scan\.ply: the largest of its 2 parts was taken",
-    ):
-        part = nextview.recognise(path, start=9, largest_part=True)
-    alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
-    first = [result.views[0].observation.depth for result in (part, alone, whole)]
-    assert (
-        ((first[0] > 0) != (first[1] > 0)).mean()
-        < 0.01
-        < ((first[0] > 0) != (first[2] > 0)).mean()
-    )
 
 
 def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
@@ -357,16 +211,3 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))
     assert radii[0] > 5 * radii[1]
-
-
-def test_the_largest_part_of_what_is_no_mesh_file_is_refused(tmp_path):
-    mesh = make_mesh(thing().vertices, thing().faces)
-    for what in (mesh, tmp_path):
-        with pytest.raises(UsageError, match="taken of a mesh file"):
-            nextview.recognise(what, largest_part=True)
-
-
-def test_a_plane_is_looked_for_among_faces_without_area():
-    points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.0)])
-    faces = np.array([[0, 1, 1]] * 200_001 + [[0, 1, 2], [1, 2, 3]])
-    assert mesh_doubts(points, faces) == ()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tables import camera_over, view
+from factories import camera_over, view
 
 import nextview
 from nextview.errors import NextviewError

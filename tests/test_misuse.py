@@ -68,8 +68,7 @@ def doors(call, names, **sound):
 
 DOORS = {
     "recognise": lambda system, junk: system.recognise(
-        sample_mesh("chair"),
-        sensor=junk,
+        sample_mesh("chair"), sensor=junk
     ),
     "session start": lambda system, junk: system.session(start=junk),
     "session seed": lambda system, junk: system.session(seed=junk),
@@ -89,10 +88,7 @@ DOORS = {
     **doors(nextview.make_policy, "sphere", name="lem"),
     **doors(nextview.Stopping, "threshold max_views threshold_decay"),
     **doors(
-        nextview.ViewSphere,
-        "azimuths distance",
-        elevations=(0.0, 30.0),
-        azimuths=8,
+        nextview.ViewSphere, "azimuths distance", elevations=(0.0, 30.0), azimuths=8
     ),
     **doors(nextview.Directions, "directions distance", directions=np.eye(3)),
     **doors(nextview.Directions.fibonacci, "n"),
@@ -102,9 +98,7 @@ DOORS = {
         **{name: getattr(SEEN, name) for name in ("depth", "pose", "intrinsics")},
     ),
     **doors(
-        nextview.SimulatedCamera,
-        "size distance intrinsics",
-        mesh=sample_mesh("chair"),
+        nextview.SimulatedCamera, "size distance intrinsics", mesh=sample_mesh("chair")
     ),
     **doors(CAMERA.observe, "pose"),
     **doors(
@@ -116,11 +110,7 @@ DOORS = {
     **doors(ObservedObject, "up point"),
     **doors(Box, "low high axes", low=[0, 0, 0], high=[1, 1, 1]),
     **doors(
-        ObjectFrame,
-        "centre radius axes",
-        centre=[0, 0, 0],
-        radius=1.0,
-        axes=np.eye(3),
+        ObjectFrame, "centre radius axes", centre=[0, 0, 0], radius=1.0, axes=np.eye(3)
     ),
     **doors(Sensor, "noise height"),
 }

@@ -5,9 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-import trimesh
 from matplotlib.text import Text
-from pipeline import box, make_recogniser, meshed, refused
 from scipy.special import softmax
 
 import nextview
@@ -17,13 +15,8 @@ from nextview.geometry.observation import Observation, pinhole
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Unidirectional
 from nextview.recognition.belief import Calibration
-from nextview.recognition.model_card import read_card
 from nextview.session.episode import Episodes
 from nextview.session.session import Session
-from nextview_lab.data.predicting import predict
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.rendering import render
-from nextview_lab.data.store import ViewStore
 
 SPHERE = ViewSphere.named("40")
 
@@ -79,18 +72,13 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
             for k, side in product(kept, range(8)):
                 zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[
-                    e,
-                    k,
-                    :,
-                    side,
+                    e, k, :, side
                 ]
             total = total + np.log(
                 np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1)
             )
         np.testing.assert_allclose(
-            together.steps[-1].belief[e],
-            softmax(total),
-            atol=1e-12,
+            together.steps[-1].belief[e], softmax(total), atol=1e-12
         )
     np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
 
@@ -107,22 +95,6 @@ def test_an_empty_view_is_taken_but_never_confident(threshold):
     end = episodes.outcome
     assert end.n_views.tolist() == [3, 1]
     assert end.confident.tolist() == [False, True]
-
-
-def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
-    stopping = Stopping(0.9, 6, threshold_decay=2.0)
-    episodes = Episodes(
-        SPHERE,
-        Unidirectional(SPHERE),
-        np.array([0]),
-        stopping,
-        np.random.default_rng(0),
-    )
-    logits = np.array([[1.5, 0.0]])
-    assert softmax(logits[0]).max() > stopping.threshold_at(2)
-    for seen in (True, False, False, False):
-        assert not episodes.update(features(logits, [seen])).stopped[0]
-    assert episodes.update(features(logits, [True])).stopped[0]
 
 
 @pytest.mark.parametrize("name", ["gain", "lem", "spread-local"])
@@ -175,61 +147,3 @@ def test_nothing_seen_is_no_answer(tiny):
     )
     drawn = result.plot(title="air")
     assert any("nothing is seen" in text.get_text() for text in drawn.findobj(Text))
-
-
-# Meshes and the command line
-
-
-@pytest.mark.parametrize("gap", [20, 300])
-def test_two_boxes_far_apart_are_nothing(gap):
-    """Most of their bounding sphere is empty; the networks would name what they see of it a
-    table, confidently.
-    """
-    found = nextview.recognise(
-        meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))),
-        start=9,
-    )
-    assert (found.answer, found.confident) == (None, False)
-
-
-def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
-    """Four balls far apart fill enough of the picture together, but no one of them does."""
-    balls = [
-        trimesh.creation.icosphere(2, 0.09).apply_translation((x, y, 0))
-        for x in (-1, 1)
-        for y in (-1, 1)
-    ]
-    file = tmp_path / "meshes/ball/test/balls.off"
-    file.parent.mkdir(parents=True)
-    trimesh.util.concatenate(balls).export(file)
-    list(render(tmp_path / "meshes", tmp_path / "store.zarr", SPHERE, 112, workers=0))
-    store = ViewStore.open(tmp_path / "store.zarr")
-    both = zip(store.depth(0), SPHERE.poses, strict=True)
-    looks = [Observation(depth, pose, store.intrinsics) for depth, pose in both]
-    assert min(look.visible for look in looks) > 0.006 * 112**2
-    card = make_recogniser(tmp_path, ["ball"])
-    list(
-        predict(
-            tmp_path / "store.zarr",
-            tmp_path / "said.npz",
-            read_card(card),
-            {},
-            workers=0,
-        )
-    )
-    said = Predictions.load(tmp_path / "said.npz").logits[0].any(1)
-    np.testing.assert_array_equal(said, [look.seen for look in looks])
-    assert not said.all()
-
-
-@pytest.mark.parametrize("json_too", [[], ["--json"]])
-def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
-    path = tmp_path / "specks.off"
-    specks = [
-        trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x))
-        for x in (-1, 1)
-    ]
-    trimesh.util.concatenate(specks).export(path)
-    said = refused(capsys, "recognise", path, "--threshold", "0", *json_too)
-    assert "specks.off: there is no answer" in said
-    assert "any of 5 views" in said

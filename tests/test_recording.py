@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pipeline import INTRINSICS, box, cast, pose_at
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 
@@ -11,7 +10,6 @@ from rerun.chunk import RrdReader
 import nextview
 from nextview.data.samples import sample_mesh
 from nextview.geometry.observation import Observation
-from nextview.sensing import Frame
 from nextview.session.system import simulated
 from nextview.viewers.recording import Recorder
 
@@ -35,8 +33,7 @@ class Recording:
                 for component, values in batch.items():
                     if ":" in component:
                         self.rows.setdefault(
-                            (chunk.entity_path.strip("/"), component),
-                            {},
+                            (chunk.entity_path.strip("/"), component), {}
                         ).setdefault(step, [])
                         self.rows[chunk.entity_path.strip("/"), component][step].append(
                             values[row]
@@ -76,8 +73,7 @@ def test_belief_and_travel_over_the_steps(made):
             ("this_view_alone", view.alone),
         ):
             np.testing.assert_array_equal(
-                recording.at(name, "BarChart:values", step)[0]["buffer"],
-                values,
+                recording.at(name, "BarChart:values", step)[0]["buffer"], values
             )
     assert recording.steps("belief/chair", "Scalars:scalars") == steps
 
@@ -94,9 +90,7 @@ def test_candidates_values_and_choices(made):
             recording.at("world/next", "Points3D:positions", step).tolist()
         ).reshape(-1, 3)
         np.testing.assert_allclose(
-            chosen,
-            poses[[] if view.next_view is None else [view.next_view]],
-            atol=1e-6,
+            chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6
         )
         values = np.array(recording.at("values", "BarChart:values", step)[0]["buffer"])
         if view.values is None:
@@ -109,28 +103,6 @@ def test_candidates_values_and_choices(made):
             np.testing.assert_array_equal(np.array(tensor["buffer"]), expected.ravel())
     (last,) = recording.at("log", "TextLog:text", len(result.views)).tolist()
     assert last == f"done: {result!r}"
-
-
-def test_frames_that_move_the_object_are_written_anew(tmp_path):
-    path = tmp_path / "frames.rrd"
-    session = nextview.load(threshold=1.0, max_views=3, threads=1).session(distance=0.9)
-    session.observers.append(Recorder(path))
-    thing = [box((0.2, 0.3, 0.2), (0, 0, 0.1)), box((2, 2, 0.02), (0, 0, -0.01))]
-    seen = []
-    for azimuth in (0, 60, 140):
-        pose = pose_at(40, azimuth, 0.9, (0, 0, 0.1))
-        depth, _ = cast(thing, pose)
-        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
-        seen.append([view.observation for view in session.views])
-    recording = Recording(path)
-    moved = [step for step in (2, 3) if seen[step - 1][0] is not seen[step - 2][0]]
-    assert moved  # else this tests nothing
-    assert recording.steps("world/seen/1", "Points3D:positions") == [1, *moved]
-    for step in moved:
-        points = np.array(
-            recording.at("world/seen/1", "Points3D:positions", step).tolist()
-        )
-        np.testing.assert_allclose(points, seen[step - 1][0].points, atol=1e-6)
 
 
 def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tmp_path):

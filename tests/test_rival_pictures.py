@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.viewers.card import differing, preview_card, walk_card
 from nextview.viewers.exploration import Exploration, shown_objects
 
 SPHERE = ViewSphere.named("40")
@@ -15,11 +14,7 @@ def walk(knobs, knobs_memory):
     """One view of the box without a knob."""
     shown = shown_objects(knobs / "plain.ply", unit="m")
     exploration = Exploration(
-        shown,
-        models=knobs_memory,
-        sensor="wrist",
-        start=20,
-        threads=1,
+        shown, models=knobs_memory, sensor="wrist", start=20, threads=1
     )
     walk = exploration.walks[0]
     assert walk.rival_pictures(SPHERE.directions[0]) is None  # nothing was seen yet
@@ -49,26 +44,4 @@ def test_the_pixels_that_differ_are_those_of_the_knob(walk):
     assert max(shares) < 0.15
     assert walk.rival_pictures(SPHERE.directions[walk.next_view]).share > 0.6 * max(
         shares
-    )
-
-
-def test_the_page_shows_both_and_where_they_differ(walk):
-    at = walk.next_view
-    share = walk.rival_pictures(SPHERE.directions[at]).share
-    shown = walk_card(walk)
-    assert (
-        f"as view {at} would show them: they differ in {share:.0%} of the pixels"
-        in shown
-    )
-    for name in ("plain", "knob", "where they differ"):
-        assert f"<figcaption>{name}</figcaption>" in shown
-    assert "as this camera would show them" in preview_card(
-        walk.views[0].observation,
-        walk,
-    )
-    rivals = walk.rival_pictures(SPHERE.directions[at])
-    colours = differing(rivals).reshape(-1, 3)
-    assert len(np.unique(colours, axis=0)) == 3
-    assert (colours == colours[rivals.different.ravel().argmax()]).all(1).sum() == (
-        rivals.different.sum()
     )

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import TABLE, box, cast, pose_at
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pipeline import TABLE, box, cast, pose_at
 from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview import Observation, SessionError, SimulatedCamera, Stopping, ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import ObservationError
 from nextview.geometry.viewsphere import viewpoints_of
 from nextview.policies.maps import MapPeak
 from nextview.policies.registry import make_policy
@@ -437,40 +437,6 @@ def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(
     np.testing.assert_equal(snapshot(session), before)
 
 
-@pytest.mark.parametrize(
-    ("distance", "words"),
-    [(0.15, "outside of it: ask for a larger one.* a mask$"), (700, "in millimetres")],
-)
-def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(
-    tiny,
-    distance,
-    words,
-):
-    session = begin(tiny, distance=distance)
-    before = snapshot(session)
-    with pytest.raises(
-        UsageError,
-        match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}",
-    ):
-        session.update(frame(pose_at(20, 30, 0.7, (0, 0, 0.08))))
-    assert snapshot(session) == before
-
-
-def test_only_sixteen_bits_are_blamed_for_a_distance_inside_the_object(tiny):
-    seen = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
-    counted = Frame(
-        np.rint(1000 * seen.depth).astype(np.uint16),
-        INTRINSICS,
-        seen.pose,
-        pixel_centre=0.5,
-    )
-    with pytest.raises(
-        UsageError,
-        match="the steps of the uint16 depth are no millimetres",
-    ):
-        begin(tiny, distance=0.15).update(counted)
-
-
 def test_a_small_thing_may_be_looked_at_from_some_way_off(tiny):
     die = box((0.02, 0.02, 0.02), (0, 0, 0.01))
     session = begin(tiny, distance=0.7)
@@ -479,23 +445,3 @@ def test_a_small_thing_may_be_looked_at_from_some_way_off(tiny):
     assert np.linalg.norm(
         session.target[:3, 3] - session.object.object_frame.centre
     ) == pytest.approx(0.7)
-
-
-def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
-    """Whatever pose is told with it.
-
-    The camera is asked for the same view still, as nobody knows where it was.
-    """
-    first = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
-    session = begin(tiny)
-    session.update(first)
-    where = session.object.object_frame
-    while not session.done:
-        session.update(replace(first, pose=session.target))
-    assert [[w.name for w in view.warnings] for view in session.views] == [
-        [],
-        *[["repeated"]] * 3,
-    ]
-    for view in session.views:
-        np.testing.assert_array_equal(view.belief, session.views[0].belief)
-    assert session.object.object_frame == where

@@ -5,7 +5,7 @@ flying pixels.
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
+from factories import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError

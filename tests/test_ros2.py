@@ -5,10 +5,8 @@ ROS itself is not here; ``rosbags`` is.
 
 import ast
 import importlib.util
-import re
 import sys
 import threading
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +15,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
-from pipeline import TABLE, box, cast, pose_at
+from factories import TABLE, box, cast, pose_at
 from ros_messages import (
     SHAPE,
     STORE,
@@ -35,11 +33,10 @@ from scipy.spatial.transform import Rotation
 import nextview
 from nextview.captured.transforms import NoTransformError
 from nextview.data.samples import sample_mesh
-from nextview.errors import NextviewError, ObservationError, UsageError
+from nextview.errors import NextviewError, ObservationError
 from nextview.sensing import Frame, ObservedObject
 
 ROS = Path(__file__).parents[1] / "ros2"
-PAGE = (ROS.parent / "docs/ros2.md").read_text(encoding="utf-8")
 sys.path.insert(0, str(ROS / "nextview_ros"))
 from nextview_ros import conversion
 
@@ -487,15 +484,6 @@ def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
     assert answer.message
 
 
-@pytest.mark.parametrize("name", ["../mug", "a/b"])
-def test_a_thing_cannot_be_learned_under_the_name_of_a_path(node, tmp_path, name):
-    mesh = tmp_path / "mug.ply"
-    mesh.touch()
-    node.value = {"models": [str(tmp_path)]}.get
-    with pytest.raises(UsageError, match="cannot be the name of a thing"):
-        node.add_to_memory(SimpleNamespace(path=str(mesh), name=name, unit="m"))
-
-
 def test_frames_of_one_time_are_used_together_and_alone_where_one_is_refused(node):
     taken = []
 
@@ -512,30 +500,6 @@ def test_frames_of_one_time_are_used_together_and_alone_where_one_is_refused(nod
     assert node.take_in(["left", "nothing"]) == (1, ["a warning", "it shows nothing"])
     assert taken[1:] == [["left"]]
     assert node.take_in([]) == (0, [])
-
-
-def mask_message(rows, encoding="mono8", padding=0):
-    rows = np.pad(rows.astype(np.uint8), ((0, 0), (0, padding)), constant_values=9)
-    return message(
-        "sensor_msgs/msg/Image",
-        header=header("optical"),
-        height=len(rows),
-        width=rows.shape[1] - padding,
-        encoding=encoding,
-        is_bigendian=0,
-        step=rows.shape[1],
-        data=rows.ravel(),
-    )
-
-
-def test_a_mask_is_an_image_of_eight_bits():
-    rows = np.random.default_rng(0).random((7, 9)) < 0.3
-    given = mask_message(255 * rows, padding=3)
-    np.testing.assert_array_equal(conversion.mask_of(given), rows)
-    with pytest.raises(ObservationError, match="encoded as mono8 or 8UC1, not 'rgb8'"):
-        conversion.mask_of(replace(given, encoding="rgb8"))
-    with pytest.raises(ObservationError, match="has not 20 bytes"):
-        conversion.mask_of(replace(given, data=given.data[:20]))
 
 
 def label_message(rows, encoding, big=0):
@@ -569,20 +533,6 @@ def test_labels_are_an_image_of_eight_or_sixteen_bits(encoding, largest, big):
         conversion.labels_of(replace(given, encoding="32SC1"))
     with pytest.raises(ObservationError, match="has not 20 bytes"):
         conversion.labels_of(replace(given, data=given.data[:20]))
-
-
-def test_labels_are_of_the_frame_with_which_they_came():
-    labels = importlib.import_module("nextview_ros.labels").LabelledFrames()
-    thing = box((0.1, 0.1, 0.1), (0, 0, 0.05))
-    k = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
-    depth, shown = cast([TABLE, thing], pose_at(40, 20, 0.7, (0, 0, 0)), k, (60, 80))
-    one, other = (Frame(depth, k, pose_at(40, 20, 0.7, (0, 0, 0))) for _ in range(2))
-    with pytest.raises(ObservationError, match="labels of 80 x 10 pixels do not"):
-        labels.add(one, np.zeros((10, 80), np.int64))
-    labels.add(one, 7 * (shown == 1))
-    np.testing.assert_array_equal(labels(one).labels, 7 * (shown == 1))
-    assert labels(one).surface is None
-    assert labels(other).surface is not None  # of the network
 
 
 # Following, with stand-ins for cameras and tracker
@@ -675,19 +625,6 @@ def test_a_bag_that_begins_again_is_followed_anew(follower):
     assert made.tracker.times == [10.0]
 
 
-def test_nothing_is_followed_before_the_first_look(follower):
-    made, (left, _), _ = follower
-    scene = SimpleNamespace(tops=())
-    made.begin(scene)
-    arrived(left, 10.0)
-    assert times(made.steps(10.0)) == []
-    scene.tops = (1,)
-    made.look_taken(())
-    assert times(made.steps(10.0)) == [10.0]
-    made.look_taken(("since",))
-    assert made.tracker.since == ("since",)
-
-
 # What cannot be run here is at least well formed
 
 
@@ -749,89 +686,3 @@ def test_the_node_fills_all_fields_of_its_messages():
     for name, parts in actions.items():
         for part in ("Result", "Feedback"):
             assert filled[f"{name}.{part}"] == parts[part]
-
-
-@pytest.mark.parametrize("package", ["nextview_msgs", "nextview_ros"])
-def test_its_packages_are_of_this_version(package):
-    root = ET.parse(ROS / package / "package.xml").getroot()
-    assert root.findtext("name") == package
-    assert root.findtext("version") == nextview.__version__
-
-
-@pytest.fixture
-def environment(monkeypatch, tmp_path):
-    """The script that makes an environment, where GitHub is not reached."""
-    spec = importlib.util.spec_from_file_location("environment", ROS / "environment.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    git = tmp_path / "bin/git"
-    git.parent.mkdir()
-    git.write_text(
-        "#!/bin/sh\necho 'fatal: Could not resolve host: github.com' >&2; exit 128\n"
-    )
-    git.chmod(0o755)
-    monkeypatch.setenv("PATH", str(git.parent), prepend=":")
-    monkeypatch.setattr(script, "PYTHON", sys.version_info[:2])
-    monkeypatch.setattr(
-        sys, "argv", ["environment.py", "venv", str(tmp_path / "clones")]
-    )
-    return script
-
-
-def test_without_github_the_environment_ends_at_once_with_one_sentence(
-    environment, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(environment, "install", MagicMock(side_effect=AssertionError))
-    (tmp_path / "clones/launch").mkdir(parents=True)
-    with pytest.raises(SystemExit) as end:
-        environment.main()
-    said = str(end.value.code)
-    assert "\n" not in said
-    assert "https://github.com/ros2/geometry2 cannot be cloned" in said
-    assert "moveit/moveit_msgs (2.6.0)" in said
-    assert "ros2/launch (" not in said
-    assert "make test-ros ROS_SOURCES=FOLDER" in said
-
-
-def test_clones_that_are_there_need_no_github(environment, tmp_path, monkeypatch):
-    for repository, *_ in environment.SOURCES:
-        environment.folder_of(repository, tmp_path / "clones").mkdir(parents=True)
-    steps = {
-        name: MagicMock() for name in ("install", "mend_paths", "build", "link_node")
-    }
-    for name, step in steps.items():
-        monkeypatch.setattr(environment, name, step)
-    environment.main()
-    assert all(step.called for step in steps.values())
-    assert len(environment.SOURCES) == 10
-    assert PAGE.count("clones ten repositories") == 2
-
-
-def test_the_page_names_the_type_and_the_qos_of_each_topic_that_it_shows():
-    """``ros2 topic echo`` knows neither before it has found the node."""
-    types = {
-        "/detections": ("vision_msgs/msg/Detection3DArray", True),
-        "/planning_scene": ("moveit_msgs/msg/PlanningScene", True),
-        "/next_pose": ("geometry_msgs/msg/PoseStamped", True),
-        "/tf": ("tf2_msgs/msg/TFMessage", False),
-    }
-    shown = [
-        line.partition("#")[0].split()
-        for line in PAGE.splitlines()
-        if line.startswith("ros2 topic echo")
-    ]
-    assert {words[-2] for words in shown} == types.keys()
-    source = (ROS / "nextview_ros/nextview_ros/node.py").read_text(encoding="utf-8")
-    for words in shown:
-        kind, latched = types[words[-2]]
-        assert words[-1] == kind
-        name = kind.rpartition("/")[2]
-        published = (
-            rf"create_publisher\(\s*{name},\s*\"{words[-2].strip('/')}\",\s*LATCHED"
-        )
-        assert bool(re.search(published, source)) == latched
-        for option in (
-            "--qos-durability transient_local",
-            "--qos-reliability reliable",
-        ):
-            assert (option in " ".join(words)) == latched

@@ -16,9 +16,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 import trimesh
+from factories import box, cast, pose_at
 from geometry_msgs.msg import Point
 from nextview_msgs.msg import Box
-from pipeline import box, cast, pose_at
 from ros_robot import PACKAGE, SECONDS, Robot, Running, until, wait
 from sensor_msgs.msg import CameraInfo, Image
 

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-import nextview_ros.node
 import trimesh
+from factories import SimulatedTable, TableCamera, camera_over, leaning, view, without
 from geometry_msgs.msg import Point
 from nextview_msgs.action import LookUntilSettled
 from nextview_msgs.msg import Box
@@ -43,14 +43,12 @@ from rosgraph_msgs.msg import Clock
 from rosidl_runtime_py.utilities import get_message
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import Image
-from small_tables import camera_over, leaning, view, without
 from test_scene_changes import shifted
 
 import nextview
 from nextview.sensing import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.teaching.learn import learn
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"
@@ -382,12 +380,6 @@ def is_missing(robot, number):
     return str(number) not in [one.id for one in robot.heard["tracked"].detections]
 
 
-def test_without_a_rate_nothing_is_tracked(running, mine):
-    node = running.add(node_with("/still", models=[str(mine)], track_rate=0.0))
-    rates = sorted(round(1e9 / timer.timer_period_ns) for timer in node.timers)
-    assert rates == [10]  # of tf alone
-
-
 def test_a_thing_that_leans_is_named_in_any_orientation(running, mine, ycb_meshes):
     things = (
         leaning(ycb_meshes["cracker_box"], 25, (0, 0)),
@@ -587,32 +579,6 @@ def test_a_recording_is_played_as_a_camera(running, mine, bag):
     for pose in seen:
         true = min((view(20), view(110)), key=lambda one: np.abs(one - pose).max())
         np.testing.assert_allclose(pose, true, atol=1e-6)
-
-
-# What is installed
-
-
-def test_without_moveit_there_is_one_line_and_no_topic(
-    running, mine, monkeypatch, capfd
-):
-    monkeypatch.setattr(nextview_ros.node, "PlanningScene", None)
-    node = running.add(node_with("/bare", models=[str(mine)]))
-    assert node.planning_scene is None
-    said = capfd.readouterr()
-    lines = [line for line in (said.out + said.err).splitlines() if "moveit" in line]
-    assert len(lines) == 1
-    assert "moveit_msgs is not installed: no topic planning_scene" in lines[0]
-
-
-def test_parameters_have_descriptions_and_ranges(running):
-    described = running.node.describe_parameters(["threshold", "max_views", "cameras"])
-    threshold, views, cameras = described
-    assert all(one.description for one in described)
-    assert threshold.floating_point_range[0].to_value == 1.0
-    assert views.integer_range[0].from_value == 1
-    assert cameras.read_only
-    (said,) = running.node.set_parameters([Parameter("threshold", value=1.5)])
-    assert not said.successful
 
 
 # The page

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from small_tables import camera_over, view
+from factories import camera_over, view
 
 import nextview
 from nextview.errors import ModelError, UsageError

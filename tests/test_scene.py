@@ -8,18 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from factories import SimulatedTable, TableCamera, camera_over, view, without
 from PIL import Image
 from programs import main
 from scipy.spatial import cKDTree
-from small_tables import camera_over, view, without
 
 import nextview
-from nextview.errors import ObservationError, SessionError, UsageError
+from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
-from nextview.sensing.plausibility import check_sizes
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 
 def by_name(scene) -> dict:
@@ -125,24 +123,6 @@ def test_a_focal_length_of_another_camera_is_named_and_not_the_pose(
     assert float(fits) == pytest.approx(right, rel=0.08)
 
 
-def test_depth_nearer_than_a_camera_measures_is_told(ycb, ycb_meshes):
-    frame = camera_over([ycb_meshes["mug"]]).frame(view(20))
-    look = nextview.Scene(ycb).update(frame.with_depth(frame.depth / 10))
-    assert [
-        warning.name for warning in look.warnings if "so near" in warning.message
-    ] == ["unit"]
-    assert not nextview.Scene(ycb).update(frame).warnings
-
-    # a fourth of a distance is measured by some cameras: what is seen has to be too small, too
-    quarter = frame.with_depth(frame.depth / 4)
-    small = [np.array([0.02, 0.02, 0.025])]
-    (warning,) = check_sizes(quarter, small, 0.1)
-    assert "several times too small" in warning.message
-    assert check_sizes(quarter, small, 0.05) == []
-    assert check_sizes(frame, small, 0.1) == []
-    assert check_sizes(quarter, [], 0.1) == []
-
-
 def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"]])
     scene = nextview.Scene(ycb)
@@ -230,20 +210,6 @@ def test_the_next_view_shows_hidden_areas(ycb, ycb_meshes):
     assert set(by_name(scene)) == set(ycb_meshes)
 
 
-def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"]])
-    frame = camera.frame(view(20))
-    scene = nextview.Scene(ycb, reachable=lambda pose: pose[0, 3] > 0.1)
-    assert scene.target is None
-    scene.update(frame)
-    target = scene.target
-    assert target[0, 3] > 0.1
-    assert target[2, 3] > 0.1
-    nowhere = nextview.Scene(ycb, reachable=lambda pose: False)
-    nowhere.update(frame)
-    assert nowhere.target is None
-
-
 def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"]])
     frame = camera.frame(view(20))
@@ -267,26 +233,6 @@ def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
     scene.travel_cost = lambda here, there: None
     with pytest.raises(UsageError, match="a travel cost is a number from 0 on"):
         _ = scene.target
-
-
-def test_a_view_that_failed_is_no_target_again(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"]])
-    scene = nextview.Scene(ycb, distance=0.65)
-    with pytest.raises(SessionError, match="no view was asked for"):
-        scene.failed()
-    scene.update(camera.frame(view(20)))
-    before = scene.targets
-    np.testing.assert_array_equal(scene.target, before[0])
-    scene.failed()
-    rest = before[1:]
-    assert len(scene.targets) == len(rest)
-    assert {pose.tobytes() for pose in scene.targets} == {
-        pose.tobytes() for pose in rest
-    }
-
-    scene.update(camera.frame(view(200)))
-    directions = scene.targets[:, :3, 2]  # the centre moves a little with each frame
-    assert (directions @ before[0, :3, 2]).max() < np.cos(np.radians(5))
 
 
 def test_only_the_region_is_searched(ycb, ycb_meshes):

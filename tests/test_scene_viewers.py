@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from factories import camera_over, view, without
 from scipy.spatial import cKDTree
-from small_tables import camera_over, view, without
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 pytest.importorskip("viser", reason="the extra 'explore' is not installed")
@@ -11,9 +11,8 @@ pytest.importorskip("viser", reason="the extra 'explore' is not installed")
 from rerun.chunk import RrdReader
 
 import nextview
-from nextview.errors import ResultsError, SessionError, UsageError
 from nextview.viewers.page import serve
-from nextview.viewers.scene_page import draw_scene_in_3d, write_scene_page
+from nextview.viewers.scene_page import draw_scene_in_3d
 from nextview.viewers.scene_recording import SceneRecorder, record_scene
 
 NAMES = ("cracker_box", "mug", "banana")
@@ -121,31 +120,3 @@ def test_a_page_has_things_and_cameras_where_they_are(made, camera):
         assert server.scene.get_handle_by_name(f"/objects/{before['banana']}") is None
     finally:
         server.stop()
-
-
-def test_a_page_is_one_file_that_says_all(made, tmp_path, capsys):
-    scene, _, _ = made
-    path = tmp_path / "scene.html"
-    write_scene_page(scene, path, "<b>my table")
-    assert capsys.readouterr().out == ""
-    page = path.read_text()
-    assert "__VISER_EMBED_DATA__" in page
-    assert page.count("<title>&lt;b&gt;my table - nextview</title>") == 1
-    assert "<title>Viser" not in page
-    assert "3 frames: 2 confident, 0 not confident, 0 unknown" in page
-    for thing in scene.objects:
-        assert f"{thing.number} {thing.name.replace('_', ' ')} <small>confident" in page
-    with pytest.raises(ResultsError):
-        write_scene_page(scene, path)
-    write_scene_page(scene, path, overwrite=True)
-    assert "my table" not in path.read_text()
-
-
-def test_invalid_outputs_of_a_scene_are_rejected(made, tmp_path):
-    scene, _, _ = made
-    with pytest.raises(UsageError, match=r"called \.html"):
-        write_scene_page(scene, tmp_path / "scene.txt")
-    with pytest.raises(UsageError, match=r"called \.rrd"):
-        SceneRecorder(tmp_path / "scene.html")
-    with pytest.raises(SessionError, match="before the first frame"):
-        write_scene_page(nextview.Scene(scene.system), tmp_path / "none.html")

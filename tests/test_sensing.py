@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, SAMPLE_FILES, SHAPE, TABLE, box, cast, meshed, pose_at
+from factories import INTRINSICS, SAMPLE_FILES, SHAPE, TABLE, box, cast, meshed, pose_at
 from scipy.spatial.transform import Rotation
 
 from nextview import Observation, SimulatedCamera
@@ -28,7 +28,6 @@ from nextview.sensing import (
 from nextview.sensing.facets import fit_facets
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import KnownFrames
-from nextview.sensing.plausibility import check_frame
 from nextview.sensing.resampling import look_again, virtual_pose
 from nextview.sensing.segmented_frame import without_surfaces
 
@@ -471,17 +470,6 @@ def test_a_wrong_unit_of_sixteen_bit_depth_is_rejected_with_the_depth_scale(step
         assert thing.warnings == []
 
 
-def test_depth_along_the_rays_is_refused():
-    seen = frame([TABLE, WEDGE], pose_at(40, 25, 0.7), seed=1)
-    (x, y), depth = seen.rays, seen.depth
-    for support in ({}, {"point": (0, 0, 0.1)}):
-        with pytest.raises(ObservationError, match="along the rays"):
-            ranged = depth * np.sqrt(x**2 + y[:, None] ** 2 + 1)
-            ObservedObject(**support).add(
-                Frame(ranged, seen.intrinsics, seen.pose, pixel_centre=0.5)
-            )
-
-
 def test_an_old_pose_and_a_missing_plane_are_warned_of():
     first, second = (
         frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7), seed=1) for azimuth in (25, 80)
@@ -672,11 +660,6 @@ def test_a_real_chair_is_a_chair():
 
 
 @real
-def test_right_frames_of_a_real_camera_get_no_warning():
-    assert [check_frame(kinect(number)) for number in range(0, 1000, 20)] == [[]] * 50
-
-
-@real
 @pytest.mark.parametrize("number", [360, 400])
 def test_a_lunch_box_is_found_on_a_real_table(number):
     """It is the largest thing on the table, some 30 x 20 cm, behind it a wall with shelves."""
@@ -741,13 +724,3 @@ def test_the_code_of_the_guide_runs(monkeypatch):
     assert simulated
     for block in simulated:
         exec(block, {})
-
-
-def test_a_frame_with_one_part_replaced_keeps_the_others():
-    depth = np.full((480, 640), 1000, np.uint16)
-    given = Frame(depth, INTRINSICS, np.eye(4), axes="ros", camera="left")
-    other = replace(given, camera="right")
-    assert other.camera == "right"
-    np.testing.assert_array_equal(other.intrinsics, given.intrinsics)
-    np.testing.assert_array_equal(other.pose, given.pose)
-    np.testing.assert_array_equal(other.depth, given.depth)

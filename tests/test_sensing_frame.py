@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pipeline import INTRINSICS, SHAPE, TABLE, cast, pose_at
+from factories import INTRINSICS, SHAPE, TABLE, cast, pose_at
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError

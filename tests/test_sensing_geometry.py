@@ -4,9 +4,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from factories import INTRINSICS, SHAPE, TABLE, box, cast, pose_at
 from hypothesis import given
 from hypothesis import strategies as st
-from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, pose_at
 from scipy.ndimage import binary_dilation
 
 from nextview.geometry.axes import upright_axes

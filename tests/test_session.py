@@ -1,10 +1,9 @@
 """``Session``: one object under way, the caller moves the camera."""
 
-import itertools
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import nextview
 from nextview import Session, SimulatedCamera, Stopping
 from nextview.data.samples import sample_mesh
 from nextview.errors import SessionError
-from nextview.recognition.belief import log_evidence_of
 
 
 @pytest.fixture(scope="module")
@@ -41,36 +39,6 @@ def test_it_asks_for_views_until_it_is_done(system, camera):
         session.update(camera.observe(system.sphere.poses[0]))
 
 
-def test_travel_and_belief_are_those_of_the_views(system, camera):
-    result = Session(
-        system.models,
-        system.policy,
-        system.sphere,
-        9,
-        Stopping(1.0, 4),
-    ).run(camera)
-    path = [view.index for view in result.views]
-    assert len(set(path)) == 4
-    assert result.travel == pytest.approx(
-        sum(system.sphere.travel[a, b] for a, b in itertools.pairwise(path))
-    )
-    for view in result.views:
-        assert view.belief.sum() == pytest.approx(1)
-    # The belief after the last view is that of all views at once, whatever their order.
-    total, calibration = 0.0, system.models.recogniser.calibration
-    for view in reversed(result.views):
-        e = system.models.evidence([view.observation])
-        azimuth = system.sphere.azimuth[[view.index]]
-        total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(
-            np.float64
-        )
-    np.testing.assert_allclose(
-        calibration.belief(total, 4, len(system.classes))[0],
-        result.views[-1].belief,
-        atol=1e-9,
-    )
-
-
 @dataclass(frozen=True)
 class Margin(Stopping):
     """Stop when the class believed most leads by so much."""
@@ -90,37 +58,6 @@ def test_a_stopping_rule_of_ones_own(camera):
         leads = [np.ptp(np.sort(view.belief)[-2:]) for view in result.views]
         assert (leads[-1] >= 0.95) == result.confident
         assert max(leads[:-1], default=0) < 0.95
-
-
-def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
-    """A camera that hangs, whatever pose is told with it: the belief stays what the first view
-    made it.
-    """
-    for move in (True, False):
-        session = Session(
-            system.models,
-            system.policy,
-            system.sphere,
-            20,
-            Stopping(0.99, 5),
-        )
-        first = camera.observe(session.pose)
-        while not session.done:
-            session.update(
-                replace(
-                    first,
-                    depth=first.depth.copy(),
-                    pose=session.pose if move else first.pose,
-                )
-            )
-        beliefs = np.array([view.belief for view in session.views])
-        assert len(beliefs) == 5
-        np.testing.assert_array_equal(beliefs, beliefs[[0] * 5])
-        assert [[w.name for w in view.warnings] for view in session.views] == [
-            [],
-            *[["repeated"]] * 4,
-        ]
-        assert not session.result.confident
 
 
 @pytest.mark.parametrize(

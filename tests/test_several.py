@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from pipeline import box
+from factories import box
 from test_poses import known, meshes, metric_scans  # noqa: F401  (fixtures)
 
 import nextview

@@ -3,15 +3,25 @@ folders of several cameras, and what a standing camera changes.
 """
 
 import json
-import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from factories import (
+    TABLE,
+    PlacedThing,
+    SimulatedTable,
+    TableCamera,
+    box,
+    camera_over,
+    meshes_of,
+    pose_at,
+    refused,
+    view,
+)
 from PIL import Image
-from pipeline import TABLE, box, pose_at, refused
 from programs import main
 from ros_messages import (
     CAMERA_INFO,
@@ -24,7 +34,6 @@ from ros_messages import (
     write_bag,
 )
 from scipy.spatial.transform import Rotation
-from small_tables import camera_over, meshes_of, view
 
 import nextview
 from nextview.captured.check import check_capture
@@ -37,11 +46,9 @@ from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.known_frames import KnownFrames
 from nextview.simulation.sensor import SENSORS
-from nextview_lab.worlds.tables import PlacedThing, SimulatedTable, TableCamera
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))
-import documented_commands
 
 SENSOR = SENSORS["stereo"]
 RAYS = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape).rays.reshape(-1, 3)
@@ -110,10 +117,9 @@ def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
     return found
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_an_error_of_a_camera_is_told(seed):
+def test_an_error_of_a_camera_is_told():
     """4 mm and .6 degrees, within 1 mm and .15 degrees."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     error = an_error(rng)
     (offset,) = camera_offsets(moments_of(rng, error))
     assert offset.noticed
@@ -125,9 +131,8 @@ def test_an_error_of_a_camera_is_told(seed):
     assert "relative to camera left" in str(offset)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_exact_cameras_are_not_reported(seed):
-    rng = np.random.default_rng(seed + 50)
+def test_exact_cameras_are_not_reported():
+    rng = np.random.default_rng(50)
     (offset,) = camera_offsets(moments_of(rng, np.eye(4), 2))
     assert not offset.noticed
 
@@ -257,20 +262,6 @@ def test_a_folder_of_several_cameras_is_read(rig):
     usable, refused_frames = check_capture(capture)
     assert len(usable.frames) == 8
     assert refused_frames == {}
-
-
-def test_check_tells_the_error_of_a_camera(rig, capsys):
-    folder, _ = rig
-    main(["check", str(folder)])
-    said = " ".join(capsys.readouterr().err.split())
-    assert "8 frames contradict each other nowhere" in said
-    _, told = said.split("camera right is ")
-    millimetres, degrees = (
-        told.split(" mm and ")[0],
-        told.split(" mm and ")[1].split()[0],
-    )
-    assert float(millimetres) == pytest.approx(4, abs=1)
-    assert float(degrees) == pytest.approx(0.6, abs=0.15)
 
 
 def test_a_pose_in_another_world_is_refused(rig, tmp_path):
@@ -457,16 +448,3 @@ def test_a_session_takes_frames_of_both_cameras_until_it_ends(pair):
     )
     assert len(quick.update([left, right])) == 1
     assert quick.done
-
-
-def test_the_examples_of_the_page_run(capsys):
-    page = "docs/several_cameras.md"
-    names: dict = {}
-    exec(documented_commands.BEFORE[page], names)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
-    for block in blocks:
-        exec(block, names)
-    assert {thing.name for thing in names["scene"].objects} == {"mug", "mustard_bottle"}
-    assert len(names["look"].gone) == 1
-    assert names["look"].moved == ()
-    assert "camera right is" in capsys.readouterr().out

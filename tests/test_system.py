@@ -7,20 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import SAMPLE_FILES, make_map_network, make_recogniser, run_python
+from factories import SAMPLE_FILES, make_map_network, make_recogniser, run_python
 from programs import main
 
 import nextview
-from nextview.data.samples import SAMPLE_MESHES, sample_mesh
+from nextview.data.samples import SAMPLE_MESHES
 
 SAMPLE = SAMPLE_FILES / "chair.off"
-
-
-@pytest.mark.parametrize("name", SAMPLE_MESHES)
-def test_sample_files_are_the_sample_meshes(name):
-    read, made = nextview.load_mesh(SAMPLE.with_stem(name)), sample_mesh(name)
-    np.testing.assert_allclose(read.vertices, made.vertices, atol=1e-6)
-    np.testing.assert_array_equal(read.faces, made.faces)
 
 
 @pytest.mark.parametrize("options", [{}, {"risk": 0.1}])
@@ -66,35 +59,6 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
     )
     main(["recognise", str(SAMPLE), "--models", str(tmp_path), "--json"])
     assert json.loads(capsys.readouterr().out)["answer"] in system.classes
-
-
-def test_what_gain_valued_is_what_it_followed():
-    views = nextview.load(threshold=1.0).recognise(SAMPLE, start=3).views
-    for view, following in itertools.pairwise(views):
-        unvisited = np.setdiff1d(
-            np.arange(40),
-            [v.index for v in views[: views.index(view) + 1]],
-        )
-        assert (
-            view.next_view
-            == following.index
-            == unvisited[view.values[unvisited].argmax()]
-        )
-    assert views[-1].values is None
-
-
-def test_a_map_policy_values_its_window_alone():
-    view = (
-        nextview.load(policy="lem-peak", threshold=1.0)
-        .recognise(SAMPLE, start=3)
-        .views[0]
-    )
-    window = nextview.ViewSphere.named("40").windows[3]
-    np.testing.assert_array_equal(
-        np.flatnonzero(np.isfinite(view.values)),
-        np.sort(window.ravel()),
-    )
-    np.testing.assert_allclose(view.values[window], view.maps["lem"])
 
 
 def test_importing_and_a_robot_need_no_ray_caster():

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from factories import camera_over, meshes_of, view, without
 from scipy.spatial.transform import Rotation
-from small_tables import camera_over, meshes_of, view, without
 from test_scene_changes import shifted
 
 import nextview

@@ -4,23 +4,18 @@ session answers.
 
 import hashlib
 import json
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from pipeline import INTRINSICS, TABLE, box, cast, meshed, pose_at
-from programs import main
+from factories import meshed
 from safetensors.numpy import load_file, save_file
 from scipy.spatial.distance import cdist
-from scipy.stats import kstest
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import print_episode
 from nextview.data.samples import sample_mesh
-from nextview.errors import UsageError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
@@ -32,9 +27,7 @@ from nextview.recognition.novelty import (
     hidden_share,
     read_novelty,
 )
-from nextview.sensing import Frame, ObservedObject
 from nextview.session.result_json import episode_as_json
-from nextview_lab.training.unknown import quantiles
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
@@ -73,25 +66,6 @@ def test_the_score_agrees_with_brute_force():
     )
 
 
-def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
-    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400
-    held-out ones.
-    """
-    rng = np.random.default_rng(2)
-
-    def scores(n):
-        return rng.gamma(3, size=(n, 1)) + rng.normal(size=(n, 12))
-
-    labels = rng.choice(3, 400, p=(0.6, 0.3, 0.1))
-    table = quantiles(scores(400), labels, 5)
-    novelty = replace(some_score(rng), quantiles=table, objects=np.array([400]))
-    for n in range(1, 6):
-        p = novelty.p_value(scores(4000)[:, :n].mean(1), n)
-        # 1.36 / sqrt(400) of the held-out ones, more as classes differ
-        assert kstest(p, "uniform").statistic < 0.09
-        assert (p < 0.05).mean() == pytest.approx(0.05, abs=0.035)
-
-
 # Files and cards
 
 
@@ -100,10 +74,7 @@ def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distributi
     few, many = rng.normal(3, 2, 48), rng.normal(3, 2, 100_000)
     table = np.quantile(few, np.linspace(0, 1, 101))[None]
     score = Quantiles(
-        table,
-        np.array([48]),
-        joint=True,
-        usual=np.array([[0.0, 1.0], [0.5, 0.0]]),
+        table, np.array([48]), joint=True, usual=np.array([[0.0, 1.0], [0.5, 0.0]])
     )
     assert score.of_belief(np.array([-9.0, -8.0]), 1) == 7.0
     assert score.of_belief(np.array([-7.0, -8.0]), 5) == 6.5
@@ -125,23 +96,15 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
     again = read_novelty(path, sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
-    in_halves(path)
-    np.testing.assert_allclose(
-        read_novelty(path, sha256_of(path)).neighbours,
-        score.neighbours,
-        atol=1e-3,
-    )
-    with pytest.raises(
-        ModelError, match="other features; run nextview-lab fit unknown"
-    ):
+    with pytest.raises(ModelError):
         again.scores(np.zeros((1, 8)))
-    with pytest.raises(ModelError, match="no such file"):
+    with pytest.raises(ModelError):
         read_novelty(tmp_path / "b.novelty.safetensors", sha256)
-    with pytest.raises(ModelError, match="SHA-256 differs"):
+    with pytest.raises(ModelError):
         read_novelty(path, "0" * 64)
     for content in (b"", b"PK\x03\x04", path.read_bytes()[:200]):
         path.write_bytes(content)
-        with pytest.raises(ModelError, match="not a novelty score"):
+        with pytest.raises(ModelError):
             read_novelty(path, hashlib.sha256(content).hexdigest())
 
 
@@ -153,113 +116,48 @@ def with_value(values, value):
 
 MUTATIONS = {
     "gone": lambda values: None,
-    "0-d": lambda values: values.ravel()[0],
     "one dimension less": lambda values: values[0],
-    "one dimension more": lambda values: values[None],
     "empty": lambda values: values[:0],
-    "of another type": lambda values: values.astype(
-        np.int32 if values.dtype.kind == "f" else np.float32
-    ),
     "complex": lambda values: values.astype(np.complex64),
-    "NaN": lambda values: with_value(values, np.nan),
-    "infinite": lambda values: with_value(values, np.inf),
-    "minus infinite": lambda values: with_value(values, -np.inf),
 }
 OF_ONE = {
+    ("quantiles", "NaN"): lambda values: with_value(values, np.nan),
     ("quantiles", "descending"): lambda values: values[:, ::-1],
-    ("quantiles", "a pair out of order"): lambda values: values[
-        :,
-        [1, 0, *range(2, values.shape[1])],
-    ],
     ("quantiles", "a single one"): lambda values: values[:, :1],
     ("objects", "none"): lambda values: values * 0,
-    ("objects", "negative"): lambda values: -values,
     ("objects", "two"): lambda values: np.repeat(values, 2),
     ("neighbours", "too few"): lambda values: values[: NEIGHBOUR - 1],
-    ("neighbours", "half as long"): lambda values: values / 2,
     ("neighbours", "a zero vector"): lambda values: np.vstack(
         [values[1:], 0 * values[:1]]
     ),
+    ("standard", "infinite"): lambda values: with_value(values, np.inf),
     ("standard", "no deviation"): lambda values: values * (1, 0),
-    ("standard", "a negative deviation"): lambda values: values * (1, -1),
     ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
 }
-FLOATS = ("quantiles", "neighbours", "standard")
-OF_BYTES = (
-    "gone",
-    "0-d",
-    "one dimension less",
-    "one dimension more",
-    "empty",
-    "too few",
-    "a zero vector",
-)
-"""What is tried of known views in eight bits a number, too; the rest in half precision, as
-earlier versions wrote.
-"""
 
 
-def mutations():
-    for name in (*FLOATS, "objects"):
-        for how, change in MUTATIONS.items():
-            if name in FLOATS or ("infinite" not in how and how != "NaN"):
-                yield name, how, change
-    for (name, how), change in OF_ONE.items():
-        yield name, how, change
-
-
-def in_halves(path):
-    """The file as earlier versions wrote it, with the known views in half precision."""
-    arrays = load_file(path)
-    rows = arrays["neighbours"].astype(np.float32)
-    arrays["neighbours"] = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(
-        np.float16
-    )
-    save_file(arrays, path)
-
-
-@pytest.mark.parametrize("halves", [False, True], ids=["eight bits", "half precision"])
-@pytest.mark.parametrize(
-    ("name", "how", "change"),
-    [pytest.param(*m, id="-".join(m[:2])) for m in mutations()],
-)
-def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(
-    tmp_path,
-    name,
-    how,
-    change,
-    halves,
-):
-    if name == "neighbours" and not halves and how not in OF_BYTES:
-        pytest.skip("bytes have no such values")
+def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_path):
     path = tmp_path / "a.novelty.safetensors"
     some_score(np.random.default_rng(7)).save(path)
-    if halves:
-        in_halves(path)
     arrays = load_file(path)
     read_novelty(path, sha256_of(path))
-
-    changed = change(arrays.pop(name))
-    if changed is not None:
-        arrays[name] = changed
-    save_file(
-        {key: np.array(values, order="C") for key, values in arrays.items()},
-        path,
-    )
-    with pytest.raises(
-        ModelError,
-        match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$",
-    ):
-        read_novelty(path, sha256_of(path))
+    wrong = {(name, how): f for name in arrays for how, f in MUTATIONS.items()}
+    for (name, how), change in (wrong | OF_ONE).items():
+        changed = change(arrays[name])
+        kept = {key: values for key, values in arrays.items() if key != name}
+        kept |= {} if changed is None else {name: changed}
+        ordered = {key: np.array(values, order="C") for key, values in kept.items()}
+        save_file(ordered, path)
+        with pytest.raises(ModelError):
+            read_novelty(path, sha256_of(path))
+            pytest.fail(f"{name}, {how}")
 
 
 @pytest.mark.parametrize(
-    ("beside", "share"),
-    [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)],
+    ("beside", "share"), [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)]
 )
 def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
-    beside,
-    share,
+    beside, share
 ):
     depth, target = np.full((60, 60), 3.0, np.float32), np.zeros((60, 60), bool)
     # with 76 pixels of outline: 20 to each side, and 4 near a corner
@@ -269,37 +167,6 @@ def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
     assert hidden_share(
         SceneView(depth, target, np.eye(4), np.eye(3))
     ) == pytest.approx(share, abs=1e-9)
-
-
-# Rates
-
-
-@pytest.mark.parametrize("objects", [3, 50, 1999])
-def test_the_least_p_value_is_that_of_a_score_beyond_all_known_ones(objects):
-    score = some_score(np.random.default_rng(objects), objects=objects)
-    assert score.least_p_value == pytest.approx(score.p_value(1e9, [1, 3, 7]).min())
-    assert score.p_value(1e9, 1) == score.least_p_value
-
-
-def test_a_rate_that_no_p_value_is_below_is_refused_with_the_least_one(capsys):
-    system = nextview.load(threads=1, unknown=0.3)
-    least = float(system.models.recogniser.novelty.p_value(1e9, 1))
-    said = f"{system.models.recogniser.name}: .* above {least:.4g},"
-    for rate in (least, 0.7 * least, 1e-9):
-        with pytest.raises(UsageError, match=said):
-            nextview.load(threads=1, unknown=rate)
-        with pytest.raises(UsageError, match=said):
-            replace(system, unknown=rate)
-        with pytest.raises(UsageError, match=said):
-            nextview.Session(system.models, system.policy, system.sphere, unknown=rate)
-    assert replace(system, unknown=1.01 * least).unknown == 1.01 * least
-    assert replace(system, unknown=0.0).unknown == 0
-
-    mesh = Path(__file__).parents[1] / "samples" / "chair.off"
-    with pytest.raises(SystemExit):
-        main(["recognise", str(mesh), "--unknown", str(0.9 * least)])
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"0 or above {least:.4g}" in told
 
 
 # Sessions
@@ -385,30 +252,6 @@ def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
         assert wary.recognise(sample_mesh(name), start=3).answer == name
 
 
-def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
-    mesh = scrambled(0)
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(
-        tmp_path / "heap.off"
-    )
-    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert "It is none of the 10 known classes (most like a " in said
-    assert "of known objects are as novel" in said
-    main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0"])
-    assert "It is a " in capsys.readouterr().out
-
-
-def test_an_object_of_an_impossible_size_is_not_in_the_class():
-    chair = sample_mesh("chair")
-    for radius, known in ((0.6, True), (0.05, False), (60.0, False)):
-        seen = SimulatedCamera(chair)
-        seen.radius = radius
-        result = nextview.load().recognise(seen, start=3)
-        assert (result.answer is not None) == known
-        assert result.confident == known
-    assert "has a radius of 60 m" in repr(result)
-
-
 def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
     assert (usual.confident, len(usual.views)) == (True, 1)
@@ -417,35 +260,3 @@ def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
         False,
         2,
     )
-
-
-def test_a_change_of_light_does_not_contradict_the_object(
-    monkeypatch,
-):
-    """From the front a long box is half as long: novel.
-
-    The frame from the side corrects that, also of the first.
-    """
-    scores = []
-    monkeypatch.setattr(
-        Novelty,
-        "scores",
-        lambda self, embeddings, exact: np.full(len(embeddings), scores[-1]),
-    )
-    monkeypatch.setattr(
-        Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1)
-    )
-    session = nextview.load(threshold=0.1).session(
-        object=ObservedObject(life_size=False)
-    )
-    for k, pose in enumerate(
-        (pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))
-    ):
-        assert not session.done
-        scores.append((9.0, 0.0)[k])
-        depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
-        session.update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
-        assert session.views[0].novelty == scores[k]
-    assert session.done
-    assert session.result.confident
-    assert not session.result.stranded

@@ -237,6 +237,7 @@ def blocks(tmp_path_factory):
     return folder, learned
 
 
+@pytest.mark.long
 def test_learn_says_how_often_things_are_named_right_by_their_geometry(blocks):
     folder, learned = blocks
     assert learned.judged == 4

@@ -5,13 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tables import camera_over, view
+from factories import camera_over, view
 
 import nextview
 from nextview.errors import PolicyError
-from nextview.scene.view_policies import SCENE_POLICIES, NamedPolicy
-from nextview_lab.benchmark.table_runs import TableSettings
-from nextview_lab.benchmark.tables import benchmark_tables
+from nextview.scene.view_policies import NamedPolicy
 
 MINE = """
 import numpy as np
@@ -184,8 +182,6 @@ def test_a_scene_goes_where_its_policy_says(ycb, ycb_meshes):
 def test_what_is_no_policy_is_refused_at_once(ycb, policy, sentence):
     with pytest.raises(PolicyError, match=sentence):
         nextview.Scene(ycb, policy=policy)
-    with pytest.raises(PolicyError, match=sentence):
-        TableSettings(policies=(policy,)).check()
 
 
 @pytest.mark.parametrize(
@@ -220,28 +216,3 @@ def test_an_error_in_a_policy_keeps_its_traceback(seen):
         chosen(seen[1], "rules_of_mine:raises")
     cause = refused.value.__cause__
     assert "choice.nothing " in "".join(traceback.format_exception(cause))
-
-
-@pytest.mark.long  # a whole benchmark
-def test_the_benchmark_of_tables_takes_a_policy_of_ones_own(household, scans, tmp_path):
-    own = "rules_of_mine:lowest"
-    settings = TableSettings(
-        tables=1,
-        views=(1, 2),
-        policies=(own, "rules_of_mine:raises"),
-        reference="fixed",
-        samples=100,
-        seed=11,
-    )
-    out = tmp_path / "out"
-    with pytest.raises(PolicyError, match=r"raises raised .*, at rules_of_mine.py:13"):
-        benchmark_tables(household, scans, out, settings, workers=0)
-
-    settings = replace(settings, policies=(own,))
-    found = benchmark_tables(household, scans, out, settings, workers=0)
-    assert set(found.measures["policy"]) == {"fixed", own}
-    after_first = found.measures.query("views == 1 and measure == 'recall'")["value"]
-    assert after_first.nunique() == 1  # the first view is the same for all
-    assert own not in SCENE_POLICIES
-    (test,) = found.tests.query("measure == 'recall'").itertuples()
-    assert (test.policy, test.reference) == (own, "fixed")

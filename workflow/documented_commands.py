@@ -3,7 +3,7 @@ draws with the page: what no machine runs is wrong some day.
 
     python workflow/documented_commands.py [PAGE or PICTURE ...] [--data FOLDER] [--update]
 
-Takes README.md, docs/*.md, research/README.md and what stands above the code of examples/*.py apart
+Takes README.md, docs/*.md and what stands above the code of examples/*.py apart
 into commands and Python blocks, and runs them page by page, in the order of the page, each page in
 a folder of its own with what its commands need: a few box meshes under the names of ModelNet10, a
 store of their views and predictions. ``SMALL`` makes a command quick; ``NOT_RUN`` says what is not
@@ -53,7 +53,6 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
 PAGES = (
     "README.md",
     *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")),
-    "research/README.md",
     *sorted(f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")),
 )
 PROGRAMS = (
@@ -78,18 +77,15 @@ TOLERANCE = (
 )
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
-    r"lmo": "needs a dataset of BOP: tests/test_bop.py writes one and runs it",
-    r"examples/arm_over_table": (
-        "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
-    ),
-    r"benchmarks\.(real_frames|segmentation)": "needs real frames, which are not part of this",
-    r"^nextview-lab benchmark tables|benchmarks\.moves": (
+    r"lmo": "needs a dataset of BOP: lab/tests/test_bop.py writes one and runs it",
+    r"studies\.(real_frames|segmentation)": "needs real frames, which are not part of this",
+    r"^nextview-lab benchmark tables|studies\.(moves|tracking)": (
         "needs scans of all things that the bundled memory knows"
     ),
-    r"^make ": "the workflow is run by tests/test_workflow.py",
-    r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
+    r"^make ": "the workflow is run by lab/tests/test_workflow.py",
+    r"^(pip|python3 -m pip) ": "installs; lab/tests/test_wheel.py installs each extra",
     r"^nextview-lab download": (
-        "473 MB from a server of others; tests/test_download.py has a server of its own"
+        "473 MB from a server of others; lab/tests/test_download.py has a server of its own"
     ),
     r"^nextview explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
@@ -98,60 +94,42 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
     ),
     r"^rerun ": "opens a window",
-    r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
+    r"^dask ": "serves until it is stopped; lab/tests/test_render.py has a cluster of its own",
     r"--scheduler": "needs the scheduler of the line before",
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source |python3.11 ros2|export AMENT_PREFIX)": (
         "needs ROS 2; make test-ros runs the node, and the first steps of its page"
     ),
     r"my_(recordings?|folder)": (
-        "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
+        "needs a recording of the reader's; tests/test_bags.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|point_pairs)|verified_things|made_things stretched": (
-        "needs the YCB scans, and minutes"
+    r"studies\.frozen|nextview-bench": (
+        "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
-    r"benchmarks\.(frozen|poses_alone)|nextview-bench": (
-        "needs the YCB scans, and hours; tests/test_submit.py runs methods on a small archive"
-    ),
-    r"benchmarks\.places": "needs the YCB scans, and an hour; tests/test_places.py shows a thing",
+    r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
-    r"look_alikes|benchmark things (YCB|HALF_SCANS)|joined_things": (
+    r"look_alikes|benchmark things (YCB|HALF_SCANS)|verified_things": (
         "needs the YCB scans, and minutes"
     ),
-    r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
-    r"research\.(train_grid|thing_features)": "trains for hours",
-    r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
-    r"benchmarks\.(render|replay|latency)": "measures time, on a quiet machine",
-    r"research/tests": "they are in make test",
-    r"benchmarks\.scenes judge": (
-        "needs 200 scenes of each level; tests/test_scene_policies.py judges few"
-    ),
     r"SceneLayout\.load": (
-        "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
+        "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
     ),
-    r"nextview-lab scenes YCB ": "needs the YCB scans; tests/test_room_scenes.py draws tables",
-    r"RoomLayout\.load": "names one of the drawn rooms; tests/test_room_scenes.py looks into some",
+    r"nextview-lab scenes YCB ": "needs the YCB scans; lab/tests/test_room_scenes.py draws tables",
     r"agent_on_things": (
-        "needs things that were taught; tests/test_thing_environment.py lets it learn"
+        "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"--ensemble runs/second": "needs the run of the line before",
-    r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
-    r"nextview-lab |nextview_lab|benchmarks\.": "nextview-lab",
+    r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
-    r"benchmarks\.(views|scenes)|research\.(measure_study|example_maps)": (
-        "nextview-lab[benchmark]"
-    ),
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
     r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
     r"explorer_pictures": "nextview[browser]",
-    r"(?<![.:])\b(volumetric|coverage)\b|\bresearch\.\w": "research",  # by short names, too
-    r"research\.train_agent": "research[rl]",
-    r"research\.arm|examples/(panda|bin_picking)": "research[arm]",
+    r"examples/bin_picking": "nextview-lab[arm]",
 }
 SMALL = {  # options that make a command quick
     "nextview-lab render": "--workers 1",
@@ -170,12 +148,7 @@ SMALL = {  # options that make a command quick
     "nextview-lab benchmark things": (
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
-    "python -m research.train_agent": "--steps 2000",
     "python examples/bin_picking.py": "--parts 1",
-    "python -m research.measure": "--workers 1",
-    "python -m research.plan": "--workers 1",
-    "python -m benchmarks.views": "--runs 2",
-    "python -m benchmarks.fixed_cameras": "--seeds 100 101 --moments 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--scenes \d+": "--scenes 4",
@@ -409,8 +382,6 @@ def _steps_and_outputs(page: str) -> Iterator[Step]:
                 yield from _commands(page, number, lines)
         elif line.startswith("    "):
             yield from _commands(page, number, lines)
-        else:
-            yield from _in_table(page, number, line)
 
 
 def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
@@ -426,23 +397,12 @@ def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
         yield Step(page, number, text)
 
 
-def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
-    """The last cell of a row of research/README.md: how a file is run."""
-    cells = (
-        re.findall(r"`((?:nextview|nextview-lab|python) [^`]+)`", line)
-        if line.startswith("|")
-        else []
-    )
-    for text in cells[-1:] if page == "research/README.md" else ():
-        yield Step(page, number, text)
-
-
 def make_inputs(folder: Path) -> None:
     """What the commands of the pages find in their working folder."""
     from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
     from nextview.recognition.model_card import find_card
 
-    for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
+    for name in ("samples", "examples", "docs", "workflow"):
         shutil.copytree(
             ROOT / name,
             folder / name,
@@ -517,12 +477,8 @@ def make_rig(folder: Path) -> None:
 FILES = {
     "mine.py": (
         """
-from nextview_lab.data.measures import Measure
-
 def clutter(view):
     return float(view.seen.mean())
-
-uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
 """
     ),
     "spread.py": (
@@ -583,12 +539,6 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/cluttered_scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
     "docs/your_table.md": "nextview learn samples mine --unit cm",
-    # Predictions name their store: those that are planned for have to be of the one in this folder.
-    "research/README.md": (
-        "nextview-lab predict views.zarr test.npz --split test --workers 1 --overwrite;"
-        " nextview-lab train map views.zarr runs/lem --epochs 1 --views-per-object 2"
-        " --batch 8 --validation-share 0.4"
-    ),
 }
 # pages of which each Python block runs by itself
 ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
@@ -620,7 +570,7 @@ class Environments:
 
         Args:
             needs: what is installed besides the base installation, as pip is told:
-                "nextview-lab[train]", "research".
+                "nextview-lab[train]".
         """
         if self.base is not None:
             return self.base
@@ -630,7 +580,6 @@ class Environments:
             projects: dict[str, set[str]] = {"nextview": set()}
             for text in needs:
                 name, _, extra = text.rstrip("]").partition("[")
-                name = "nextview-research" if name == "research" else name
                 projects.setdefault(name, set()).update(filter(None, [extra]))
             try:
                 python = installation(self.folder / str(len(self._made)), projects)
@@ -824,26 +773,16 @@ PICTURES = {
     "python docs/site/explorer_pictures.py --out .": (
         "explore.png explore_compared.png recording.png table_page.png"
     ),
-    "python examples/panda.py samples/table.off --threshold 0.99 --film panda.gif": "panda.gif",
-    "python examples/bin_picking.py --parts 6 --seed 31 --film picking.gif": "picking.gif",
-    "python examples/arm_over_table.py YCB --film arm_table.gif": "arm_table.gif",
-    "python -m benchmarks.scenes picture ModelNet10 scenes.png": "scenes.png",
     (
         "mkdir eight && cp YCB/{b_lego_duplo,f_lego_duplo,flat_screwdriver,g_cups,h_cups,mug,"
         "phillips_screwdriver,power_drill}.ply eight && nextview learn eight taught --unit m"
         " && mv taught/learned.png ."
     ): "learned.png",
-    "python -m research.film YCB .": "things.gif",
 }
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
-    "things.mp4": "the film of things.gif, made with it, in a format that is not read here",
-    **dict.fromkeys(
-        ("conditions.png", "front.png", "measures.png"),
-        "needs hours; make reproduce draws it",
-    ),
-    "scenes_travel.png": "needs 200 scenes of each level; benchmarks.scenes judge draws it",
+    "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 """Of the repository."""
 
 sys.path.insert(0, str(ROOT))
-from benchmarks.shared import wilson
+from nextview_lab.studies.shared import wilson
 
 PARTS = {"README.md": ("measured", "citation"), "docs/results.md": ("measured",)}
 """What a page repeats."""

@@ -320,31 +320,6 @@ def comparison(stage: Path) -> Iterator[str]:
         yield ""
 
 
-def fixed_views(stage: Path) -> Iterator[str]:
-    """Everybody takes so many views: the table that the script wrote."""
-    (page,) = stage.glob("*.md")
-    yield page.read_text()
-    yield ""
-    yield (
-        "![Accuracy against travel, the gain policy at several travel weights and its"
-        " rivals](images/front.png)"
-    )
-    yield ""
-
-
-def measures(stage: Path) -> Iterator[str]:
-    """Which measure of a view serves recognition."""
-    yield "[measures.md](measures.md) defines the measures. `measures.csv`."
-    yield ""
-    yield (stage / "measures.md").read_text().rstrip()
-    yield ""
-    yield (
-        "![Correlation of every measure with recognition, and what its policy"
-        " gains](images/measures.png)"
-    )
-    yield ""
-
-
 def risk(stage: Path) -> Iterator[str]:
     """What became of the promised error rates."""
     settings = json.loads((stage / "benchmark.json").read_text())
@@ -394,36 +369,12 @@ def risk(stage: Path) -> Iterator[str]:
     )
 
 
-def page_as_is(stage: Path) -> Iterator[str]:
-    """Markdown that a script printed."""
-    yield stage.read_text()
-    yield ""
-
-
-def conditions(stage: Path) -> Iterator[str]:
-    """Noise, wrong object frames, occlusion, sensors."""
-    yield from page_as_is(stage)
-    yield "![Accuracy under every condition](images/conditions.png)"
-    yield ""
-
-
-def text_as_is(stage: Path) -> Iterator[str]:
-    """Text that a script printed."""
-    yield f"```\n{stage.read_text().rstrip()}\n```"
-    yield ""
-
-
 SECTIONS: list[tuple[str, str, Callable[[Path], Iterator[str]]]] = [
     ("benchmark", f"Policies at threshold {THRESHOLD}", comparison),
-    ("views", "Policies after 2, 3 and 5 views", fixed_views),
-    ("measures", "Measures of a view", measures),
     ("benchmark-risk", "Promised error rates", risk),
     ("evaluation", "Recogniser", recogniser),
     ("evaluation", "Calibration", calibration),
     ("evaluation", "Map networks", maps),
-    ("conditions.md", "Under every condition", conditions),
-    ("unknown.md", "Objects of no known class", page_as_is),
-    ("latency.txt", "Latency", text_as_is),
 ]
 """Stage, heading, and what writes the section."""
 

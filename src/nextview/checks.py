@@ -30,6 +30,7 @@ EXTRAS = {  # packages by the optional part of the installation that brings them
     "explore": ("viser", "websockets"),
     "large": ("faiss",),
     "record": ("rerun",),
+    "teach": ("fast_simplification", "mapbox_earcut", "networkx"),
 }
 # an environment variable: set, the whole traceback of a plugin's error is printed too
 TRACEBACK = "NEXTVIEW_TRACEBACK"
@@ -92,6 +93,20 @@ def extras(
         if sentence is None:
             raise
         raise MissingExtraError(sentence) from error
+
+
+def check_extra(extra: str) -> None:
+    """Check that an optional part of the installation is there, before any work.
+
+    Args:
+        extra: name of the part, one of EXTRAS.
+
+    Raises:
+        MissingExtraError: it is not installed; the sentence says how to install it.
+    """
+    for package in EXTRAS[extra]:
+        with extras():
+            importlib.import_module(package)
 
 
 def one_line(text: str, most: int = 80) -> str:

@@ -1,6 +1,6 @@
 """The bundled recording of a table: simulated depth frames with ground truth.
 
-It was created by ``benchmarks/demo_table.py``.
+An earlier script of the repository created it.
 """
 
 from collections.abc import Collection, Sequence

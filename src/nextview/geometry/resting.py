@@ -7,6 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial import QhullError, cKDTree
 
+from nextview.checks import check_extra
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import Directions
 from nextview.types import Float
@@ -99,6 +100,8 @@ def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
     """Return the up directions of all stable poses, (N, 3), and their shares of throws, (N,)."""
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses
+
+    check_extra("teach")  # networkx, which trimesh imports only when it is asked
 
     axes = np.linalg.eigh(np.cov(mesh.vertices.T))[1].T
     normal = axes[0]  # of the plane that is nearest to all vertices

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from nextview.checks import extras
 from nextview.errors import MeshError, option
 from nextview.types import Float, Index, Mask
 
@@ -161,7 +162,8 @@ def _fan_is_right(points: Float) -> Mask:
 
 def _clip_ears(points: Float) -> Index | None:
     """Cut a polygon, (K, 3), into triangles, (T, 3) corner indices; None without area."""
-    from mapbox_earcut import triangulate_float64
+    with extras():
+        from mapbox_earcut import triangulate_float64
 
     with np.errstate(over="ignore", invalid="ignore"):
         points = points - points[0]

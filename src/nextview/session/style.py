@@ -28,8 +28,6 @@ ACCENT = "#d1495b"
 PAPER = "#fafaf8"
 GROUND = "#f5efe4"
 WOOD = "#e0ab6c"
-# colours of several series, in order
-SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
 UNKNOWN_COLOUR = 201, 210, 218  # for missing values
 FIGURE_STYLE = {
     "font.family": "sans-serif",

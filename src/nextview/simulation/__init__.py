@@ -1,1 +1,1 @@
-"""Simulated cameras, sensor models, cluttered scenes and rooms."""
+"""Simulated cameras and sensor models."""

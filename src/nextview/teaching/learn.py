@@ -13,7 +13,7 @@ from msgspec.structs import replace as replace_record
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from nextview.checks import one_line
+from nextview.checks import check_extra, one_line
 from nextview.data.pool import GivenItem, Result, WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, in_lines, silently
@@ -312,6 +312,7 @@ def learn_things(
     folder = Path(folder)
     out = Path(out)
     how.check()
+    check_extra("teach")
     count_workers(workers)  # rejects an invalid number
     changes = bool(remove or how.symmetry)
     nothing_new = changes and folder.resolve() == out.resolve()

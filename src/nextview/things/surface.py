@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from nextview.checks import extras
 from nextview.errors import MeshError, option
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import embree_scene
@@ -120,7 +121,8 @@ class Surface:
         Returns:
             A surface in the same frame, with at most as many triangles.
         """
-        from fast_simplification import simplify
+        with extras():
+            from fast_simplification import simplify
 
         kept = self
         count = len(self.faces) // 2

@@ -1,15 +1,19 @@
-"""A leaderboard as Markdown and as a page of HTML.
+"""Tables of text, and a leaderboard of them as Markdown.
 
 Names of methods and of archives come from elsewhere. ``plain`` escapes line breaks and control
-characters in all texts of a leaderboard; ``_markdown`` and ``_html`` escape each text for a file.
+characters in all texts of a leaderboard; ``_escaped`` escapes each text for Markdown.
 """
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
+from typing import Any
+
+import numpy as np
 
 from nextview.checks import one_line
+from nextview_lab.benchmark.comparison import Tables, values_of
 
 NONE = "\N{EN DASH}"
 LONGEST_TEXT = 1000  # characters of a cell or a sentence
@@ -17,11 +21,11 @@ LONGEST_TEXT = 1000  # characters of a cell or a sentence
 
 @dataclass(frozen=True)
 class WrittenTable:
-    """A table of the leaderboard.
+    """A table of text, for a terminal or a file.
 
     Attributes:
         title: above it.
-        about: what it shows, a sentence or two.
+        about: what it shows, a sentence or two; "" for nothing.
         headings: of the columns.
         rows: cells, as many as headings in each.
     """
@@ -30,6 +34,84 @@ class WrittenTable:
     about: str
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table that compares policies.
+
+    Attributes:
+        heading: of the column.
+        measures: in a cell, separated by commas.
+        views: number of views; 0 for whole episodes.
+        digits: after the decimal point.
+        short: heading in narrow tables; "" if it is not part of them.
+    """
+
+    heading: str
+    measures: tuple[str, ...]
+    views: int = 0
+    digits: int = 3
+    short: str = ""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A table that compares policies.
+
+    Attributes:
+        title: of the table.
+        name: of the set of objects.
+        columns: after the column of policy names.
+        about: a line below the title.
+    """
+
+    title: str
+    name: str
+    columns: tuple[Column, ...]
+    about: str = ""
+
+    def narrow(self) -> dict[str, Column]:
+        """Return the columns of the narrow tables, by their short headings."""
+        return {column.short: column for column in self.columns if column.short}
+
+
+def written(
+    tables: Tables,
+    board: Board,
+    columns: Mapping[str, Column],
+    marked: Iterable[tuple[str, str, int]] = (),
+) -> WrittenTable:
+    """Return a board as text: a row for each policy that has all of its numbers.
+
+    Args:
+        tables: of the benchmark.
+        board: the table.
+        columns: of the table, by heading.
+        marked: policy, measure and views of the numbers marked with a star.
+    """
+    values = values_of(tables.measures, board.name)
+    stars = set(marked)
+
+    def shown(policy: str, measure: str, column: Column) -> str:
+        value = values[policy, measure, column.views][0]
+        star = "*" * ((policy, measure, column.views) in stars)
+        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
+
+    rows = tuple(
+        (
+            policy,
+            *(
+                ", ".join(shown(policy, m, c) for m in c.measures)
+                for c in columns.values()
+            ),
+        )
+        for policy in tables.policies()
+        if all(
+            (policy, m, c.views) in values for c in columns.values() for m in c.measures
+        )
+    )
+    return WrittenTable(board.title, board.about, ("policy", *columns), rows)
 
 
 @dataclass(frozen=True)
@@ -86,66 +168,29 @@ def as_markdown(board: Leaderboard) -> str:
     Args:
         board: the leaderboard, plain.
     """
-    lines = [f"# {_markdown(board.archive)}", ""]
+    lines = [f"# {_escaped(board.archive)}", ""]
     for table in board.tables:
-        lines += [f"## {_markdown(table.title)}", "", _markdown(table.about), ""]
-        lines.append(_markdown_row(table.headings))
-        lines.append("|---" * len(table.headings) + "|")
-        lines += [*map(_markdown_row, table.rows), ""]
-    lines += [f"- {_markdown(note)}" for note in board.notes]
+        lines += [f"## {_escaped(table.title)}", "", _escaped(table.about), ""]
+        rows = [map(_escaped, row) for row in table.rows]
+        lines.append(markdown(map(_escaped, table.headings), rows))
+    lines += [f"- {_escaped(note)}" for note in board.notes]
     return "\n".join(lines) + "\n"
 
 
-def as_html(board: Leaderboard, sha256: str) -> str:
-    """Return a leaderboard as a page of HTML, which loads nothing.
+def markdown(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Format a table as Markdown.
 
     Args:
-        board: the leaderboard, plain.
-        sha256: of the archive's manifest.
+        head: headings.
+        rows: cells.
     """
-    style = files("nextview_lab.benchmark") / "templates" / "page.css"
-    title = _html(f"Leaderboard of {board.archive}")
-    anchors = [f"table-{row}" for row in range(1, len(board.tables) + 1)]
-    parts = [
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<meta name="generator" content="nextview"><title>{title}</title>',
-        f"<style>{style.read_text(encoding='utf-8')}</style></head>",
-        f"<body><main>\n<h1>{title}</h1>",
-        *(f"<p>{_html(note)}</p>" for note in board.notes),
-        f'<p class="soft">SHA-256 of the archive\'s manifest: {_html(sha256)}</p>',
-        "<nav>",
-        *(
-            f'<a href="#{anchor}">{_html(table.title)}</a>'
-            for anchor, table in zip(anchors, board.tables, strict=True)
-        ),
-        "</nav>",
-    ]
-    for anchor, table in zip(anchors, board.tables, strict=True):
-        about = _html(table.about)
-        parts += [
-            f'<section id="{anchor}"><h2>{_html(table.title)}</h2>',
-            f'<p class="soft">{about}</p>',
-            f'<div class="wide" tabindex="0"><table aria-label="{about}">\n<thead><tr>',
-            *(f'<th scope="col">{_html(heading)}</th>' for heading in table.headings),
-            "</tr></thead>\n<tbody>",
-            *map(_html_row, table.rows),
-            "</tbody>\n</table></div></section>",
-        ]
-    return "\n".join([*parts, "</main></body></html>"]) + "\n"
+    head = list(head)
+    lines = [head, *rows]
+    text = [f"| {' | '.join(map(str, line))} |" for line in lines]
+    return "\n".join([text[0], "|---" * len(head) + "|", *text[1:]]) + "\n"
 
 
-def _markdown_row(cells: tuple[str, ...]) -> str:
-    return f"| {' | '.join(map(_markdown, cells))} |"
-
-
-def _html_row(cells: tuple[str, ...]) -> str:
-    first, *others = map(_html, cells)
-    numbers = "".join(f"<td>{cell}</td>" for cell in others)
-    return f'<tr><th scope="row">{first}</th>{numbers}</tr>'
-
-
-def _markdown(text: str) -> str:
+def _escaped(text: str) -> str:
     """Return a text that Markdown shows as it is.
 
     Entities instead of ``\\<``: not all that read Markdown know the latter.
@@ -154,8 +199,3 @@ def _markdown(text: str) -> str:
     text = escape(text, quote=False)
     # addresses become links without any mark
     return re.sub(r":(?=//)|(?<=www)\.", lambda mark: f"&#{ord(mark[0])};", text)
-
-
-def _html(text: str) -> str:
-    """Return a text that HTML shows as it is."""
-    return escape(text)

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.session.episode import Outcome
-from nextview.types import Float, Index
+from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
 from nextview_lab.benchmark.comparison import (
     ALL,
+    ONE,
     Counted,
     Key,
     Tables,
@@ -36,6 +37,18 @@ Cell = tuple[str, float | None, Outcome]
 Both = tuple["pd.DataFrame", "pd.DataFrame"]  # measures and tests
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 OF_CLASSES = ("accuracy", "travel_moved")  # measures that are also reported by class
+# measures of whole episodes, and after a number of views: columns of the long table
+ENDS = {
+    "accuracy": ("right", ONE),
+    "clean_accuracy": ("clean_right", "clean"),
+    "n_views": ("n_views", ONE),
+    "travel_moved": ("travel", "moved"),
+    "travel_all": ("travel", ONE),
+    "arc_all": ("arc", ONE),
+    "confident": ("confident", ONE),
+    "confident_accuracy": ("confident_right", "confident"),
+}
+AFTER = {"accuracy": ("right", ONE), "travel": ("travel", ONE)}
 # thresholds of the curves: from stopping at the first view to taking almost all views
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
 LEVEL_VIEWS = (2, 3, 5)  # numbers of views after which the policies are compared
@@ -131,11 +144,11 @@ def summarise(
     families = st.target_families(grid.specs.predictions.names)
     weights = st.resample_families(families, samples, rng)
     cells = list(grid.cells())
-    counted = _counted(grid, cells, families)
+    counted = Counted.of(_ended(grid, cells), {}, ENDS, families)
     whole = counted.tests(ALL, weights, reference, lambda key: key.measure in TESTED)
     of_measures = [whole[whole["measure"] == measure] for measure in TESTED]
     parts = [by_level(grid, reference, samples, rng)]
-    parts += [after_views(grid, n_views, weights, [reference])] if n_views else []
+    parts += [after_views(grid, n_views, weights, reference)] if n_views else []
     measures = [_measures(grid, cells, counted, weights), *(part for part, _ in parts)]
     tests = [*(corrected([some]) for some in of_measures), *(part for _, part in parts)]
 
@@ -143,46 +156,36 @@ def summarise(
         pd.concat([table for table in measures if len(table)], ignore_index=True),
         pd.concat(tests, ignore_index=True),
         reference,
-        _sweep(grid, families),
+        _sweep(grid),
         _reliability(grid, cells),
     )
 
 
-def _counted(grid: Grid, cells: list[Cell], families: Index) -> Counted:
-    """Compute all measures of whole episodes."""
-    sums = {
-        Key(policy, threshold, 0, measure): both
-        for policy, threshold, ends in cells
-        for measure, both in _sums(grid, ends).items()
-    }
-    return Counted.of(sums, families)
-
-
-def _sums(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
-    """Return each measure of a cell as numerator and denominator per object, (N,) each."""
-    right = grid.right(ends.answer).astype(np.float64)
-    clean = np.where(grid.specs.predictions.conflicting, 0.0, 1.0)
-    one = np.ones(right.shape[1])
-
-    def of(values: NDArray) -> NDArray:
-        return values.reshape(grid.runs, -1)
-
-    moved = of(ends.n_views > 1)
-    confident = of(ends.confident)
-    mean = right.mean(0)
-    return {
-        "accuracy": (mean, one),
-        "clean_accuracy": (mean * clean, clean),
-        "n_views": (of(ends.n_views).mean(0), one),
-        "travel_moved": (of(ends.travel).sum(0), moved.sum(0).astype(np.float64)),
-        "travel_all": (of(ends.travel).mean(0), one),
-        "arc_all": (of(ends.arc).mean(0), one),
-        "confident": (confident.mean(0), one),
-        "confident_accuracy": (
-            (right * confident).sum(0),
-            confident.sum(0).astype(np.float64),
-        ),
-    }
+def _ended(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
+    """Return the long table of whole episodes."""
+    specs = grid.specs
+    clean = ~specs.predictions.conflicting[specs.objects]
+    parts = []
+    for policy, threshold, ends in cells:
+        right = ends.answer == specs.labels
+        columns = {
+            "policy": policy,
+            "threshold": np.nan if threshold is None else threshold,
+            "views": 0,
+            "object": specs.objects,
+            ONE: 1.0,
+            "right": right,
+            "clean": clean,
+            "clean_right": right & clean,
+            "n_views": ends.n_views,
+            "moved": ends.n_views > 1,
+            "travel": ends.travel,
+            "arc": ends.arc,
+            "confident": ends.confident,
+            "confident_right": right & ends.confident,
+        }
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
 
 
 def _measures(
@@ -204,12 +207,7 @@ def _measures(
     by_class = counted.only(OF_CLASSES)
     for index in np.unique(p.labels):
         here = p.labels == index
-        of_one = Counted(
-            by_class.keys,
-            by_class.top[here],
-            by_class.bottom[here],
-            by_class.families[here],
-        )
+        of_one = by_class.among(here)
         found.append(of_one.measures(class_set(p.classes[index]), weights[:, here]))
 
     classes = comparable_classes(p)
@@ -250,20 +248,17 @@ def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     return measures_of(ALL, rows)
 
 
-def _sweep(grid: Grid, families: Index) -> pd.DataFrame:
+def _sweep(grid: Grid) -> pd.DataFrame:
     """Return the points of the curves."""
-    measures = ["accuracy", "n_views", "travel_all", "arc_all"]
     points = []
     for name, paths in grid.paths.items():
-        if not paths.fixed:
-            ends: list[Cell] = [(name, t, grid.ends(name, t)) for t in SWEEP]
-            curve = _counted(grid, ends, families).only(measures).top.mean(0)
-            points += [
-                (name, t, *values)
-                for t, values in zip(SWEEP, curve.reshape(len(SWEEP), -1), strict=True)
-            ]
-    table = pd.DataFrame(points, columns=["policy", "threshold", *measures])
-    return table.astype({"threshold": "float64"})
+        for threshold in () if paths.fixed else SWEEP:
+            ends = grid.ends(name, threshold)
+            right = ends.answer == grid.specs.labels
+            means = map(np.mean, (right, ends.n_views, ends.travel, ends.arc))
+            points.append((name, threshold, *means))
+    columns = ["policy", "threshold", "accuracy", "n_views", "travel_all", "arc_all"]
+    return pd.DataFrame(points, columns=columns).astype({"threshold": "float64"})
 
 
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
@@ -307,14 +302,17 @@ def by_level(
     counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
     known = [level for level in CLUTTER_LEVELS if level in level_of]
+    levels = [*known, *sorted({*level_of} - {*known, ""})]
+    episodes = _after(grid, choosing, counts) if levels else pd.DataFrame()
     measures = [measures_of("", [])]
     tests = [tests_of("", reference, [])]
 
-    for level in [*known, *sorted({*level_of} - {*known, ""})]:
+    for level in levels:
         mine = np.flatnonzero(level_of == level)
         families = st.target_families([names[i] for i in mine])
         weights = st.resample_families(families, samples, rng)
-        counted = _after(grid, choosing, counts, mine, families)
+        rows = episodes[episodes["object"].isin(mine)]
+        counted = Counted.of(rows, AFTER, {}, families)
         measures.append(counted.measures(f"{level} clutter", weights))
         tests.append(
             counted.tests(f"{level} clutter", weights, reference, _chosen_view)
@@ -331,7 +329,7 @@ def after_views(
     grid: Grid,
     n_views: Sequence[int],
     weights: Float,
-    references: Sequence[str],
+    reference: str,
 ) -> Both:
     """Compare policies after fixed numbers of views, without a threshold.
 
@@ -342,7 +340,7 @@ def after_views(
         grid: the episodes; the paths are long enough, or end by themselves.
         n_views: numbers of views.
         weights: bootstrap weight of each object in each sample, (S, N).
-        references: names of the reference policies.
+        reference: name of the reference policy.
 
     Returns:
         Measures and tests.
@@ -353,65 +351,44 @@ def after_views(
         for name, paths in grid.paths.items()
         if not paths.fixed or paths.views.shape[1] >= long
     ]
-    references = [name for name in references if name in names]
     families = st.target_families(grid.specs.predictions.names)
-    every = np.arange(len(families))
-    counted = _after(grid, names, n_views, every, families)
-    measures = [counted.measures(ALL, weights), _gap(counted, references)]
-    tests = [
-        counted.tests(ALL, weights, reference, lambda key: key.measure == "accuracy")
-        for reference in references
-    ]
-    return pd.concat(measures, ignore_index=True), corrected(tests, knows_truth)
+    counted = Counted.of(_after(grid, names, n_views), AFTER, {}, families)
+    measures = [counted.measures(ALL, weights), _gap(counted, reference)]
+    tests = counted.tests(
+        ALL, weights, reference, lambda key: key.measure == "accuracy"
+    )
+    return pd.concat(measures, ignore_index=True), corrected([tests], knows_truth)
 
 
-def _gap(counted: Counted, references: Sequence[str]) -> pd.DataFrame:
-    """Return the share of the lead of one-step lookahead over the first reference."""
+def _gap(counted: Counted, reference: str) -> pd.DataFrame:
+    """Return the share of the lead of one-step lookahead over the reference."""
     right = counted.only(["accuracy"])
-    of_each = dict(zip(right.keys, right.top.T, strict=True))
+    mean = dict(zip(right.keys, right.top.mean(0).tolist(), strict=True))
     rows = []
-    for key, own in of_each.items():
-        share = np.nan
-        if references:
-            floor = of_each[key._replace(policy=references[0])]
-            ahead = of_each.get(key._replace(policy=ONE_STEP), floor)
-            lead = (ahead - floor).mean()
-            share = (own - floor).mean() / lead if lead > 0 else np.nan
+    for key, own in mean.items():
+        floor = mean.get(key._replace(policy=reference), np.nan)
+        lead = mean.get(key._replace(policy=ONE_STEP), floor) - floor
+        share = (own - floor) / lead if lead > 0 else np.nan
         rows.append((*key._replace(measure="share_of_gap"), share, np.nan, np.nan))
     return measures_of(ALL, rows)
 
 
-def _after(
-    grid: Grid,
-    policies: Sequence[str],
-    counts: Sequence[int],
-    objects: Index,
-    families: Index,
-) -> Counted:
-    """Return accuracy and travel of objects after numbers of views, or at the end of a path."""
-    sums: dict[Key, tuple[Float, Float]] = {}
+def _after(grid: Grid, policies: Sequence[str], counts: Sequence[int]) -> pd.DataFrame:
+    """Return the long table after numbers of views, or at the end of a path."""
+    parts = []
     for policy in policies:
         path = grid.paths[policy]
-        last = np.minimum((path.views >= 0).sum(1)[:, None], counts) - 1
-        at = np.arange(len(path.views))[:, None], last
-        right = path.answers[at] == grid.specs.labels[:, None]
-        for measure, values in (("accuracy", right), ("travel", path.travel[at])):
-            mean = grid_mean(grid, values.astype(np.float64))[objects]
-            sums |= {
-                Key(policy, None, k, measure): (mean[:, i], np.ones(len(objects)))
-                for i, k in enumerate(counts)
+        rows = np.arange(len(path.views))
+        for k in counts:
+            last = np.minimum((path.views >= 0).sum(1), k) - 1
+            columns = {
+                "policy": policy,
+                "threshold": np.nan,
+                "views": k,
+                "object": grid.specs.objects,
+                ONE: 1.0,
+                "right": path.answers[rows, last] == grid.specs.labels,
+                "travel": path.travel[rows, last],
             }
-    return Counted.of(sums, families)
-
-
-def grid_mean(grid: Grid, values: NDArray) -> Float:
-    """Average over the runs of each object.
-
-    Args:
-        grid: the episodes.
-        values: of the episodes, (E, ...).
-
-    Returns:
-        Means, (N, ...) float64.
-    """
-    return values.reshape(grid.runs, -1, *values.shape[1:]).mean(0)
+            parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)

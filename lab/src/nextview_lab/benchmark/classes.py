@@ -15,11 +15,13 @@ from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_stopping import own_stopping
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ClassResults, ClassTables, summarise
 from nextview_lab.benchmark.entries import default_entries
-from nextview_lab.benchmark.leaderboard import after_views_rows
+from nextview_lab.benchmark.jobs import Settings
+from nextview_lab.benchmark.leaderboard import after_views_table
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
-from nextview_lab.benchmark.results import RECORD, markdown, write_results
+from nextview_lab.benchmark.results import RECORD, write_results
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import EntryError
 from nextview_lab.extras import extras
@@ -31,7 +33,7 @@ with extras():
 
 
 @dataclass(frozen=True)
-class ClassSettings:
+class ClassSettings(Settings):
     """Policies, thresholds and statistics.
 
     Attributes:
@@ -49,24 +51,17 @@ class ClassSettings:
         split: use only objects of this split; needed if the predictions contain several.
         runs: random first views of each object.
         max_views: largest number of views.
-        reference: policy with which the others are compared.
-        samples: number of bootstrap samples.
-        seed: seed of first views, random policies and the bootstrap.
     """
 
-    policies: tuple[str, ...] = ()
     models: str = "modelnet10"
     thresholds: tuple[float, ...] = THESIS_THRESHOLDS
     risks: tuple[float, ...] = ()
-    views: tuple[int, ...] = ()
     stopping: str | None = None
     uncalibrated: bool = False
     split: Literal["train", "test", "val"] | None = None
     runs: int = 10
     max_views: int = 5
-    reference: str = "random"
     samples: int = 2000
-    seed: int = 0
 
 
 def benchmark_classes(
@@ -123,9 +118,8 @@ def benchmark_classes(
 
     def more(part: Path) -> None:
         _write_episodes(part / "episodes.parquet", grid)
-        if settings.views:
-            rows = after_views_rows(tables)
-            text = markdown(rows.columns, rows.itertuples(index=False))
+        if after := after_views_table(tables):
+            text = markdown(after.headings, after.rows)
             (part / "views.md").write_text(text, encoding="utf-8")
         table.save(part / "predictions.npz")
 

@@ -1,20 +1,44 @@
-"""Compare policies: one format of measures and tests for all benchmarks."""
+"""Compare policies by one long table of episodes: measures, intervals and tests.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+A row of the table is what a policy had in one episode, after a number of views or at the end. All
+benchmarks make such a table, and all measures are ratios of sums over the objects of its rows.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from nextview.types import Float, Index
+from nextview.types import Float, Index, Mask
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.sums import SIGNIFICANT, Key, Sums, too_few_families
 from nextview_lab.extras import extras
 
 with extras():
     import pandas as pd
 
 ALL = "all"  # the set of all objects
+# significance level of differences after Holm's correction
+SIGNIFICANT = 0.05
+CELL = ["policy", "threshold", "views"]  # columns that say of what a row is
+ONE = "one"  # column of ones, the denominator of means over episodes
+
+
+class Key(NamedTuple):
+    """Identifies a number.
+
+    Attributes:
+        policy: its name.
+        threshold: of the belief, at which episodes stop; None without a threshold.
+        views: number of views; 0 for whole episodes.
+        measure: its name.
+    """
+
+    policy: str
+    threshold: float | None
+    views: int
+    measure: str
+
 
 MEASURE_COLUMNS = ["set", *Key._fields, "value", "low", "high"]
 TEST_COLUMNS = ["set", *Key._fields, "reference", "difference", "low", "high", "p"]
@@ -48,8 +72,72 @@ class Tables:
         return {name: table for name, table in there if isinstance(table, pd.DataFrame)}
 
 
-class Counted(Sums):
-    """The same sums, whose measures and differences are rows of ``Tables``."""
+# by measure: columns of its numerator and of its denominator
+Ratios = Mapping[str, tuple[str, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """M measures of policies on N objects, each a ratio of sums over the objects.
+
+    Attributes:
+        keys: of the measures.
+        top: numerators, (N, M) float64.
+        bottom: denominators, (N, M) float64.
+        families: family index of each object, (N,) int64; families are resampled as a whole.
+    """
+
+    keys: tuple[Key, ...]
+    top: Float
+    bottom: Float
+    families: Index
+
+    @classmethod
+    def of(
+        cls, episodes: "pd.DataFrame", after: Ratios, ends: Ratios, families: Index
+    ) -> Self:
+        """Count the measures of a long table of episodes.
+
+        Args:
+            episodes: columns CELL; "object", the same objects in every cell; and those of the
+                measures. Several episodes of an object are averaged.
+            after: measures of rows after a number of views.
+            ends: measures of whole episodes, whose "views" is 0.
+            families: family index of each object, in their order, (N,).
+        """
+        keys = []
+        tops = []
+        bottoms = []
+        cells = episodes.groupby(CELL, sort=False, dropna=False)
+        cell: Any
+        for cell, rows in cells:
+            policy, threshold, views = cell
+            ratios = after if views else ends
+            columns = list(dict.fromkeys(sum(ratios.values(), ())))
+            means = rows.groupby("object")[columns].mean()
+            at = None if np.isnan(threshold) else float(threshold)
+            for measure, (top, bottom) in ratios.items():
+                keys.append(Key(policy, at, int(views), measure))
+                tops.append(means[top].to_numpy(np.float64))
+                bottoms.append(means[bottom].to_numpy(np.float64))
+        return cls(tuple(keys), np.stack(tops, 1), np.stack(bottoms, 1), families)
+
+    def only(self, measures: Sequence[str]) -> Self:
+        """Select measures by name."""
+        kept = [i for i, key in enumerate(self.keys) if key.measure in measures]
+        keys = tuple(self.keys[i] for i in kept)
+        return replace(
+            self, keys=keys, top=self.top[:, kept], bottom=self.bottom[:, kept]
+        )
+
+    def among(self, objects: Mask) -> Self:
+        """Select objects, by a mask, (N,) bool."""
+        return replace(
+            self,
+            top=self.top[objects],
+            bottom=self.bottom[objects],
+            families=self.families[objects],
+        )
 
     def measures(
         self,
@@ -64,8 +152,10 @@ class Counted(Sums):
             weights: bootstrap weight of each object in each sample, (S, N).
             labels: class of each object, (N,), for means over classes; None for sums over objects.
         """
-        numbers = self.estimates(weights, labels)
-        return measures_of(name, [(*key, *number) for key, number in numbers.items()])
+        value, drawn = st.estimate(self.top, self.bottom, weights, labels)
+        numbers = np.stack([value, *st.interval(drawn)], 1).tolist()
+        rows = [(*key, *row) for key, row in zip(self.keys, numbers, strict=True)]
+        return measures_of(name, rows)
 
     def tests(
         self,
@@ -82,8 +172,26 @@ class Counted(Sums):
             reference: the policy; its measures have the same denominators.
             tested: selects the measures to compare.
         """
-        found = self.differences(weights, reference, tested)
-        return tests_of(name, reference, [(*one, self.family_count) for one in found])
+        place = {key: i for i, key in enumerate(self.keys)}
+        pairs = [
+            (place[key], place[rival])
+            for key in self.keys
+            if key.policy != reference and tested(key)
+            if (rival := key._replace(policy=reference)) in place
+        ]
+        if not pairs:
+            return tests_of(name, reference, [])
+
+        own, theirs = np.array(pairs).T
+        apart = self.top[:, own] - self.top[:, theirs]
+        value, drawn = st.estimate(apart, self.bottom[:, own], weights)
+        p = st.sign_flip_p(st.by_family(apart, self.families))
+        numbers = np.stack([value, *st.interval(drawn), p], 1).tolist()
+        count = int(self.families.max()) + 1
+        rows = [
+            (self.keys[i], *row, count) for i, row in zip(own, numbers, strict=True)
+        ]
+        return tests_of(name, reference, rows)
 
 
 def measures_of(name: str, rows: Sequence[tuple]) -> "pd.DataFrame":
@@ -137,25 +245,36 @@ def too_few(tests: "pd.DataFrame") -> dict[str, str]:
     tested = tests[tests["p"].notna()]
     found = {}
     for name, rows in tested.groupby("set", sort=False):
-        sentence = too_few_families(int(rows["families"].iloc[0]), len(tested))
-        if sentence is not None:
-            found[str(name)] = sentence
+        families = int(rows["families"].iloc[0])
+        # two-sided sign flips of n families have p-values of 2^(1 - n) and more
+        wanted = families
+        while (
+            wanted < st.EXACT_FAMILIES
+            and len(tested) * 2.0 ** (1 - wanted) >= SIGNIFICANT
+        ):
+            wanted += 1
+        if wanted > families:
+            found[str(name)] = (
+                f"Too few to tell: no p-value of {families} is below"
+                f" {2.0 ** (1 - families):.2g}, and {len(tested)} tests are corrected together, so"
+                f" that no difference can be significant; it takes {wanted} or more."
+            )
     return found
 
 
 def values_of(
-    tables: Tables,
+    measures: "pd.DataFrame",
     name: str,
     threshold: float | None = None,
 ) -> dict[tuple[str, str, int], Any]:
     """Return value, low and high by policy, measure and number of views.
 
     Args:
-        tables: of the benchmark.
+        measures: of the benchmark, see ``Tables``.
         name: of the set of objects.
         threshold: of the belief; None for measures without a threshold.
     """
-    some = tables.measures[tables.measures["set"] == name]
+    some = measures[measures["set"] == name]
     at = some["threshold"]
     some = some[at.isna() if threshold is None else at == threshold]
     keys = zip(some["policy"], some["measure"], some["views"], strict=True)

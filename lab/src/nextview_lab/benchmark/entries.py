@@ -9,7 +9,7 @@ from scipy.special import log_softmax
 from nextview.checks import did_you_mean
 from nextview.errors import OtherUseError
 from nextview.policies.base import Policy, Scope
-from nextview.policies.baselines import ViewList, orbit, ranked
+from nextview.policies.baselines import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import (
@@ -24,7 +24,7 @@ from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, ma
 from nextview.recognition.model_card import DISCRIMINATE
 from nextview.types import Index
 from nextview_lab.benchmark.oracle import OracleGain, OracleMeasure, OracleValley
-from nextview_lab.benchmark.true_maps import TRUE, known_maps, stored_rows, true_measure
+from nextview_lab.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.scene_views import SceneSight
 from nextview_lab.errors import EntryError
@@ -157,28 +157,17 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
         EntryError: the predictions lack what the policy needs.
     """
     policy = _make(name, specs)
-    if (
-        "observations" in policy.needs
-    ):  # predictions contain no depth, so the paths are planned in advance
-        return ViewList(
-            stored_rows(specs.predictions, f"plans/{name}")[
-                specs.objects,
-                specs.starts,
-            ].astype(np.int64)
-        )
-
     p = specs.predictions
     there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
     there |= {"joint"} if p.calibration.hypotheses else set()
     lacking = [wanted for wanted in policy.needs if wanted not in there]
     if lacking:
-        bins = lacking[0] == "azimuth_bins"
-        what = (
-            "what the recogniser says of the azimuth bins"
-            if bins
-            else f"the map {lacking[0]!r}"
-        )
+        known = {
+            "azimuth_bins": "what the recogniser says of the azimuth bins",
+            "observations": "the depth of the views",
+        }
+        what = known.get(lacking[0], f"the map {lacking[0]!r}")
         raise EntryError(f"policy {name} needs {what}, which these predictions lack")
 
     return policy

@@ -2,8 +2,7 @@
 
 Importing this module registers them:
 
-- ``nextview/Recognise-v0``: replays a file of predictions, thousands of episodes in one batch,
-  without rendering.
+- ``nextview/Recognise-v0``: replays a file of predictions, without rendering.
 - ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
 - ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
 """
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import number, one_line, whole
 from nextview.data.folders import list_dataset
@@ -43,7 +41,7 @@ from nextview.recognition.map_names import in_order
 from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.types import Float, Float32, Index, Mask
+from nextview.types import Float, Float32, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
@@ -51,18 +49,12 @@ from nextview_lab.training.rollout import OBJECTIVES, value_of
 
 with extras():
     import gymnasium
-    from gymnasium.vector import AutoresetMode, VectorEnv
-    from gymnasium.vector.utils import batch_space
 
 log = logging.getLogger(__name__)
 PredictionsSource = str | Path | Predictions
 CAMERAS = 16  # meshes that are cached
 _HERE = "nextview_lab.benchmark.environments"
-gymnasium.register(
-    "nextview/Recognise-v0",
-    f"{_HERE}:RecogniseEnv",
-    vector_entry_point=f"{_HERE}:RecogniseVectorEnv",
-)
+gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv")
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
 gymnasium.register(
     "nextview/RecogniseThings-v0",
@@ -187,39 +179,6 @@ class EnvironmentTask:
     rules: Rules = Rules()
     balanced: bool = False
 
-    def __post_init__(self) -> None:
-        whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
-
-    def begin(
-        self,
-        n: int,
-        rng: np.random.Generator,
-        options: Info | None = None,
-    ) -> "Cohort":
-        """Begin episodes.
-
-        Args:
-            n: number of episodes.
-            rng: source of all random numbers.
-            options: of ``reset``: "object" and "start" of each episode; random by default.
-
-        Returns:
-            The episodes.
-
-        Raises:
-            UsageError: an option is not valid.
-        """
-        weight = 1 / np.bincount(self.labels)[self.labels]
-        chance = weight / weight.sum() if self.balanced else None
-        objects = rng.choice(len(self.labels), n, p=chance)
-        starts = rng.integers(len(self.sphere), size=n)
-        given = {"object": objects, "start": starts} | (options or {})
-        below = {"object": len(self.labels), "start": len(self.sphere)}
-        return Cohort(
-            self,
-            *(rows(given[name], n, most, name) for name, most in below.items()),
-        )
-
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Space of ``policies.gain.features``, (D,) float32; all but the maps are in 0 to 1."""
@@ -240,11 +199,6 @@ class EnvironmentTask:
             np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
             high.astype(np.float32),
         )
-
-    @property
-    def action_space(self) -> gymnasium.spaces.Discrete:
-        """Ring and azimuth steps ahead, as ``ring * azimuths + steps``; V actions."""
-        return gymnasium.spaces.Discrete(len(self.sphere))
 
 
 def replayed(
@@ -314,163 +268,61 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of a cohort: takes the free view nearest to the agent's action.
+    """The policy of an agent: takes the view that it asks for, or the free one nearest to it.
 
     Attributes:
         sphere: of the views.
-        views: requested views, one per episode.
+        view: the view.
         needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
-    views: Index
+    view: int
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Return the free view nearest to the requested one.
+        """Return the view, (1,).
 
         Args:
-            state: the state of B episodes with V candidate views.
+            state: of the episode.
             rng: source of all random numbers.
-
-        Returns:
-            The next view of each episode, (B,) int64.
         """
-        return np.where(
-            state.free,
-            self.sphere.travel[self.views[state.episodes]],
-            np.inf,
-        ).argmin(1)
+        return np.where(state.free, self.sphere.travel[self.view], np.inf).argmin(1)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """Outcomes of the actions in A episodes.
+class ViewsEnv(gymnasium.Env[Any, Any]):
+    """Episodes in which an agent takes views: its actions, its rewards, and their end.
 
-    Attributes:
-        observation: (A, D) float32.
-        change: of the objective, (A,).
-        price: of the view and the travel to it, (A,).
-        ended: whether each episode has ended, (A,) bool.
-        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer", its
-            "confidence", "prediction_target" and "action_mask", the actions that lead to an
-            unvisited view, (A, V) int8.
+    An action is a ring and a number of azimuth steps ahead: ``ring * azimuths + steps``. One that
+    leads to a visited view goes to the nearest free one. The reward is the change of the objective
+    minus the prices. Kinds of episodes define ``begin`` and ``take``.
     """
-
-    observation: Float32
-    change: Float
-    price: Float
-    ended: Mask
-    info: dict[str, NDArray[Any]]
-
-
-class Cohort:
-    """B episodes that run side by side, all with the same number of views.
-
-    ``first`` is the outcome before any action.
-    """
-
-    def __init__(self, task: EnvironmentTask, objects: Index, starts: Index) -> None:
-        self.task = task
-        self.objects = objects
-        self._asked = Asked(task.sphere, np.array(starts))
-        # not used for any draw
-        rng = np.random.default_rng(0)
-        stopping = task.rules.stopping(task.calibration)
-        self.episodes = Episodes(
-            task.sphere,
-            self._asked,
-            starts,
-            stopping,
-            rng,
-            task.calibration,
-        )
-        self._visited = np.zeros((len(objects), len(task.sphere)), bool)
-        self._value = np.zeros(len(objects))
-        self._travel = np.zeros(len(objects))
-        self.first = self._look(np.zeros(len(objects)))
-
-    def step(self, actions: Index) -> Seen:
-        """Continue all running episodes; visited views are replaced by the nearest free ones."""
-        sphere = self.task.sphere
-        running = self.episodes.running
-        rules = self.task.rules
-        # ``current`` is the next view
-        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]
-        self._asked.views[running] = self._reached[np.arange(len(running)), actions]
-        self.episodes.keep_choice(self.episodes.next_choice())
-        way = sphere.travel[before, self.episodes.current[running]]
-        self._travel[running] += way
-        return self._look(rules.view_price + rules.travel_price * way)
-
-    def _look(self, price: Float) -> Seen:
-        task = self.task
-        running = self.episodes.running
-        k = len(self.episodes.steps) + 1
-        sphere = task.sphere
-        calibration = task.calibration
-        classes = len(task.classes)
-        objects = self.objects[running]
-        views = self.episodes.current[running]
-
-        step = self.episodes.update(task.observe(objects, views))
-        n_seen = np.maximum(step.seen, 1)
-        self._visited[running, views] = True
-        visited = self._visited[running]
-        labels = task.labels[objects]
-
-        azimuth_bins = calibration.azimuth_bins(
-            step.total,
-            n_seen,
-            classes,
-            sphere.azimuth[views],
-        )
-        state = EpisodeState(
-            views,
-            visited,
-            step.belief,
-            step.evidence,
-            k,
-            running,
-            azimuth_bins,
-        )
-        value = value_of(
-            calibration.log_belief(step.total, n_seen, classes),
-            labels,
-            task.rules.objective,
-        )
-
-        change = value - self._value[running] if k > 1 else np.zeros(len(running))
-        self._value[running] = value
-        reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
-        self._reached = reached[~step.stopped]
-
-        info = {
-            "object": objects,
-            "view": views,
-            "n_views": np.full(len(running), k),
-            "travel": self._travel[running],
-            "answer": step.belief.argmax(1),
-            "confidence": step.belief.max(1),
-            "prediction_target": labels,
-            "action_mask": (~np.take_along_axis(visited, reached, 1)).astype(np.int8),
-        }
-        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(
-            np.float32
-        )
-        return Seen(seen, change, price, step.stopped, info)
-
-
-class TaskEnv(gymnasium.Env[Any, Any]):
-    """A task as an environment with one episode at a time."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
-    def __init__(self, task: EnvironmentTask) -> None:
-        self.task = task
-        self.observation_space = task.observation_space
-        self.action_space = task.action_space
-        self._cohort: Cohort | None = None
+    def __init__(self, sphere: ViewSphere, rules: Rules) -> None:
+        whole(rules.max_views, "the number of views", 2, len(sphere))
+        self.sphere = sphere
+        self.rules = rules
+        self.action_space = gymnasium.spaces.Discrete(len(sphere))
+        # view that each action leads to, (V,); None where no episode is under way
+        self.reached: Index | None = None
+
+    def begin(self, options: Info) -> int:
+        """Begin an episode, and return its first view.
+
+        Args:
+            options: of ``reset``.
+        """
+        raise NotImplementedError
+
+    def take(self, view: int) -> tuple[Any, float, Index | None, Info]:
+        """Take a view: the observation, the objective, what actions lead to, and the info.
+
+        Args:
+            view: that is free.
+        """
+        raise NotImplementedError
 
     def reset(
         self,
@@ -478,43 +330,143 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         seed: int | None = None,
         options: Info | None = None,
     ) -> tuple[Any, Info]:
-        """Begin an episode; see Gymnasium.
+        """Begin an episode; its first view is not chosen by the agent.
 
         Args:
             seed: of the random numbers; None to continue their sequence.
-            options: "object" and "start"; random by default.
+            options: numbers of the episode; random by default.
 
         Returns:
             The first observation and its info.
         """
         super().reset(seed=seed)
-        self._cohort = self.task.begin(1, self.np_random, options)
-        return self.observed(self._cohort.first), info_of(self._cohort.first)
+        self.views = [self.begin(options or {})]
+        self.travel = 0.0
+        observation, self._value, self.reached, info = self.take(self.views[0])
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        seen = self.go(action)
-        return (
-            self.observed(seen),
-            float((seen.change - seen.price)[0]),
-            bool(seen.ended[0]),
-            False,
-            info_of(seen),
-        )
-
-    def go(self, action: Any) -> Seen:
-        """Return the outcome of an action."""
-        if self._cohort is None or len(self._cohort.episodes.running) == 0:
+        """Take a view; see Gymnasium."""
+        if self.reached is None:
             raise SessionError("no episode is under way; call reset")
-        return self._cohort.step(rows(action, 1, len(self.task.sphere), "action"))
+        chosen = int(rows(action, 1, len(self.sphere), "action")[0])
+        away = self.sphere.travel[self.reached[chosen]].copy()
+        away[self.views] = np.inf
+        view = int(away.argmin())
+        way = float(self.sphere.travel[self.views[-1], view])
+        self.views.append(view)
+        self.travel += way
 
-    def observed(self, seen: Seen) -> Any:
-        """Return the observation of the single episode."""
-        return seen.observation[0]
+        earlier = self._value
+        observation, self._value, self.reached, info = self.take(view)
+        price = self.rules.view_price + self.rules.travel_price * way
+        over = self.reached is None
+        return observation, self._value - earlier - price, over, False, info
+
+    def drawn(self, options: Info, below: dict[str, int]) -> list[int]:
+        """Return numbers of an episode: those of the options, or else random ones.
+
+        Args:
+            options: of ``reset``.
+            below: upper limit of each number, exclusive, by name.
+
+        Raises:
+            UsageError: an option is not valid.
+        """
+        found = {name: self.np_random.integers(most) for name, most in below.items()}
+        given = found | options
+        return [
+            int(rows(given[name], 1, most, name)[0]) for name, most in below.items()
+        ]
 
 
-def info_of(seen: Seen) -> Info:
-    """Return the info of a single episode."""
-    return {name: values[0] for name, values in seen.info.items()}
+class TaskEnv(ViewsEnv):
+    """A task as an environment.
+
+    The info holds "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
+    "prediction_target" and "action_mask", the actions that lead to an unvisited view, (V,) int8.
+    """
+
+    def __init__(self, task: EnvironmentTask) -> None:
+        super().__init__(task.sphere, task.rules)
+        self.task = task
+        self.observation_space = task.observation_space
+
+    def begin(self, options: Info) -> int:
+        """Begin an episode; see ``ViewsEnv``.
+
+        Args:
+            options: "object" and "start".
+        """
+        task = self.task
+        weight = 1 / np.bincount(task.labels)[task.labels]
+        chance = weight / weight.sum() if task.balanced else None
+        object_ = {"object": self.np_random.choice(len(task.labels), p=chance)}
+        below = {"object": len(task.labels), "start": len(task.sphere)}
+        number, start = self.drawn(object_ | options, below)
+        self._objects = np.array([number])
+        self._asked = Asked(task.sphere, start)
+        self._episodes = Episodes(
+            task.sphere,
+            self._asked,
+            np.array([start]),
+            task.rules.stopping(task.calibration),
+            np.random.default_rng(0),  # not used for any draw
+            task.calibration,
+        )
+        return start
+
+    def take(self, view: int) -> tuple[Any, float, Index | None, Info]:
+        """Take a view; see ``ViewsEnv``.
+
+        Args:
+            view: that is free.
+        """
+        episodes = self._episodes
+        if episodes.steps:
+            self._asked.view = view
+            episodes.keep_choice(episodes.next_choice())
+        task = self.task
+        calibration = task.calibration
+        here = np.array([view])
+        step = episodes.update(task.observe(self._objects, here))
+        n_seen = np.maximum(step.seen, 1)
+        visited = np.zeros((1, len(task.sphere)), bool)
+        visited[0, self.views] = True
+        labels = task.labels[self._objects]
+        classes = len(task.classes)
+        state = EpisodeState(
+            here,
+            visited,
+            step.belief,
+            step.evidence,
+            len(self.views),
+            np.zeros(1, np.int64),
+            calibration.azimuth_bins(
+                step.total, n_seen, classes, task.sphere.azimuth[here]
+            ),
+        )
+        logs = calibration.log_belief(step.total, n_seen, classes)
+        value = float(value_of(logs, labels, task.rules.objective)[0])
+        inputs, frame = task.rules.inputs, task.rules.frame
+        reached = cells_from(task.sphere)[origin(task.sphere, state, frame)][0]
+        seen = features(task.sphere, state, inputs, frame)[0].astype(np.float32)
+        info = {
+            "object": self._objects[0],
+            "view": view,
+            "n_views": len(self.views),
+            "travel": self.travel,
+            "answer": step.belief[0].argmax(),
+            "confidence": step.belief[0].max(),
+            "prediction_target": labels[0],
+            "action_mask": (~visited[0, reached]).astype(np.int8),
+        }
+        going = reached if len(episodes.running) else None
+        return self.observed(seen), value, going, info
+
+    def observed(self, state: Float32) -> Any:
+        """Return the observation with a state, (D,)."""
+        return state
 
 
 class RecogniseEnv(TaskEnv):
@@ -531,118 +483,6 @@ class RecogniseEnv(TaskEnv):
         **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
-
-
-class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
-    """Many episodes of a task at once, grouped in cohorts by number of views."""
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
-    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
-
-    def __init__(self, task: EnvironmentTask, num_envs: int) -> None:
-        self.task = task
-        self.num_envs = whole(num_envs, "the number of environments", 1)
-        self.single_observation_space = task.observation_space
-        self.single_action_space = task.action_space
-        self.observation_space = batch_space(task.observation_space, num_envs)
-        self.action_space = batch_space(task.action_space, num_envs)
-        self._cohorts: list[tuple[Cohort, Index]] = []
-
-    def reset(
-        self,
-        *,
-        seed: int | None = None,
-        options: Info | None = None,
-    ) -> tuple[Float32, Info]:
-        """Begin an episode in every environment; see Gymnasium.
-
-        Args:
-            seed: of the random numbers; None to continue their sequence.
-            options: "object" and "start" of each episode; random by default.
-
-        Returns:
-            The first observations, (E, D) float32, and their infos.
-        """
-        super().reset(seed=seed)
-        cohort = self.task.begin(self.num_envs, self.np_random, options)
-        self._cohorts = [(cohort, np.arange(self.num_envs))]
-        return cohort.first.observation, cohort.first.info
-
-    def step(self, actions: Any) -> tuple[Float32, NDArray, Mask, Mask, Info]:
-        seen, info = self.go(actions)
-        return (
-            seen.observation,
-            seen.change - seen.price,
-            seen.ended,
-            np.zeros(self.num_envs, bool),
-            info,
-        )
-
-    def go(self, actions: Any) -> tuple[Seen, Info]:
-        """Return the next observation of each episode; ended episodes are replaced by new ones."""
-        if not self._cohorts:
-            raise SessionError("no episode is under way; call reset")
-
-        actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
-        wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
-        parts = [
-            cohort.step(actions[where])
-            for (cohort, _), where in zip(self._cohorts, wheres, strict=True)
-        ]
-
-        order = np.argsort(np.concatenate(wheres))
-        names = ("observation", "change", "price", "ended")
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order]
-            for name in names
-        }
-        info = {
-            name: np.concatenate([part.info[name] for part in parts])[order]
-            for name in parts[0].info
-        }
-
-        seen = Seen(**joined, info=info)
-        self._cohorts = [
-            (cohort, members)
-            for cohort, members in self._cohorts
-            if len(cohort.episodes.running)
-        ]
-
-        over = np.flatnonzero(seen.ended)
-        if len(over) == 0:
-            return seen, info
-        last = seen.observation.copy()
-        now = {name: values.copy() for name, values in info.items()}
-
-        fresh = self.task.begin(len(over), self.np_random)
-        self._cohorts.append((fresh, over))
-        seen.observation[over] = fresh.first.observation
-        for name, values in fresh.first.info.items():
-            now[name][over] = values
-
-        return seen, now | {
-            "final_obs": last,
-            "_final_obs": seen.ended,
-            "final_info": info,
-            "_final_info": seen.ended,
-        }
-
-
-class RecogniseVectorEnv(TaskVectorEnv):
-    """Vector version of ``RecogniseEnv`` with ``num_envs`` episodes side by side."""
-
-    def __init__(
-        self,
-        num_envs: int,
-        predictions: PredictionsSource,
-        split: EnvironmentSplit = "train",
-        balanced: bool = False,
-        **rules: Any,
-    ) -> None:
-        super().__init__(
-            replayed(predictions, split, balanced, Rules(**rules)),
-            num_envs,
-        )
 
 
 class RecogniseMeshEnv(TaskEnv):
@@ -743,7 +583,6 @@ class RecogniseMeshEnv(TaskEnv):
         self._last = seen[-1]
         return self._models.evidence(seen)
 
-    def observed(self, seen: Seen) -> Any:
+    def observed(self, state: Float32) -> Any:
         """Return the state, with the depth image if requested."""
-        state = super().observed(seen)
         return {"state": state, "depth": self._last.depth} if self._depth else state

@@ -90,7 +90,7 @@ def compared(results: ClassResults) -> list[str]:
     names = list(results.tables.sweep["policy"].unique())
     reference = results.settings["reference"]
     headline = headline_threshold(results.settings["thresholds"])
-    values = values_of(results.tables, ALL, headline)
+    values = values_of(results.tables.measures, ALL, headline)
     robots = sorted(
         (n for n in names if not is_oracle(n)),
         key=lambda n: (n != reference, -values[n, "accuracy", 0][0]),
@@ -125,7 +125,7 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
         what: description of the share.
     """
     figure, axes = new_figure(4.6, 3.5)
-    values = values_of(tables, ALL)
+    values = values_of(tables.measures, ALL)
     views = sorted({k for _, name, k in values if name == measure})
     policies = tables.policies()
     for row, policy in enumerate(policies):
@@ -325,7 +325,7 @@ def reliability_diagram(
     Returns:
         The figure.
     """
-    values = values_of(results.tables, ALL, threshold)
+    values = values_of(results.tables.measures, ALL, threshold)
     table = results.tables.reliability.query("threshold == @threshold").rename(
         columns={"episodes": "answers"}
     )

@@ -13,12 +13,46 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from nextview.checks import whole
 from nextview.data import pool
 from nextview.data.progress import TrackProgress
-from nextview.errors import ResultsError
+from nextview.errors import ResultsError, UsageError
 from nextview.files import check_new, read_record, write_record
 
 EPISODES_FILE = "episodes.json"  # conditions of the episodes in a folder
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Policies and statistics of any benchmark.
+
+    Attributes:
+        policies: names of policies, or MODULE:NAME for your own; by default all that the input
+            allows. In a folder of results only missing ones run; your own always run again.
+        reference: policy with which the others are compared; it is always included.
+        views: numbers of views after which the policies are compared; the largest is the length of
+            an episode, unless that has an option of its own.
+        samples: number of bootstrap samples.
+        seed: seed of all that is drawn: objects and their places, first views, noise, and random
+            policies.
+    """
+
+    policies: tuple[str, ...] = ()
+    reference: str = "random"
+    views: tuple[int, ...] = ()
+    samples: int = 10_000
+    seed: int = 0
+
+    def check(self) -> None:
+        """Check the settings before any work is done.
+
+        Raises:
+            UsageError: a number is invalid.
+        """
+        whole(self.samples, "the samples of the bootstrap", 100)
+        if not self.views or list(self.views) != sorted(set(self.views)):
+            raise UsageError("the numbers of views ascend, as in --views 1 2 3")
+        whole(self.views[0], "a number of views", 1)
 
 
 Runs = TypeVar("Runs", bound=msgspec.Struct)

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
+from nextview_lab.benchmark.board_page import Board, Column, WrittenTable, written
 from nextview_lab.benchmark.class_tables import ClassTables
 from nextview_lab.benchmark.comparison import (
     ALL,
     SIGNIFICANT,
     Tables,
+    significant,
     too_few,
     values_of,
 )
@@ -70,7 +70,7 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
     """
     rows = []
     for risk, threshold in risks.items():
-        values = values_of(tables, ALL, threshold)
+        values = values_of(tables.measures, ALL, threshold)
         for policy in dict.fromkeys(policy for policy, _, _ in values):
             # the upper limit of the accuracy is the lower limit of the error
             right, high, low = values[policy, "confident_accuracy", 0]
@@ -98,7 +98,7 @@ def levels_in(tables: Tables) -> dict[str, dict[str, Any]]:
         found[str(name)] = {
             "views": rows["views"].unique().tolist(),
             "policies": sorted(rows["policy"].unique(), key=is_oracle),
-            "values": values_of(tables, str(name)),
+            "values": values_of(tables.measures, str(name)),
             "tests": tests.set_index(["policy", "views"]).to_dict("index"),
         }
     return found
@@ -195,45 +195,14 @@ def _robot_tests(tables: Tables, threshold: float) -> "pd.DataFrame":
     return tests[~tests["policy"].map(is_oracle).astype(bool)]
 
 
-def after_views_rows(tables: Tables) -> "pd.DataFrame":
-    """Return the results after fixed numbers of views as formatted text, one row per policy."""
+def after_views_table(tables: Tables) -> WrittenTable | None:
+    """Return the results after fixed numbers of views as text; None if there are none."""
     after = tables.measures.query("set == @ALL and views > 0")
-    tested = tables.tests.query("set == @ALL and views > 0")
-    keys = ["policy", "reference", "views"]
-    tests = tested.set_index(keys)[["difference", "p_holm"]]
-    values = values_of(tables, ALL)
-    n_views = [int(k) for k in after["views"].unique()]
-    at = " at " + ", ".join(map(str, n_views))
-
-    def difference(name: str, reference: str, k: int) -> str:
-        place: Any = name, reference, k
-        value, p = tests.loc[place]
-        # rounded first, to avoid a negative zero
-        shown = f"{round(100 * value, 1) + 0.0:+.1f}"
-        if np.isnan(p):  # upper bounds are not tested
-            return shown
-        return f"{shown} (p {'< 0.0001' if p < 1e-4 else f'{p:.2g}'})"
-
-    rows = []
-    for name in after["policy"].unique():
-        row = {"policy": name}
-        for k in n_views:
-            row[f"{k} view{'s' * (k > 1)}"] = "{:.3f} ({:.3f}-{:.3f})".format(
-                *values[name, "accuracy", k]
-            )
-        row[f"travel{at}"] = ", ".join(
-            f"{values[name, 'travel', k][0]:.2f}" for k in n_views
-        )
-        for reference in tested["reference"].unique():
-            over = (
-                ""
-                if name == reference
-                else ", ".join(difference(name, reference, k) for k in n_views)
-            )
-            row[f"points over {reference}{at}"] = over
-        shares = [values[name, "share_of_gap", k][0] for k in n_views]
-        row[f"of the gap{at}"] = ", ".join(
-            "-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares
-        )
-        rows.append(row)
-    return pd.DataFrame(rows)
+    counts = [int(k) for k in after["views"].unique()]
+    columns = [Column(f"{k} view{'s' * (k > 1)}", ("accuracy",), k) for k in counts]
+    for what, measure in (("travel", "travel"), ("of the gap", "share_of_gap")):
+        columns += [Column(f"{what} at {k}", (measure,), k, 2) for k in counts]
+    board = Board(f"points over {tables.reference}: tests.csv", ALL, tuple(columns))
+    stars = significant(tables, ALL)
+    named = {column.heading: column for column in columns}
+    return written(tables, board, named, stars) if counts else None

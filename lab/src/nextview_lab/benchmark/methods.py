@@ -5,7 +5,7 @@ the same as one line of JSON on its standard input, and answers with one on its 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +21,6 @@ from nextview.files import decode_record
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import Directions, Viewpoints, ViewSphere
 from nextview.policies.base import Policy
-from nextview.policies.baselines import Furthest, RandomAll, Spread
-from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy_anywhere
 from nextview.recognition.belief import Stopping
 from nextview.sensing.frame import Frame, check_pose
@@ -33,11 +31,7 @@ from nextview.session.system import load
 from nextview.types import Float, Mask
 from nextview_lab.benchmark.frozen import FrozenView, Matrix, as_matrix, read_view
 from nextview_lab.benchmark.line_process import ONE_LINE, LineProcess, quoted
-from nextview_lab.benchmark.published_policies import (
-    PredictedEntropy,
-    SampledInformation,
-)
-from nextview_lab.benchmark.thing_policies import BLIND_RULES, RingSteps
+from nextview_lab.benchmark.thing_policies import BLIND_RULES, rules_of
 
 WORLD_UP = (0.0, 0.0, 1.0)  # against gravity, in the world of an archive
 STRAIGHT_DOWN = 0.99  # cosine, above which a camera looks from above
@@ -228,18 +222,7 @@ class NextviewMethod:
         return session
 
     def _make_policy(self, sphere: Viewpoints) -> Policy:
-        grid = self._sphere
-        known: dict[str, Callable[[], Policy]] = {
-            "random": lambda: RandomAll(sphere),
-            "spread": lambda: Spread(sphere),
-            "furthest": lambda: Furthest(grid),
-            "fixed": lambda: RingSteps(grid),
-            "ring": lambda: RingSteps(grid, 1),
-            "geometry": lambda: DiscriminateGeometry(sphere),
-            "sampled": lambda: SampledInformation(sphere),
-            "predicted": lambda: PredictedEntropy(sphere),
-        }
-
+        known = rules_of(sphere, self._sphere)
         if self._policy in known:
             return known[self._policy]()
         return make_policy_anywhere(

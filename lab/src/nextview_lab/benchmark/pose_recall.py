@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from nextview.types import Float, Floats
@@ -22,6 +23,18 @@ MSPD_WIDTH = 640
 # largest way of a point between two turns of a symmetry by any angle, parts of its distance from
 # the axis, as in bop_toolkit
 SYMMETRY_STEP = 0.01
+
+
+def add_s(points: Float, pose: Float, true: Float) -> float:
+    """Return the mean distance of points in a pose from the nearest points in the true pose.
+
+    Args:
+        points: of the surface, (N, 3).
+        pose: (4, 4).
+        true: pose, (4, 4).
+    """
+    here, there = (points @ one[:3, :3].T + one[:3, 3] for one in (pose, true))
+    return float(np.mean(cKDTree(there).query(here)[0]))
 
 
 def symmetries_of(info: BopModelInfo) -> Float:

@@ -84,8 +84,8 @@ def report(
             "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
             "tests": tables.tests,
         }
-        after = board.after_views_rows(tables)
-        shown |= {} if after.empty else {"views": after}
+        if after := board.after_views_table(tables):
+            shown["views"] = pd.DataFrame(after.rows, columns=list(after.headings))
         write_figures(
             figures,
             _figures(loaded, headline_policy(loaded, at), at),
@@ -105,7 +105,7 @@ def headline_policy(results: ClassResults, threshold: float) -> str:
     Returns:
         Its name; the reference if there is no other.
     """
-    found = values_of(results.tables, ALL, threshold)
+    found = values_of(results.tables.measures, ALL, threshold)
     reference = results.settings["reference"]
     names = [
         n

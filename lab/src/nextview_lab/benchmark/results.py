@@ -1,7 +1,7 @@
 """Write a folder of results: tables as CSV, Markdown and LaTeX, figures, and settings."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,8 @@ import numpy as np
 
 from nextview.files import new_folder
 from nextview.session.style import to_png
-from nextview_lab.benchmark.comparison import Tables, too_few, values_of
+from nextview_lab.benchmark.board_page import Board, markdown, written
+from nextview_lab.benchmark.comparison import Tables, too_few
 from nextview_lab.benchmark.figures import differences, views_curve
 from nextview_lab.extras import extras
 
@@ -18,46 +19,6 @@ with extras():
     import pandas as pd
 
 RECORD = "benchmark.json"
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table that compares policies.
-
-    Attributes:
-        heading: of the column.
-        measures: in a cell, separated by commas.
-        views: number of views; 0 for whole episodes.
-        digits: after the decimal point.
-        short: heading in narrow tables; "" if it is not part of them.
-    """
-
-    heading: str
-    measures: tuple[str, ...]
-    views: int = 0
-    digits: int = 3
-    short: str = ""
-
-
-@dataclass(frozen=True)
-class Board:
-    """A table that compares policies.
-
-    Attributes:
-        title: of the table.
-        name: of the set of objects.
-        columns: after the column of policy names.
-        about: a line below the title.
-    """
-
-    title: str
-    name: str
-    columns: tuple[Column, ...]
-    about: str = ""
-
-    def narrow(self) -> list[Column]:
-        """Return the columns of the narrow tables."""
-        return [column for column in self.columns if column.short]
 
 
 @dataclass(frozen=True)
@@ -103,59 +64,13 @@ def write_results(
         (part / RECORD).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
 
 
-def board_rows(
-    tables: Tables,
-    board: Board,
-    columns: Sequence[Column],
-    marked: Iterable[tuple[str, str, int]] = (),
-) -> Iterator[list[str]]:
-    """Iterate over the rows of a board as text: the policy, then a cell for each column.
-
-    Args:
-        tables: of the benchmark.
-        board: the table.
-        columns: of the table.
-        marked: policy, measure and views of the numbers marked with a star.
-
-    Yields:
-        The cells of a policy.
-    """
-    values = values_of(tables, board.name)
-    stars = set(marked)
-
-    def shown(policy: str, measure: str, column: Column) -> str:
-        value = values[policy, measure, column.views][0]
-        star = "*" * ((policy, measure, column.views) in stars)
-        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
-
-    for policy in tables.policies():
-        yield [
-            policy,
-            *(", ".join(shown(policy, m, c) for m in c.measures) for c in columns),
-        ]
-
-
-def markdown(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Format a table as Markdown.
-
-    Args:
-        head: headings.
-        rows: cells.
-    """
-    head = list(head)
-    lines = [head, *rows]
-    text = [f"| {' | '.join(map(str, line))} |" for line in lines]
-    return "\n".join([text[0], "|---" * len(head) + "|", *text[1:]]) + "\n"
-
-
 def compared_markdown(tables: ComparedTables) -> str:
     """Format the boards, followed by all tests, as Markdown."""
     parts = []
     for board in tables.boards:
-        head = ["policy", *(column.heading for column in board.columns)]
-        rows = board_rows(tables, board, board.columns)
+        text = written(tables, board, {one.heading: one for one in board.columns})
         about = [f"{board.about}\n"] if board.about else []
-        parts += [f"### {board.title}\n", *about, markdown(head, rows)]
+        parts += [f"### {board.title}\n", *about, markdown(text.headings, text.rows)]
     few = tables.sentences()
     chosen = [few.pop(0) + "\n"] if tables.chosen else []
     parts += [*chosen, f"### Differences to {tables.reference}\n", _tests(tables)]
@@ -211,9 +126,8 @@ def latex(tables: ComparedTables) -> str:
     """Format the narrow boards as LaTeX tables, which need the package booktabs."""
     parts = []
     for board in tables.boards:
-        columns = board.narrow()
-        head = ["policy", *(column.short for column in columns)]
-        rows = pd.DataFrame(board_rows(tables, board, columns), columns=head)
+        text = written(tables, board, board.narrow())
+        rows = pd.DataFrame(text.rows, columns=list(text.headings))
         rows["policy"] = [policy.rpartition(":")[2] for policy in rows["policy"]]
         parts.append(f"% {board.title}\n{rows.to_latex(index=False, escape=True)}")
     return "\n".join(parts)

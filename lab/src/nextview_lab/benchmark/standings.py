@@ -26,13 +26,21 @@ from nextview_lab.benchmark.board_page import (
     NONE,
     Leaderboard,
     WrittenTable,
-    as_html,
     as_markdown,
     plain,
     points,
 )
+from nextview_lab.benchmark.comparison import (
+    ALL,
+    ONE,
+    Counted,
+    corrected,
+    too_few,
+    values_of,
+)
 from nextview_lab.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview_lab.benchmark.methods import check_said
+from nextview_lab.benchmark.page import render
 from nextview_lab.benchmark.submit import (
     SUBMISSION_FORMAT,
     SaidAfterView,
@@ -40,12 +48,19 @@ from nextview_lab.benchmark.submit import (
     SubmittedEpisode,
     mean_seconds,
 )
-from nextview_lab.benchmark.sums import Difference, Key, Sums, too_few_families
+from nextview_lab.extras import extras
+
+with extras():
+    import pandas as pd
 
 RIGHT = "right"
 CONFIDENT_RIGHT = "confident_right"
 CONFIDENT_WRONG = "confident_wrong"
 UNKNOWN_SAID = "unknown"
+SHARES = {
+    name: (name, ONE)
+    for name in (RIGHT, CONFIDENT_RIGHT, CONFIDENT_WRONG, UNKNOWN_SAID)
+}
 SURFACE_POINTS = 20_000  # among which the nearest is looked for
 JUDGED_POINTS = 2_000  # of the true surface
 MOST_SAMPLES = 100_000  # of the bootstrap
@@ -74,25 +89,24 @@ class Scored:
     turns: Float
     posed: Index
 
-    def shares(self) -> dict[Key, tuple[Float, Float]]:
-        """Return numerators and denominators of all shares, (episodes,) each."""
-        name = self.submission.method
+    def episodes(self) -> "pd.DataFrame":
+        """Return the long table: each episode after each view, and what was said after the last."""
         last = [said[-1] for said in self.said]
-        views = self.right.shape[1]
         sure = np.array([one.confident for one in last])
-        ones = np.ones(len(last))
-        found = {
-            Key(name, None, view + 1, RIGHT): (self.right[:, view].astype(float), ones)
-            for view in range(views)
+        right = self.right[:, -1]
+        columns = {
+            "policy": self.submission.method,
+            "threshold": np.nan,
+            "object": np.arange(len(last)),
+            ONE: 1.0,
+            CONFIDENT_RIGHT: sure & right,
+            CONFIDENT_WRONG: sure & ~right,
+            UNKNOWN_SAID: [one.name is None for one in last],
         }
-        ends = {
-            CONFIDENT_RIGHT: sure & self.right[:, -1],
-            CONFIDENT_WRONG: sure & ~self.right[:, -1],
-            UNKNOWN_SAID: np.array([one.name is None for one in last]),
-        }
-        for measure, values in ends.items():
-            found[Key(name, None, views, measure)] = (values.astype(float), ones)
-        return found
+        after = enumerate(self.right.T, 1)
+        return pd.concat(
+            [pd.DataFrame({**columns, "views": k, RIGHT: own}) for k, own in after]
+        )
 
 
 class KnownShape:
@@ -209,7 +223,7 @@ def leaderboard_of(
         note = f"Not scored here: {number_of(others, kind)} of the archive."
         board = replace(board, notes=(*board.notes, note))
     with new_folder(Path(out), overwrite) as part:
-        page = as_html(board, frozen.sha256)
+        page = render("leaderboard.html", board=board, sha256=frozen.sha256)
         (part / PAGE_FILE).write_text(page, encoding="utf-8")
         (part / TEXT_FILE).write_text(as_markdown(board), encoding="utf-8")
     return board
@@ -378,13 +392,13 @@ def _board(
     order = {name: row for row, name in enumerate(dict.fromkeys(things))}
     families = np.array([order[name] for name in things])
     weights = st.resample_families(families, samples, np.random.default_rng(seed))
-    sums = {key: pair for one in scored for key, pair in one.shares().items()}
-    counted = Sums.of(sums, families)
-    numbers = counted.estimates(weights)
+    episodes = pd.concat([one.episodes() for one in scored])
+    counted = Counted.of(episodes, SHARES, {}, families)
+    shares = counted.measures(ALL, weights)
 
     compared = best_blind_method(scored) if reference is None else reference
     tables = [
-        _main_table(scored, numbers, weights, len(order)),
+        _main_table(scored, shares, weights, len(order)),
         _places_table(scored, truths),
     ]
     notes = [
@@ -394,13 +408,12 @@ def _board(
         " of the told poses of the cameras.",
     ]
     if compared is not None and len(scored) > 1:
-        tests = counted.differences(
-            weights, compared, lambda key: key.measure == RIGHT and key.views > 1
+        tests = counted.tests(
+            ALL, weights, compared, lambda key: key.measure == RIGHT and key.views > 1
         )
-        if tests:
-            tables.insert(1, _differences_table(tests, compared))
-            few = too_few_families(len(order), len(tests))
-            notes += [] if few is None else [few]
+        if len(tests):
+            tables.insert(1, _differences_table(corrected([tests]), compared))
+            notes += too_few(tests).values()
             if reference is None:
                 notes.append(
                     f"The reference, {compared}, is the best blind method on these same episodes,"
@@ -413,7 +426,7 @@ def _board(
 
 def _main_table(
     scored: Sequence[Scored],
-    numbers: dict[Key, tuple[float, float, float]],
+    shares: "pd.DataFrame",
     weights: Float,
     things: int,
 ) -> WrittenTable:
@@ -429,11 +442,12 @@ def _main_table(
         ("unknown", UNKNOWN_SAID, views),
     ]
 
+    numbers = values_of(shares, ALL)
     rows = []
     for one in scored:
         name = one.submission.method
         cells = [
-            _with_interval(*numbers[Key(name, None, at, measure)], things)
+            _with_interval(numbers[name, measure, at], things)
             for _, measure, at in columns
         ]
 
@@ -465,11 +479,12 @@ def _main_table(
     )
 
 
-def _with_interval(value: float, low: float, high: float, things: int) -> str:
+def _with_interval(number: tuple[float, float, float], things: int) -> str:
     """Format a share with its interval.
 
     Where all episodes agree, a bootstrap tells nothing: Wilson's interval for so many things.
     """
+    value, low, high = number
     if value in (0, 1):
         agreed = binomtest(int(value) * things, things).proportion_ci(method="wilson")
         low = agreed.low
@@ -491,20 +506,16 @@ def _median(values: Float, rows: Index, weights: Float) -> str:
     return f"{medians[0]:.1f} ({low:.1f} to {high:.1f})"
 
 
-def _differences_table(tests: Sequence[Difference], reference: str) -> WrittenTable:
+def _differences_table(tests: "pd.DataFrame", reference: str) -> WrittenTable:
     """Return the table of differences to the reference."""
-    together = st.holm(np.array([test.p for test in tests])).tolist()
     rows = []
-    for test, corrected in zip(tests, together, strict=True):
-        between = f"({points(test.low)} to {points(test.high)})"
+    for policy, views, *numbers in tests[
+        ["policy", "views", "difference", "low", "high", "p", "p_holm"]
+    ].itertuples(index=False):
+        apart, low, high = map(points, numbers[:3])
+        p = (f"{number:.3g}" for number in numbers[3:])
         rows.append(
-            (
-                test.key.policy,
-                number_of(test.key.views, "view"),
-                f"{points(test.value)} {between}",
-                f"{test.p:.3g}",
-                f"{corrected:.3g}",
-            )
+            (policy, number_of(views, "view"), f"{apart} ({low} to {high})", *p)
         )
     return WrittenTable(
         f"Differences to {reference}",

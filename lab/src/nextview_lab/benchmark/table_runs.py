@@ -16,7 +16,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nextview.checks import whole
 from nextview.errors import ObservationError, UsageError
@@ -35,7 +34,8 @@ from nextview.sensing.frame import Frame
 from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float, Index
-from nextview_lab.benchmark.jobs import Job
+from nextview_lab.benchmark.jobs import Job, Settings
+from nextview_lab.benchmark.pose_recall import add_s
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 FEWEST_THINGS = 6
@@ -75,23 +75,18 @@ class TableRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class TableSettings:
+class TableSettings(Settings):
     """Tables, policies and statistics.
 
     Attributes:
         models: name or folder of the memory that was taught the scans.
         network: card of a network of nextview-lab train segmentation; by default the bundled one.
         tables: number of tables.
-        views: numbers of frames after which the policies are compared; the last one is the number
-            of frames taken.
         policies: target uses the view with the most expected information, random any candidate view
             at 30 to 60 degrees elevation, and fixed the candidate nearest to a quarter turn ahead.
             Your own policy, MODULE:NAME, is a function of what may be looked at and what the scene
             knows; see docs/add_a_policy.md. Only missing results are computed; your own policies
             always run again.
-        reference: policy with which the others are compared; it is always included.
-        samples: number of bootstrap samples.
-        seed: seed of the tables, the first views and the camera errors.
     """
 
     models: str = "ycb"
@@ -99,9 +94,6 @@ class TableSettings:
     tables: int = 100
     views: tuple[int, ...] = (1, 2, 4)
     policies: tuple[str, ...] = tuple(SCENE_POLICIES)
-    reference: str = "random"
-    samples: int = 10_000
-    seed: int = 0
 
     def check(self) -> None:
         """Check the settings before any work is done.
@@ -113,10 +105,7 @@ class TableSettings:
         for name in (self.reference, *self.policies):
             NamedPolicy.of(name)
         whole(self.tables, "the number of tables", 1)
-        whole(self.samples, "the samples of the bootstrap", 100)
-        if not self.views or list(self.views) != sorted(set(self.views)):
-            raise UsageError("the numbers of views ascend, as in --views 1 2 4")
-        whole(self.views[0], "a number of views", 1)
+        super().check()
 
 
 @dataclass(frozen=True)
@@ -365,9 +354,7 @@ class Looking:
             true = np.linalg.inv(really) @ thing.pose
 
         diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
-        placed = points @ pose[:3, :3].T + pose[:3, 3]
-        there = points @ true[:3, :3].T + true[:3, 3]
-        return float(np.mean(cKDTree(placed).query(there)[0])) / diameter
+        return add_s(points, true, pose) / diameter
 
 
 def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun:

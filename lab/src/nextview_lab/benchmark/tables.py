@@ -12,9 +12,10 @@ from nextview.errors import UsageError
 from nextview.files import command, only_one
 from nextview.scene.view_policies import SCENE_POLICIES
 from nextview.things.memory import open_memory
-from nextview_lab.benchmark.comparison import ALL, Counted, Key, corrected
+from nextview_lab.benchmark.board_page import Board, Column
+from nextview_lab.benchmark.comparison import ALL, ONE, Counted, Key, corrected
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
-from nextview_lab.benchmark.results import Board, Column, ComparedTables, write_compared
+from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample
 from nextview_lab.benchmark.table_runs import (
     MOST_THINGS,
@@ -24,6 +25,10 @@ from nextview_lab.benchmark.table_runs import (
     meshes_in,
     work_at_table,
 )
+from nextview_lab.extras import extras
+
+with extras():
+    import pandas as pd
 
 # by measure: numerator, denominator, and heading in narrow tables
 SHARES = {
@@ -35,6 +40,10 @@ SHARES = {
     "ADD-S < 0.1 d, camera": ("close_in_camera", "right", ""),
     "strangers unknown": ("unknown", "strangers", "strangers unknown"),
 }
+AFTER = {name: (top, bottom) for name, (top, bottom, _) in SHARES.items()}
+AFTER["CPU, s"] = ("seconds", ONE)
+COUNTS = tuple(dict.fromkeys(column for pair in AFTER.values() for column in pair))
+ENDS = {"frames until done": ("done", ONE)}
 
 
 def benchmark_tables(
@@ -125,25 +134,19 @@ def summarise_tables(
         policies: in the order of the results.
         settings: views, reference, samples and seed.
     """
-    one = np.ones(len(runs))
-    sums: dict[Key, tuple] = {}
+    rows = []
     for policy in policies:
-        mine = [each.runs[policy] for each in runs]
-        for row, k in enumerate(settings.views):
-            counts = [run.counts[row] for run in mine]
-
-            def of(name: str, counts: list = counts) -> np.ndarray:
-                return np.array([each.get(name, 0) for each in counts], np.float64)
-
-            sums |= {
-                Key(policy, None, k, measure): (of(found), of(there))
-                for measure, (found, there, _) in SHARES.items()
-            }
-            sums[Key(policy, None, k, "CPU, s")] = of("seconds"), one
-        done = np.array([run.done for run in mine], np.float64)
-        sums[Key(policy, None, 0, "frames until done")] = done, one
-
-    counted = Counted.of(sums, np.arange(len(runs)))
+        for each in runs:
+            run = each.runs[policy]
+            for views, counts in (
+                *zip(settings.views, run.counts, strict=True),
+                (0, {}),
+            ):
+                cell = {"policy": policy, "threshold": np.nan, "views": views}
+                known = {"object": each.table, ONE: 1.0, "done": run.done}
+                rows.append(cell | dict.fromkeys(COUNTS, 0.0) | known | counts)
+    families = np.arange(len(runs))
+    counted = Counted.of(pd.DataFrame(rows), AFTER, ENDS, families)
     weights = resample(
         len(runs), settings.samples, np.random.default_rng(settings.seed)
     )

@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
@@ -40,6 +39,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 from nextview.types import Float
 from nextview_lab.benchmark.own_things import OwnAnswer, OwnThings
+from nextview_lab.benchmark.pose_recall import add_s
 
 Occlusion = Literal["none", "half", "heavy"]
 
@@ -231,11 +231,7 @@ class ThingEpisode:
 
         points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._kept[f"{seen[-1]}.in_camera"]
-        there, here = (
-            points @ each[:3, :3].T + each[:3, 3]
-            for each in (true, np.linalg.inv(camera) @ pose)
-        )
-        return float(1000 * np.mean(cKDTree(there).query(here)[0]))
+        return 1000 * add_s(points, np.linalg.inv(camera) @ pose, true)
 
     @cached_property
     def _surface(self) -> Surface:

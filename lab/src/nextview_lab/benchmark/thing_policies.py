@@ -1,12 +1,13 @@
 """Policies of the benchmark of things, including blind rules and an upper bound."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from nextview.errors import UsageError
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
@@ -114,6 +115,25 @@ class TruthCeiling:
         return float(right) + self.episode.belief_in_truth(views)
 
 
+def rules_of(sphere: Viewpoints, grid: ViewSphere) -> dict[str, Callable[[], Policy]]:
+    """Return functions that create the policies that know nothing of an episode, by name.
+
+    Args:
+        sphere: candidate views.
+        grid: the same views as a grid, for those that move on its rings.
+    """
+    return {
+        "random": lambda: RandomAll(sphere),
+        "spread": lambda: Spread(sphere),
+        "furthest": lambda: Furthest(grid),
+        "fixed": lambda: RingSteps(grid),
+        "ring": lambda: RingSteps(grid, 1),
+        "geometry": lambda: DiscriminateGeometry(sphere),
+        "sampled": lambda: SampledInformation(sphere),
+        "predicted": lambda: PredictedEntropy(sphere),
+    }
+
+
 def policies_of(
     names: tuple[str, ...],
     things: TaughtThings | OwnThings,
@@ -130,17 +150,11 @@ def policies_of(
             memory and there is none.
         PolicyError: a policy cannot be created.
     """
-    geometry = DiscriminateGeometry(EPISODE_SPHERE)
+    pose = DiscriminateGeometry(EPISODE_SPHERE, goal="pose")
+    rules = rules_of(EPISODE_SPHERE, EPISODE_SPHERE)
     known: dict[str, Callable[[ThingEpisode], Policy]] = {
-        "random": lambda _: RandomAll(EPISODE_SPHERE),
-        "spread": lambda _: Spread(EPISODE_SPHERE),
-        "furthest": lambda _: Furthest(EPISODE_SPHERE),
-        "fixed": lambda _: RingSteps(EPISODE_SPHERE),
-        "ring": lambda _: RingSteps(EPISODE_SPHERE, 1),
-        "geometry": lambda _: geometry,
-        "pose": lambda _: replace(geometry, goal="pose"),
-        "sampled": lambda _: SampledInformation(EPISODE_SPHERE),
-        "predicted": lambda _: PredictedEntropy(EPISODE_SPHERE),
+        **{name: partial(_of_any_episode, rule) for name, rule in rules.items()},
+        "pose": _always(pose),
         "ceiling": TruthCeiling,
     }
     for name in names:
@@ -181,3 +195,8 @@ def _refuse_needs(
 def _always(policy: Policy) -> Callable[[ThingEpisode], Policy]:
     """Use the same policy for all episodes."""
     return lambda _: policy
+
+
+def _of_any_episode(rule: Callable[[], Policy], _: ThingEpisode) -> Policy:
+    """Create a policy that knows nothing of an episode."""
+    return rule()

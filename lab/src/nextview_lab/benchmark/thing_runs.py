@@ -23,7 +23,7 @@ from nextview.simulation.sensor import sensor_named
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
-from nextview_lab.benchmark.jobs import Job
+from nextview_lab.benchmark.jobs import Job, Settings
 from nextview_lab.benchmark.own_things import OwnThings, own_things
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
@@ -129,7 +129,7 @@ def policies_in(runs: Sequence[EpisodeRuns]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class ThingSettings:
+class ThingSettings(Settings):
     """Conditions, policies and statistics.
 
     Attributes:
@@ -139,11 +139,7 @@ class ThingSettings:
         occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave half and a
             third of them visible.
         draws: episodes per thing, each with another rotation and first view.
-        views: numbers of views after which the policies are compared; the largest is the length of
-            the episodes.
-        policies: names, or MODULE:CLASS for your own; by default all that the recogniser supports.
-            Only missing results are computed; your own policies always run again.
-        reference: policy with which the others are compared; it is always included. "best-blind" is
+        reference: policy with which the others are compared; it is always included. best-blind is
             the rule that ignores the images (random, spread, furthest, fixed or ring) and is best
             after the first view in other episodes of the same things.
         choose_seed: seed of these other episodes.
@@ -156,8 +152,6 @@ class ThingSettings:
         unit: unit of length of the scan files.
         families: count things whose names are equal up to the first _, such as variants of one
             scan, as one in intervals and p-values.
-        samples: number of bootstrap samples.
-        seed: seed of rotations, boxes, first views, noise and random policies.
     """
 
     models: str | None = None
@@ -165,7 +159,6 @@ class ThingSettings:
     occlusion: Occlusion = "none"
     draws: int = 1
     views: tuple[int, ...] = (1, 2, 3, 5)
-    policies: tuple[str, ...] = ()
     reference: str = "random"
     choose_seed: int = 1
     recogniser: str | None = None
@@ -173,8 +166,6 @@ class ThingSettings:
     repeats: int = 2
     unit: str = "m"
     families: bool = False
-    samples: int = 10_000
-    seed: int = 0
 
     def check(self) -> None:
         """Check the settings before any work is done.
@@ -184,11 +175,7 @@ class ThingSettings:
         """
         for value, what in ((self.draws, "draws"), (self.repeats, "repeats")):
             whole(value, f"the number of {what}", 1)
-        whole(self.samples, "the samples of the bootstrap", 100)
-
-        if not self.views or list(self.views) != sorted(set(self.views)):
-            raise UsageError("the numbers of views ascend, as in --views 1 2 3 5")
-        whole(self.views[0], "a number of views", 1, len(EPISODE_SPHERE))
+        super().check()
         whole(self.views[-1], "a number of views", 2, len(EPISODE_SPHERE))
 
         if number(self.threshold, "the threshold", 0) >= 1:

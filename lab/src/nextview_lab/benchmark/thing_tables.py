@@ -1,6 +1,6 @@
 """Summarise the benchmark of things: measures, intervals and tests."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +8,10 @@ import numpy as np
 from nextview.session.result import SUSPICIOUS
 from nextview.session.system import UNKNOWN_ALPHA
 from nextview.types import Float, Index
+from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
+    ONE,
     Counted,
     Key,
     corrected,
@@ -17,16 +19,11 @@ from nextview_lab.benchmark.comparison import (
     tests_of,
 )
 from nextview_lab.benchmark.confusable import Alikeness
-from nextview_lab.benchmark.results import Board, Column, ComparedTables
+from nextview_lab.benchmark.results import ComparedTables
 from nextview_lab.benchmark.statistics import exchange_p, interval, resample_families
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview_lab.benchmark.thing_policies import CEILINGS
-from nextview_lab.benchmark.thing_runs import (
-    EpisodeRuns,
-    ThingRun,
-    ThingSettings,
-    policies_in,
-)
+from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingSettings, policies_in
 from nextview_lab.extras import extras
 
 with extras():
@@ -38,6 +35,15 @@ TITLES = {ALL: "All things", CONFUSABLE: "The confusable half"}
 FAR_END = 0.95  # quantile of the pose error
 FAR_POSE = "pose error, 95 %"
 POSE_AFTER = 2  # number of views after which the pose error is tested
+QUANTILES = {"median": 0.5, "95 %": FAR_END}
+# measures after a number of views, and of whole episodes: columns of the long table
+AFTER = {"accuracy": ("right", ONE), "travel, rad": ("travel", ONE)}
+ENDS = {
+    "views until confident": ("until", ONE),
+    "travel until confident, rad": ("travel", ONE),
+    "confident": ("confident", ONE),
+    "wrong, of the confident": ("wrong", "confident"),
+}
 
 
 @dataclass(frozen=True)
@@ -55,122 +61,78 @@ class ThingTables(ComparedTables):
     episodes: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """The runs of one policy.
+def _episodes(runs: Sequence[EpisodeRuns], threshold: float) -> "pd.DataFrame":
+    """Return the long table of all runs.
 
-    Attributes:
-        things: thing of each run, (R,) int64.
-        weight: of each run, 1 in total for each thing, (R,).
-        right: after each view, (R, K) float64.
-        sure: whether it was ever confident, like a session without ``Recognition.joint_doubt``: the
-            belief reached the threshold, and the residual is not suspicious, (R,) float64.
-        wrong: whether it was confident and wrong, (R,) float64.
-        until: number of views until it was confident; all of them if it never was, (R,).
-        travel: radians on the sphere up to each view, (R, K).
-        pose: error, millimetres, (R, K); NaN if the thing was not named correctly.
-        decision: seconds per choice.
-        verification: seconds per verification of all views.
+    A run is confident, like a session without ``Recognition.joint_doubt``, where the belief has
+    reached the threshold and the residual is not suspicious.
+
+    Args:
+        runs: of all episodes.
+        threshold: belief from which a run is confident.
+
+    Returns:
+        One row for each number of views: "right", "travel", radians, "pose", the error in
+        millimetres, NaN if the thing was not named correctly, and the CPU times "decision" and
+        "verification", seconds. And one for each whole run, with 0 views: "until", the number of
+        views until it was confident, all of them if it never was, the "travel" until then, whether
+        it was "confident", and "wrong" then.
     """
-
-    things: Index
-    weight: Float
-    right: Float
-    sure: Float
-    wrong: Float
-    until: Float
-    travel: Float
-    pose: Float
-    decision: Float
-    verification: Float
-
-    @classmethod
-    def of(cls, runs: Sequence[tuple[int, ThingRun]], threshold: float) -> "_Runs":
-        """Combine runs, each with the number of its thing.
-
-        Args:
-            runs: pairs of a thing's number and a run.
-            threshold: belief from which a run is confident.
-        """
-        things = np.array([thing for thing, _ in runs])
-        right = np.array([each.right for _, each in runs], np.float64)
-        believed = np.array([each.confidence for _, each in runs], np.float64)
-        explained = np.array([each.p_value for _, each in runs], np.float64)
+    rows: list[dict] = []
+    for each, policy, run in (
+        (one, policy, run)
+        for one in runs
+        for policy, several in one.runs.items()
+        for run in several
+    ):
+        cell = {"policy": policy, "threshold": np.nan, "thing": each.thing, ONE: 1.0}
+        explained = np.array(run.p_value, np.float64)
         # False if it is not known
         suspicious = explained < SUSPICIOUS * UNKNOWN_ALPHA
-        sure = (believed >= threshold) & ~suspicious
-        ever = sure.any(1)
-        last = np.where(ever, sure.argmax(1), sure.shape[1] - 1)
-        rows = np.arange(len(runs))
-        arcs = [EPISODE_SPHERE.arc[each.views[:-1], each.views[1:]] for _, each in runs]
-        travel = np.concatenate([np.zeros((len(runs), 1)), np.cumsum(arcs, axis=1)], 1)
+        sure = (np.array(run.confidence) >= threshold) & ~suspicious
+        last = int(sure.argmax()) if sure.any() else len(sure) - 1
+        arcs = EPISODE_SPHERE.arc[run.views[:-1], run.views[1:]]
+        travel = np.append(0.0, np.cumsum(arcs))
+        ends = {"until": last + 1, "travel": travel[last], "confident": sure[last]}
+        ends["wrong"] = sure[last] and not run.right[last]
+        rows.append(cell | {"views": 0} | ends)
 
-        return cls(
-            things=things,
-            weight=1 / np.bincount(things)[things],
-            right=right,
-            sure=np.asarray(ever, np.float64),
-            wrong=(ever & (right[rows, last] == 0)).astype(np.float64),
-            until=last + 1.0,
-            travel=travel,
-            pose=np.array([each.pose_error for _, each in runs], np.float64),
-            decision=np.concatenate([each.decision for _, each in runs]),
-            verification=np.array([each.verification[-1] for _, each in runs]),
-        )
-
-    def mean(self, values: Float) -> Float:
-        """Return the mean of a value over the runs of each thing, (T,).
-
-        Args:
-            values: of each run, (R,).
-        """
-        return np.bincount(self.things, values * self.weight).astype(np.float64)
-
-    def quantile(self, values: Float, drawn: Float, share: float) -> Float:
-        """Return the quantile of the valid values in each bootstrap sample of things, (S,).
-
-        Args:
-            values: of each run, (R,); NaN if not known.
-            drawn: bootstrap weight of each thing in each sample, (S, things).
-            share: level of the quantile, 0 to 1.
-        """
-        known = ~np.isnan(values)
-        if not known.any():
-            return np.full(len(drawn), np.nan)
-        order = np.flatnonzero(known)[np.argsort(values[known])]
-        weights = np.cumsum((drawn[:, self.things] * self.weight)[:, order], axis=1)
-        first = (weights >= share * weights[:, -1:]).argmax(1)
-        return np.asarray(values[order][first], np.float64)
+        after = {
+            "views": range(1, len(run.views) + 1),
+            "right": run.right,
+            "travel": travel,
+            "pose": run.pose_error,
+            "decision": [*run.decision, None],
+            "verification": run.verification,
+        }
+        columns = zip(*after.values(), strict=True)
+        rows += [cell | dict(zip(after, values, strict=True)) for values in columns]
+    return pd.DataFrame(rows).astype({"pose": "float64", "decision": "float64"})
 
 
-def _sums(runs: _Runs, policy: str, views: tuple[int, ...]) -> dict[Key, tuple]:
-    """Return the measures of one policy that are means over things, as sums for each thing."""
-    right = {k: runs.mean(runs.right[:, k - 1]) for k in views}
-    one = np.ones(len(right[views[0]]))
-    found = {Key(policy, None, k, "accuracy"): (right[k], one) for k in views}
-    for k in views:
-        way = runs.mean(runs.travel[:, k - 1])
-        found[Key(policy, None, k, "travel, rad")] = (way, one)
+def _pose_quantiles(rows: "pd.DataFrame", drawn: Float) -> dict[str, Float]:
+    """Return quantiles of the valid pose errors in each bootstrap sample of things, (S,) each.
 
-    rows = np.arange(len(runs.things))
-    way = runs.travel[rows, runs.until.astype(np.int64) - 1]
-    sure = runs.mean(runs.sure)
-    whole = {
-        "views until confident": (runs.mean(runs.until), one),
-        "travel until confident, rad": (runs.mean(way), one),
-        "confident": (sure, one),
-        "wrong, of the confident": (runs.mean(runs.wrong), sure),
-    }
-    return found | {Key(policy, None, 0, name): both for name, both in whole.items()}
-
-
-def _far(runs: _Runs, views: tuple[int, ...], drawn: Float) -> dict[tuple, Float]:
-    """Return quantiles of the pose error in bootstrap samples of the things, (S, T): each (S,)."""
+    Args:
+        rows: of one policy after a number of views.
+        drawn: bootstrap weight of each thing in each sample, (S, things).
+    """
+    things, errors, weight = _weighed(rows)
+    known = ~np.isnan(errors)
+    if not known.any():
+        return dict.fromkeys(QUANTILES, np.full(len(drawn), np.nan))
+    order = np.flatnonzero(known)[np.argsort(errors[known])]
+    weights = np.cumsum((drawn[:, things] * weight)[:, order], axis=1)
     return {
-        (f"pose error, {name}", k): runs.quantile(runs.pose[:, k - 1], drawn, share)
-        for k in views
-        for share, name in ((0.5, "median"), (FAR_END, "95 %"))
+        name: errors[order][(weights >= share * weights[:, -1:]).argmax(1)]
+        for name, share in QUANTILES.items()
     }
+
+
+def _weighed(rows: "pd.DataFrame") -> tuple[Index, Float, Float]:
+    """Return thing, pose error and weight of each row, (R,); the weights of a thing sum to 1."""
+    things = rows["object"].to_numpy()
+    return things, rows["pose"].to_numpy(), 1 / np.bincount(things)[things]
 
 
 def summarise_things(
@@ -191,6 +153,9 @@ def summarise_things(
         The tables.
     """
     rng = np.random.default_rng(0)
+    policies = list(policies_in(runs))
+    episodes = _episodes(runs, how.threshold)
+    episodes = episodes[episodes["policy"].isin(policies)]
     groups = {ALL: np.ones(len(alike.names), bool), CONFUSABLE: alike.confusable}
     measures: list[pd.DataFrame] = []
     tests: list[pd.DataFrame] = []
@@ -201,25 +166,17 @@ def summarise_things(
         if not things:
             continue
         number = {thing: k for k, thing in enumerate(things)}
-        some = [each for each in runs if each.thing in number]
+        some = episodes[episodes["thing"].isin(number)]
+        some = some.assign(object=some["thing"].map(number))
         family = _families(things, how)
         weights = resample_families(family, how.samples, rng)
-        together = {
-            policy: _Runs.of(
-                [(number[e.thing], run) for e in some for run in e.runs[policy]],
-                how.threshold,
-            )
-            for policy in policies_in(runs)
-        }
-        sums: dict[Key, tuple] = {}
-        for policy, own in together.items():
-            sums |= _sums(own, policy, how.views)
-        counted = Counted.of(sums, family)
-        poses = _poses(name, together, family, weights, how)
-        found = [counted.measures(name, weights), poses[0], _times(name, together)]
+        kept = some[some["views"].isin([0, *how.views])]
+        counted = Counted.of(kept, AFTER, ENDS, family)
+        poses = _poses(name, some, family, weights, how)
+        found = [counted.measures(name, weights), poses[0], _times(name, some)]
         apart = [counted.tests(name, weights, how.reference, _is_tested), poses[1]]
-        measures.append(_by_policy(found, list(together)))
-        tests.append(_by_policy(apart, list(together)))
+        measures.append(_by_policy(found, policies))
+        tests.append(_by_policy(apart, policies))
         about = f"{len(things)} thing{'s' * (len(things) > 1)}"
         title = f"{TITLES[name]}: share named right after views"
         boards.append(Board(title, name, _columns(how.views), about))
@@ -279,28 +236,27 @@ def _families(names: Sequence[str], how: ThingSettings) -> Index:
     return np.asarray(np.unique(np.array(bodies), return_inverse=True)[1])
 
 
-def _times(name: str, runs: dict[str, _Runs]) -> "pd.DataFrame":
-    """Return the run times of all policies, milliseconds, without intervals."""
-    quantiles: list[tuple[str, Callable[[Float], float]]] = [
-        ("median", lambda times: float(np.median(times))),
-        ("95 %", lambda times: float(np.quantile(times, FAR_END))),
+def _times(name: str, episodes: "pd.DataFrame") -> "pd.DataFrame":
+    """Return the run times of all policies, milliseconds, without intervals.
+
+    That of a verification is of all views together.
+    """
+    last = episodes["views"] == episodes["views"].max()
+    times = episodes.assign(verification=episodes["verification"].where(last))
+    rows = [
+        (policy, None, 0, f"{what}, ms, {which}", 1000 * value, np.nan, np.nan)
+        for policy, own in times.groupby("policy", sort=False)
+        for what in ("decision", "verification")
+        for which, value in zip(
+            QUANTILES, own[what].quantile([0.5, FAR_END]), strict=True
+        )
     ]
-    rows = []
-    for policy, own in runs.items():
-        for what, times in (
-            ("decision", own.decision),
-            ("verification", own.verification),
-        ):
-            rows += [
-                (policy, None, 0, f"{what}, ms, {which}", 1000 * of(times))
-                for which, of in quantiles
-            ]
-    return measures_of(name, [(*row, np.nan, np.nan) for row in rows])
+    return measures_of(name, rows)
 
 
 def _poses(
     name: str,
-    runs: dict[str, _Runs],
+    episodes: "pd.DataFrame",
     family: Index,
     weights: Float,
     how: ThingSettings,
@@ -309,31 +265,34 @@ def _poses(
 
     Args:
         name: of the set of things.
-        runs: of all policies.
+        episodes: long table.
         family: of each thing, (T,).
         weights: bootstrap weight of each thing in each sample, (S, T).
         how: settings of the comparison.
     """
     # the first sample is the original set
     drawn = np.concatenate([np.ones((1, len(family))), weights])
-    found = {policy: _far(own, how.views, drawn) for policy, own in runs.items()}
+    cells = {
+        (str(policy), int(views)): rows
+        for (policy, views), rows in episodes.groupby(["policy", "views"], sort=False)
+        if views in how.views
+    }
+    found = {cell: _pose_quantiles(rows, drawn) for cell, rows in cells.items()}
     rows = [
-        (policy, None, k, measure, values[0], *_ends(values))
-        for policy, all_of_one in found.items()
-        for (measure, k), values in all_of_one.items()
+        (policy, None, k, f"pose error, {which}", values[0], *_ends(values))
+        for (policy, k), both in found.items()
+        for which, values in both.items()
     ]
     tests = []
-    reference = runs.get(how.reference)
-    if reference is not None and POSE_AFTER in how.views:
-        for policy, own in runs.items():
-            if policy == how.reference:
-                continue
-            both = (found[one][FAR_POSE, POSE_AFTER] for one in (policy, how.reference))
-            apart = np.subtract(*both)
-            key = Key(policy, None, POSE_AFTER, FAR_POSE)
-            p = _pose_p(own, reference, family)
-            count = int(family.max()) + 1
-            tests.append((key, apart[0], *_ends(apart), p, count))
+    theirs = how.reference, POSE_AFTER
+    for policy, k in cells:
+        if theirs not in cells or k != POSE_AFTER or policy == how.reference:
+            continue
+        apart = found[policy, k]["95 %"] - found[theirs]["95 %"]
+        p = _pose_p(cells[policy, k], cells[theirs], family)
+        count = int(family.max()) + 1
+        key = Key(policy, None, k, FAR_POSE)
+        tests.append((key, apart[0], *_ends(apart), p, count))
     return measures_of(name, rows), tests_of(name, how.reference, tests)
 
 
@@ -350,13 +309,13 @@ def _is_tested(key: Key) -> bool:
     return key.measure == "views until confident"
 
 
-def _pose_p(own: _Runs, reference: _Runs, family: Index) -> float:
+def _pose_p(own: "pd.DataFrame", reference: "pd.DataFrame", family: Index) -> float:
     """Return the p-value of the difference in the quantile of the pose error."""
-    errors = np.concatenate([one.pose[:, POSE_AFTER - 1] for one in (own, reference)])
-    weights = np.concatenate([own.weight, reference.weight])
+    both = _weighed(own), _weighed(reference)
+    things, errors, weights = (np.concatenate(pair) for pair in zip(*both, strict=True))
     order = np.argsort(errors)[: np.count_nonzero(~np.isnan(errors))]
-    whose = np.repeat([1.0, -1.0], [len(own.things), len(reference.things)])[order]
-    families = family[np.concatenate([own.things, reference.things])][order]
+    whose = np.repeat([1.0, -1.0], [len(own), len(reference)])[order]
+    families = family[things][order]
 
     def far(ours: Float) -> Float:
         """The far end of the errors of those runs that count as ours, (S,)."""

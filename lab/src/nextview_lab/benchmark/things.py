@@ -8,20 +8,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from nextview.data import pool
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, ResultsError
-from nextview.files import command, only_one, read_record, write_record
+from nextview.errors import DatasetError
+from nextview.files import command, only_one
 from nextview.geometry.mesh import load_mesh
 from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
-from nextview_lab.benchmark.confusable import Alikeness, how_alike
+from nextview_lab.benchmark.confusable import how_alike
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
 from nextview_lab.benchmark.own_things import OwnThings
 from nextview_lab.benchmark.results import write_compared
@@ -41,7 +40,6 @@ from nextview_lab.benchmark.thing_runs import (
 )
 from nextview_lab.benchmark.thing_tables import ThingTables, summarise_things
 
-ALIKE_FILE = "alike.json"  # similarity of the things in the memory
 CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is selected
 MEMORY = "memory"  # folder of the taught memory, if no models are given
 
@@ -108,7 +106,7 @@ def benchmark_things(
         jobs = _jobs(models, found, out, settings, things)
         runs = _replayed(jobs, settings, things, workers, track)
         names = {job.scan.stem for job in jobs}
-        alike = _alike(out, _surfaces(things, found, settings)).of(names)
+        alike = how_alike(_surfaces(things, found, settings)).of(names)
         tables = summarise_things(runs, alike, settings, chosen)
         made = asdict(asked) | {
             "policies": settings.policies,
@@ -217,37 +215,6 @@ def _taught(
         how = TeachingOptions(unit=settings.unit, sensor=settings.sensor)  # type: ignore[arg-type]
         learn_things(scans, memory, how, workers=workers, track=track)
     return str(memory)
-
-
-class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Similarity of the things in a memory, see ``Alikeness``.
-
-    Attributes:
-        nearest: name of the most similar other thing.
-        distance: of the two surfaces; None for infinity.
-    """
-
-    nearest: tuple[str, ...]
-    distance: tuple[float | None, ...]
-
-
-def _alike(out: Path, surfaces: Sequence[Surface]) -> Alikeness:
-    """Return the similarity of the things, which takes seconds and is cached in the folder."""
-    file = out / ALIKE_FILE
-    if not file.exists():
-        found = how_alike(surfaces)
-        distance = [
-            apart if apart < np.inf else None for apart in found.distance.tolist()
-        ]
-        write_record(file, _Alike(found.nearest, tuple(distance)))
-        return found
-
-    kept = read_record(file, _Alike, "how alike things are", ResultsError)
-    distances = np.array(
-        [np.inf if apart is None else apart for apart in kept.distance]
-    )
-    names = tuple(surface.name for surface in surfaces)
-    return Alikeness(names, kept.nearest, distances)
 
 
 def _jobs(

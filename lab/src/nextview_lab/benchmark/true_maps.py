@@ -1,4 +1,4 @@
-"""True measures, true maps and planned paths, from predictions and their view store."""
+"""True measures and true maps, from predictions and their view store."""
 
 from collections.abc import Callable
 

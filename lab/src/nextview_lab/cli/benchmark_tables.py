@@ -1,22 +1,33 @@
-"""Print benchmark and evaluation results as tables in the terminal."""
+"""Print the results of benchmarks and evaluations as tables in the terminal."""
 
+import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from math import isfinite
 from typing import Any
 
 from rich import box
+from rich.cells import cell_len
 from rich.table import Table
-from rich.text import Text
 
-from nextview.cli.progress import Terminal
+from nextview.cli.progress import Terminal, console
 from nextview_lab.benchmark import leaderboard as board
+from nextview_lab.benchmark.board_page import (
+    Leaderboard,
+    WrittenTable,
+    points,
+    written,
+)
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant
-from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import Number, numbers
-from nextview_lab.benchmark.results import Board, ComparedTables, board_rows, markdown
+from nextview_lab.benchmark.results import ComparedTables
+from nextview_lab.benchmark.submit import Submitted
 from nextview_lab.errors import EntryError
+
+MOST_WHOLE_COLUMNS = 7  # of a table with its intervals; the page has them all
+NAME_SHARE = 3  # the names of methods take this part of a line at most: a third
 
 
 def print_classes(found: ClassResults) -> None:
@@ -30,25 +41,24 @@ def print_leaderboard(results: ClassResults) -> None:
     """Print the policies at the headline threshold, and the conclusions of the tests."""
     tables = results.tables
     reference = results.settings["reference"]
-    console = Terminal()
+    terminal = Terminal()
 
     if not tables.sweep.empty:
         at = board.headline_threshold(results.settings["thresholds"])
-        console.print(_policies(board.leaderboard(tables, at), at, reference))
-        console.print(
+        print_tables([_policies(board.leaderboard(tables, at), at, reference)])
+        terminal.print(
             f"* differs from {reference} in accuracy: p after Holm's correction is below"
             f" {SIGNIFICANT}"
         )
         few = board.too_few_objects(tables, at, len(results.predictions))
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
-                console.print(sentence)
+                terminal.print(sentence)
 
-    after = board.after_views_rows(tables)
-    if not after.empty:
-        print(markdown(after.columns, after.itertuples(index=False)), end="")
+    if after := board.after_views_table(tables):
+        print_tables([after])
     if sentence := board.level_differences(tables, reference):
-        console.print(sentence)
+        terminal.print(sentence)
 
     for r in board.promised_risks(tables, results.settings["risks"]):
         if r.broken:
@@ -56,89 +66,56 @@ def print_leaderboard(results: ClassResults) -> None:
                 f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are"
                 " wrong"
             )
-            console.print(
+            terminal.print(
                 f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised."
             )
 
 
-def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
-    """Lay out the policies in 80 columns; only long policy names are folded."""
-    title = (
-        f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
-    )
-    table = Table(
-        title=title,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=0,
-        pad_edge=False,
-    )
-    table.add_column("policy", overflow="fold", min_width=20)
-
-    for column in (
-        "accuracy",
-        "class\nmean",
-        "views",
-        "travel\ncells",
-        f"over\n{reference}",
-        "p",
-    ):
-        table.add_column(column, justify="right", no_wrap=True)
-    for i, s in enumerate(rows):
-        oracle = is_oracle(s.policy)
+def _policies(rows: list[Any], threshold: float, reference: str) -> WrittenTable:
+    """Return the policies as text."""
+    texts = []
+    for s in rows:
         over = ""
         p = ""
-        if oracle and i > 0 and not is_oracle(rows[i - 1].policy):
-            table.add_section()
-            table.add_row("oracles:", style="dim")
         if s.p_holm == s.p_holm:  # not the reference
-            over = f"{round(100 * s.difference, 1) + 0.0:+.1f}"
-            p = ("< 0.001" if s.p_holm < 0.001 else f"{s.p_holm:.3f}") + (
-                " *" if s.differs else "  "
+            over = points(s.difference)
+            small = "< 0.001" if s.p_holm < 0.001 else f"{s.p_holm:.3f}"
+            p = small + " *" * s.differs
+        texts.append(
+            (
+                s.policy,
+                f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})",
+                f"{s.class_accuracy:.3f}",
+                f"{s.n_views:.2f}",
+                f"{s.travel:.2f}",
+                over,
+                p,
             )
-        accuracy = (
-            f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})",
-            f"{s.class_accuracy:.3f}",
         )
-        style = "bold" if s.differs else None
-        if oracle:
-            style = "dim"
-        table.add_row(
-            s.policy,
-            *accuracy,
-            f"{s.n_views:.2f}",
-            f"{s.travel:.2f}",
-            over,
-            p,
-            style=style,
-        )
-
-    return table
+    return WrittenTable(
+        f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}",
+        "",
+        ("policy", "accuracy", "class mean", "views", "travel, cells", "over", "p"),
+        tuple(texts),
+    )
 
 
 def print_compared(found: ComparedTables) -> None:
     """Print a table for each board, in 80 columns, and the conclusions of the tests."""
-    console = Terminal()
+    terminal = Terminal()
     for each in found.boards:
-        console.print(_compared(found, each))
-    console.print(
+        stars = significant(found, each.name)
+        columns = {
+            name: replace(column, measures=column.measures[:1])
+            for name, column in each.narrow().items()
+        }
+        text = written(found, each, columns, stars)
+        print_tables([replace(text, title=f"{each.title}; {each.about}")])
+    terminal.print(
         f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT}"
     )
     for sentence in found.sentences():
-        console.print(sentence)
-
-
-def _compared(found: ComparedTables, shown: Board) -> Table:
-    table = Table(title=shown.title, caption=shown.about, box=box.SIMPLE_HEAD)
-    table.add_column("policy", no_wrap=True)
-    columns = [
-        replace(column, measures=column.measures[:1]) for column in shown.narrow()
-    ]
-    for column in columns:
-        table.add_column(column.short, justify="right")
-    for cells in board_rows(found, shown, columns, significant(found, shown.name)):
-        table.add_row(*cells)
-    return table
+        terminal.print(sentence)
 
 
 def print_evaluation(found: Evaluation) -> None:
@@ -146,7 +123,7 @@ def print_evaluation(found: Evaluation) -> None:
 
     The HTML page of the evaluation shows more.
     """
-    console = Terminal()
+    terminal = Terminal()
     right = numbers(found.accuracy, "n_views", "label", "measure")
     views = int(found.accuracy["n_views"].max())
     lines = {
@@ -155,14 +132,13 @@ def print_evaluation(found: Evaluation) -> None:
         "size not known": "shape_accuracy",
     }
 
-    shown = Table("share of right answers", "one view", f"all {views} views")
-    for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items():
-        if (1, "", measure) in right:
-            shown.add_row(
-                heading,
-                *(_cell(right[n_views, "", measure], 3) for n_views in (1, views)),
-            )
-    console.print(shown)
+    rows = [
+        (heading, *(_cell(right[k, "", measure], 3) for k in (1, views)))
+        for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items()
+        if (1, "", measure) in right
+    ]
+    head = ("share of right answers", "one view", f"all {views} views")
+    tables = [WrittenTable("", "", head, tuple(rows))]
 
     headings = {
         "mse": "MSE",
@@ -175,28 +151,104 @@ def print_evaluation(found: Evaluation) -> None:
     maps = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")]
     scores = numbers(maps, "map", "measure")
     names = maps["map"].unique()
-    shown = Table("mean of objects", *(name.upper() for name in names))
-    for measure, heading in headings.items():
-        shown.add_row(
+    rows = [
+        (
             heading,
-            *(
-                _cell(scores[name, measure], 4 if measure == "mse" else 3)
-                for name in names
-            ),
+            *(_cell(scores[name, measure], 3 + (measure == "mse")) for name in names),
         )
+        for measure, heading in headings.items()
+    ]
     if len(names):
-        console.print(shown)
+        head = ("mean of objects", *(name.upper() for name in names))
+        tables.append(WrittenTable("", "", head, tuple(rows)))
+    print_tables(tables)
 
     for name, why in found.left_out.items():
-        console.print(f"{name}: {why}")
+        terminal.print(f"{name}: {why}")
 
 
-def _cell(number: Number, digits: int) -> Text:
+def _cell(number: Number, digits: int) -> str:
     if not isfinite(number.value):
-        return Text("-")
-    interval = (
-        f" {number.low:.{digits}f}-{number.high:.{digits}f}"
-        if number.high > number.low
-        else ""
-    )
-    return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))
+        return "-"
+    low, high = (f"{end:.{digits}f}" for end in (number.low, number.high))
+    interval = f" ({low}-{high})" if number.high > number.low else ""
+    return f"{number.value:.{digits}f}{interval}"
+
+
+def print_submitted(run: Submitted) -> None:
+    """Print what was run.
+
+    Args:
+        run: what was run.
+    """
+    Terminal().print(str(run), soft_wrap=True)
+    if not run.whole:
+        console.print(
+            "these are not all episodes of the archive: the leaderboard refuses the file",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
+def print_standings(board: Leaderboard) -> None:
+    """Print the tables of a leaderboard.
+
+    Args:
+        board: the leaderboard.
+    """
+    print_tables(board.tables)
+    for note in board.notes:
+        console.print(note, soft_wrap=True)
+
+
+def print_tables(tables: Iterable[WrittenTable]) -> None:
+    """Print tables, those that are too wide in several parts.
+
+    Args:
+        tables: with headings and cells of text.
+    """
+    terminal = Terminal()
+    for one in tables:
+        for part in _parts(one, terminal):
+            terminal.print(part)
+
+
+def _parts(one: WrittenTable, terminal: Terminal) -> Iterator[Table]:
+    """Divide the columns of a table so that each part fits; the names stand in all of them."""
+    short = len(one.headings) > MOST_WHOLE_COLUMNS
+    names = [row[0] for row in one.rows]
+    columns = [
+        [cell.partition(" (")[0] if short else cell for cell in cells]
+        for cells in zip(*(row[1:] for row in one.rows), strict=True)
+    ]
+    longest = max(map(cell_len, [one.headings[0], *names]))
+    of_names = min(longest, max(1, terminal.width // NAME_SHARE))
+    # a heading breaks at its spaces, and a score nowhere
+    widths = [
+        max(map(cell_len, [*heading.split(), *cells]))
+        for heading, cells in zip(one.headings[1:], columns, strict=True)
+    ]
+
+    def part(first: int, last: int) -> Table:
+        table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
+        table.title = None if first else one.title
+        table.title_justify = "left"
+        table.add_column(one.headings[0], width=of_names, overflow="fold")
+        for column in range(first, last):
+            heading = one.headings[1 + column]
+            table.add_column(heading, justify="right", width=widths[column])
+        for row, name in enumerate(names):
+            table.add_row(name, *(cells[row] for cells in columns[first:last]))
+        return table
+
+    unlimited = terminal.options.update(max_width=sys.maxsize)
+    first = 0
+    while first < len(widths):
+        last = first + 1
+        while last < len(widths):
+            longer = terminal.measure(part(first, last + 1), options=unlimited)
+            if longer.maximum > terminal.width:
+                break
+            last += 1
+        yield part(first, last)
+        first = last

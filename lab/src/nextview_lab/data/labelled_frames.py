@@ -31,7 +31,7 @@ from nextview.segmentation.network import (
 )
 from nextview.segmentation.parting import pair_slices
 from nextview.types import Float, Float32, Index, Mask
-from nextview_lab.data.room_drawing import LIFE_SIZES, life_radius
+from nextview_lab.worlds.life_sizes import LIFE_SIZES, life_radius
 from nextview_lab.worlds.solids import Solid
 from nextview_lab.worlds.worlds import (
     BACKGROUND,

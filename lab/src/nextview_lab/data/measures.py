@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,13 +74,13 @@ class Measure:
     """A measure of a view, and its required input.
 
     Attributes:
-        function: computes the measure of one view.
+        function: computes the measure of one ``MeasuredView``.
         needs: "depth" if the depth image is enough, or "mesh".
         source: publication of the measure.
         good: whether high values (peak) or low values (valley) mark the better views.
     """
 
-    function: Callable[[MeasuredView], float]
+    function: Callable[[Any], float]
     needs: Literal["depth", "mesh"] = "depth"
     source: str = "your own"
     good: Good = "peak"
@@ -93,7 +93,7 @@ class Measure:
 MEASURES: dict[
     str,
     Measure,
-] = {  # of the thesis; other packages add measures with entry points MEASURE_ENTRY_POINTS
+] = {  # the others are entry points MEASURE_ENTRY_POINTS of installed packages
     "depth_entropy": Measure(
         lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
     )

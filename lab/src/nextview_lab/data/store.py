@@ -34,7 +34,6 @@ POINT_UNIT = 1 / 32767  # unit of the int16 points, object radii
 PENDING = 0
 DONE = 1
 FAILED = 2
-PLANNED = 5  # views of a plan: the longest episode of the thesis
 # arrays created by rendering, and additional ones for scenes
 RENDERED_ARRAYS = (
     "image",
@@ -143,10 +142,9 @@ class ViewStore:
 
     Arrays of the group, with one chunk per object: ``image`` (N, V, S, S) uint8; ``depth``
     (N, V, S, S) uint16 in DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in
-    POINT_UNIT, object frame; ``measures/NAME`` (N, V) float32; ``plans/NAME`` (N, V, PLANNED)
-    float32, the views that a policy takes from each first view; ``radius`` (N,) float64, in the
-    unit of its mesh file; ``status`` (N,) uint8. Every chunk has a checksum. Zarr reads the fill
-    value for a missing chunk, so every read checks that the file exists.
+    POINT_UNIT, object frame; ``measures/NAME`` (N, V) float32; ``radius`` (N,) float64, in
+    the unit of its mesh file; ``status`` (N,) uint8. Every chunk has a checksum. Zarr reads the
+    fill value for a missing chunk, so every read checks that the file exists.
 
     Attributes:
         path: of the store, a zarr folder.
@@ -279,13 +277,8 @@ class ViewStore:
             "scene/owner": ((v, scene, scene), "uint8", 0),
             "scene/reachable": ((v,), "bool", False),
         }
-        # a plan or measure
-        added = (
-            (v, min(PLANNED, v)) if name.startswith("plans/") else (v,),
-            "float32",
-            np.nan,
-        )
-        return layouts.get(name, added)
+        measure = ((v,), "float32", np.nan)
+        return layouts.get(name, measure)
 
     def array(self, name: str) -> zarr.Array:
         """Return an array of the store."""

@@ -1,4 +1,4 @@
-"""Geometry of a scene: upright objects on a table, and reachable camera positions."""
+"""Geometry of a scene: objects on a table or in a room, and reachable camera positions."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -12,13 +12,18 @@ from nextview.checks import points
 from nextview.errors import DatasetError, MeshError, option
 from nextview.files import regular_file, sha256_of
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
+from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.boxes import upright_boxes
 from nextview.types import Float, Mask
-from nextview_lab.worlds.scene_layout import Block, Placement, SceneLayout
+from nextview_lab.worlds.scene_layout import (
+    SCENE_TABLE,
+    UPRIGHT,
+    Block,
+    Placement,
+    SceneLayout,
+)
 
-# half the side of the square table, object radii, with room for the clutter
-SCENE_TABLE = 3.4
 SCENE_CLEARANCE = 0.2  # clearance around a camera, object radii
 # margin of every footprint, object radii, so that thin sheets have an area
 FOOTPRINT_EDGE = 1e-3
@@ -44,15 +49,19 @@ class Item:
 
 @dataclass(frozen=True)
 class TargetScene:
-    """A target, and the other objects on its table.
+    """A target, and the other objects on its table or in its room.
 
     Attributes:
         target: the object to recognise.
         items: the other objects.
+        half: half the side of the table or floor, object radii.
+        metres: object radius of the target; None if not known.
     """
 
     target: Mesh
     items: tuple[Item, ...] = ()
+    half: float = SCENE_TABLE
+    metres: float | None = None
 
     @property
     def floor(self) -> float:
@@ -73,8 +82,8 @@ class TargetScene:
 
     @cached_property
     def table(self) -> Mesh:
-        """Table top, a square."""
-        return Mesh(*square(SCENE_TABLE, self.floor), np.zeros(3), 1.0, "table")
+        """Table top or floor, a square."""
+        return Mesh(*square(self.half, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
         """Return the distance of cameras, (V, 3), from the nearest item or the table, (V,).
@@ -82,11 +91,14 @@ class TargetScene:
         It is 0 inside an item, and negative below the table.
         """
         found = positions[:, 2] - self.floor
+        height = positions[:, 2]
         for item in self.items:
-            above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)
+            low = item.vertices[:, 2].min()
+            high = item.vertices[:, 2].max()
+            aside = np.maximum(np.maximum(height - high, low - height), 0)
             found = np.minimum(
                 found,
-                np.hypot(distances(item.footprint, positions[:, :2]), above),
+                np.hypot(distances(item.footprint, positions[:, :2]), aside),
             )
         return found
 
@@ -138,6 +150,8 @@ def build_scene(
             )
 
     target, *others = loaded
+    if layout.target.rotation != UPRIGHT:
+        target = rotated(target, np.reshape(layout.target.rotation, (3, 3)))
     floor = float(target.vertices[:, 2].min())
     objects = [
         place(mesh, at, floor) for mesh, at in zip(others, layout.objects, strict=True)
@@ -145,6 +159,8 @@ def build_scene(
     return TargetScene(
         target,
         (*objects, *(block_item(block, floor) for block in layout.blocks)),
+        layout.table,
+        layout.metres,
     )
 
 
@@ -159,7 +175,8 @@ def place(mesh: Mesh, at: Placement, floor: float) -> Item:
     Returns:
         The item.
     """
-    vertices = at.radius * mesh.vertices @ rotation_z(at.azimuth).T
+    turn = rotation_z(at.azimuth) @ np.reshape(at.rotation, (3, 3))
+    vertices = at.radius * mesh.vertices @ turn.T
     vertices += (at.x, at.y, floor - vertices[:, 2].min())
     return Item(vertices, mesh.faces, footprint(vertices))
 
@@ -176,22 +193,25 @@ def block_item(block: Block, floor: float) -> Item:
     """
     size = np.array([[block.width, block.depth, block.height]])
     middle = np.array([[block.x, block.y]])
-    mesh = upright_boxes(size, np.array([block.azimuth]), middle, floor)
+    mesh = upright_boxes(size, np.array([block.azimuth]), middle, floor + block.z)
     return Item(mesh.vertices, mesh.faces, footprint(mesh.vertices), block.wall)
 
 
 @lru_cache(maxsize=64)
-def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
+def cached_mesh(
+    path: Path, max_faces: int = MAX_FACES, unit: str | None = None
+) -> Mesh:
     """Load a mesh with a cache, as meshes are shared between scenes; see ``load_mesh``.
 
     Args:
         path: of the file.
         max_faces: largest number of triangles.
+        unit: of its lengths; None if not known.
 
     Returns:
         The mesh.
     """
-    return load_mesh(path, max_faces=max_faces)
+    return load_mesh(path, unit=unit, max_faces=max_faces)
 
 
 @lru_cache(maxsize=4096)

@@ -1,6 +1,7 @@
-"""Error-free cameras in front of the target of a scene, or of a whole scene."""
+"""Cameras in front of the target of a scene, of a whole scene, and in a room."""
 
 from dataclasses import replace
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from nextview.geometry.observation import (
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
+from nextview.sensing import Frame
+from nextview.simulation.sensor import Sensor
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float, Float32, Mask
 from nextview_lab.worlds.scene import TargetScene
@@ -104,6 +107,49 @@ class SceneCamera:
         return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[
             which
         ].reshape(shape)
+
+
+class RoomCamera:
+    """Delivers the frames of a sensor in a room: 16-bit millimetres, in the frame of its target.
+
+    A pose always gives the same frame: its noise depends on the seed and the pose.
+
+    Args:
+        scene: the room, whose target has a known size.
+        sensor: simulated depth errors. Those of a setup, such as pose errors, are not simulated.
+        seed: of the noise.
+    """
+
+    def __init__(self, scene: TargetScene, sensor: Sensor, seed: int = 0) -> None:
+        assert scene.metres is not None
+        self.scene = scene
+        self.metres = scene.metres
+        self.sensor = sensor
+        self.seed = seed
+        self._camera = SceneCamera(scene, sensor.intrinsics, sensor.shape)
+
+    def reachable(self, pose: Float) -> bool:
+        """Return True if the camera can be at a pose, (4, 4), metres."""
+        place = np.asarray(pose)[None, :3, 3] / self.metres
+        return bool(self.scene.reachable(place)[0])
+
+    def look(self, pose: Float) -> tuple[Frame, Mask]:
+        """Capture a frame from a camera-to-world pose, (4, 4), OpenCV axes, metres.
+
+        Returns:
+            The frame, and the pixels of the target, (H, W) bool.
+        """
+        pose = np.asarray(pose, np.float64)
+        near = pose.copy()
+        near[:3, 3] /= self.metres
+        depth, owner = self._camera.look(near)
+        rng = np.random.default_rng([self.seed, crc32(np.round(pose, 4).tobytes())])
+        metres = (self.metres * depth).astype(np.float32)
+        measured, source = self.sensor.measure(metres, rng)
+        shown = (owner.ravel() == SHOWS_TARGET)[np.maximum(source, 0)]
+        millimetres = np.rint(1000 * measured.clip(max=65)).astype(np.uint16)
+        frame = Frame(millimetres, self.sensor.intrinsics, pose, pixel_centre=0.5)
+        return frame, shown & (source >= 0) & (measured > 0)
 
 
 def visible_shares(

@@ -1,16 +1,21 @@
-"""The layout of a cluttered scene: a JSON file from which the scene is rebuilt exactly."""
+"""The layout of a scene around a target: a JSON file from which the scene is rebuilt exactly."""
 
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated
 
+import numpy as np
 from msgspec import Meta, Struct
 
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
+from nextview.types import Float
 
 # mean visible share of the target
 CLUTTER_LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
+ROOM = "room"  # level of a scene in a room, where things are life-size
+# half the side of the square table, object radii, with room for the clutter
+SCENE_TABLE = 3.4
 # names of generated scenes: target, level and number
 NAMED = re.compile(r".*@(\w+)-\d+")
 SUFFIX = ".json"
@@ -20,6 +25,9 @@ Length = Annotated[float, Meta(ge=-1000, le=1000)]
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
 LAYOUT_LENGTH = Meta(max_length=1000)
+Rotation = Annotated[tuple[Length, ...], Meta(min_length=9, max_length=9)]
+Pose = Annotated[tuple[Length, ...], Meta(min_length=16, max_length=16)]
+UPRIGHT: Rotation = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def clutter_level(name: str) -> str:
@@ -45,6 +53,7 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
         y: centre of the bounding box, object radii of the target.
         azimuth: rotation about the vertical, radians.
         radius: of the object, object radii of the target.
+        rotation: to its resting pose, (3, 3), row by row; the azimuth follows.
     """
 
     mesh: str
@@ -53,6 +62,7 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     y: Length = 0.0
     azimuth: Length = 0.0
     radius: Size = 1.0
+    rotation: Rotation = UPRIGHT
 
     def __post_init__(self) -> None:
         below_the_meshes(self.mesh)
@@ -69,6 +79,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
         depth: object radii of the target.
         height: object radii of the target.
         wall: whether the camera cannot be behind it.
+        z: of its bottom above the table, object radii of the target.
     """
 
     x: Length
@@ -78,20 +89,26 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
     depth: Size
     height: Size
     wall: bool = False
+    z: Length = 0.0
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table, in its object frame, and the objects around it.
+    """A target at rest on a table or a floor, in its object frame, and the objects around it.
 
     Attributes:
         name: unique in its folder, "chair_0890@medium-1".
-        level: clutter level, one of CLUTTER_LEVELS, or a custom word.
+        level: clutter level, one of CLUTTER_LEVELS, ROOM, or a custom word.
         seed: with which the scene was drawn.
-        target: in the centre of the table, not rotated.
+        target: in the centre of the table, at azimuth 0.
         objects: the other objects.
         blocks: boxes and walls.
         visible: visible share of the target's pixels from each of the 40 views; () if not measured.
         unreachable: indices of the views that no camera can reach.
+        table: half the side of the square table or floor, object radii.
+        label: class of the target; "" if not known.
+        metres: object radius of the target; None if not known.
+        pose: of the first camera in a room, camera-to-world, (4, 4), row by row, metres; None for
+            none.
     """
 
     name: str
@@ -108,12 +125,22 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
         tuple[Annotated[int, Meta(ge=0, lt=LAYOUT_VIEWS)], ...],
         Meta(max_length=LAYOUT_VIEWS),
     ] = ()
+    table: Size = SCENE_TABLE
+    label: str = ""
+    metres: Size | None = None
+    pose: Pose | None = None
 
     def __post_init__(self) -> None:
-        if self.target != Placement(self.target.mesh, self.target.sha256):
+        mine = self.target
+        if mine != Placement(mine.mesh, mine.sha256, rotation=mine.rotation):
             raise ValueError("the target stands in the middle as it is")
         if len(self.visible) not in (0, LAYOUT_VIEWS):
             raise ValueError(f"visible has {LAYOUT_VIEWS} numbers")
+
+    @property
+    def first_pose(self) -> Float:
+        """Pose of the first camera in a room, (4, 4), metres."""
+        return np.reshape(np.array(self.pose, np.float64), (4, 4))
 
     def save(self, path: Path) -> None:
         """Write the file, completely or not at all. The same scene gives identical files."""

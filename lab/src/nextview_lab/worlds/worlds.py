@@ -187,10 +187,7 @@ class HeightMap:
             return None
 
         margin = 0 if piled else int(np.ceil(gap / self.cell))
-        around = np.pad(there, margin)
-        if margin:
-            around = ndimage.binary_dilation(around, iterations=margin)
-
+        around = _widened(there, margin)
         for middle in self._places(rng, piled, spread):
             if (np.abs(middle - self.centre) + half > self.reach).any():
                 continue
@@ -215,6 +212,23 @@ class HeightMap:
             self.last = placed[0].mean(0)[:2]
             return placed
         return None
+
+    def stands(self, solid: Solid, gap: float) -> bool:
+        """Add a solid where it is, and return True, if nothing on the level is nearer than a gap.
+
+        Args:
+            solid: in its pose, standing on the level.
+            gap: least distance from others, metres.
+        """
+        _, top = self._profiles(solid)
+        there = np.isfinite(top)
+        at = np.floor((solid[0].min(0)[:2] - self.low) / self.cell).astype(int)
+        here = self._cells(at, there.shape)
+        margin = int(np.ceil(gap / self.cell))
+        if here is None or not self._is_free(at - margin, _widened(there, margin)):
+            return False
+        here[there] = np.maximum(here, top)[there]
+        return True
 
     def _places(self, rng: Generator, piled: bool, spread: float) -> Iterator[Float]:
         """Iterate over positions, (2,) each: random ones, or from near the centre outwards."""
@@ -258,6 +272,12 @@ class HeightMap:
         lower = low[2] - 1 + caster.cast(below, up)[0]
         upper = high[2] + 1 - caster.cast(above, -up)[0]
         return lower.reshape(count), upper.reshape(count)
+
+
+def _widened(outline: Mask, margin: int) -> Mask:
+    """Return an outline with a margin of some cells, larger by them on each side."""
+    around = np.pad(outline, margin)
+    return ndimage.binary_dilation(around, iterations=margin) if margin else around
 
 
 def _pushed(solid: Solid, others: Sequence[Solid], axes: Float | None) -> Solid:

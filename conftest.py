@@ -1,0 +1,3 @@
+"""The tests of both packages share the fixtures of ``tests/shared_fixtures.py``."""
+
+pytest_plugins = ("shared_fixtures",)

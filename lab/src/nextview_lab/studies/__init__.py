@@ -1,0 +1,1 @@
+"""What the pages measure: each module runs as ``python -m nextview_lab.studies.NAME``."""

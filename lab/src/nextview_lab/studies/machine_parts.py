@@ -1,0 +1,243 @@
+"""Poses of machine parts that are nearly symmetric: how often a confident one is wrong.
+
+    python -m nextview_lab.studies.machine_parts PARTS      # writes the parts, millimetres
+    nextview learn PARTS taught --unit mm
+    python -m nextview_lab.studies.machine_parts PARTS --models taught [--draws 20]
+
+The parts are flanges with bolt holes, a gear with a keyway, L brackets of 20 mm, a die, a hex nut,
+a hex bolt and a shaft with a flat, all exact. Each is shown as it falls (on any face of the convex
+hull, as often as throws end on it) at a random azimuth, from one random view through the sensor,
+five object radii away and at least 25 cm. Printed is, for each part, the symmetries of the memory,
+how many views were named right, how many of these are confident, by how many degrees the
+orientation is off modulo the part's true symmetries, and how many confident ones are off by more
+than 20 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import tyro
+from scipy.spatial.transform import Rotation
+
+import nextview
+from nextview.cli.exit_status import orderly_end
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.resting import rotated, stable_poses
+from nextview.geometry.viewsphere import ViewSphere, rotation_z
+from nextview.recognition.model_card import Symmetry
+from nextview.session.result import Recognition
+from nextview.session.system import System
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.things.recogniser import VerifiedRecogniser
+from nextview.types import Float
+from nextview_lab.studies.shared import markdown, progress
+from nextview_lab.worlds.solids import Solid, extruded, joined, moved, ring_points
+
+SPHERE = ViewSphere((18.0, 36.0, 54.0, 72.0), 8)
+WRONG = 20.0  # degrees by which a confident orientation is wrong
+X, Y, Z = np.eye(3).tolist()
+COLUMNS = (
+    "part",
+    "symmetries",
+    "named right",
+    "confident",
+    "off: median, worst",
+    "wrong",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A machine part.
+
+    Attributes:
+        solid: vertices, (V, 3), millimetres, and triangles, (F, 3).
+        symmetries: axis and order of each, which generate all; order 0 for any angle.
+    """
+
+    solid: Solid
+    symmetries: tuple[tuple[Sequence[float], int], ...] = ()
+
+
+def rectangle(left: float, low: float, right: float, high: float) -> Float:
+    """Corners of a rectangle, (4, 2)."""
+    return np.array([[left, low], [right, low], [right, high], [left, high]])
+
+
+def around(count: int, circle: float, radius: float) -> list[Float]:
+    """The outlines of so many holes on a circle."""
+    return [
+        ring_points(radius, 16, (circle * np.cos(angle), circle * np.sin(angle)))
+        for angle in np.arange(count) / count * 2 * np.pi
+    ]
+
+
+def keyed(bore: float, width: float, depth: float) -> Float:
+    """The outline of a bore with a keyway on the side of +x."""
+    corner = np.arcsin(width / 2 / bore)
+    angles = np.linspace(corner, 2 * np.pi - corner, 40)
+    arc = bore * np.c_[np.cos(angles), np.sin(angles)]
+    return np.r_[arc, [[bore + depth, -width / 2], [bore + depth, width / 2]]]
+
+
+def toothed(teeth: int, outside: float, depth: float) -> Float:
+    """The outline of a gear."""
+    angles = (np.arange(4 * teeth) + 0.5) / (4 * teeth) * 2 * np.pi
+    radii = np.where(np.arange(4 * teeth) % 4 < 2, outside, outside - depth)
+    return np.c_[radii * np.cos(angles), radii * np.sin(angles)]
+
+
+def bent(first: float, second: float, width: float, holes: Sequence[Float]) -> Solid:
+    """An L bracket of 2.5 mm sheet; the holes are in its first leg."""
+    thick = 2.5
+    flat = extruded([rectangle(0, 0, first, width), *holes], thick)
+    upright = extruded([rectangle(0, 0, thick, width)], second - thick)
+    return joined([flat, moved(upright, by=(0, 0, thick))])
+
+
+def parts() -> dict[str, Part]:
+    """The parts by their names."""
+    six = [ring_points(40, 64), ring_points(10, 48), *around(6, 28, 4)]
+    four = [ring_points(30, 64), ring_points(9, 48), *around(4, 21, 3.5)]
+    hub = extruded([ring_points(18, 64), ring_points(10, 48)], 18)
+    wheel = [toothed(20, 30, 4), keyed(9, 6, 3)]
+    boss = extruded([ring_points(16, 64), keyed(9, 6, 3)], 10)
+    nut = extruded([ring_points(9.8, 6), ring_points(5, 48)], 8)
+    head = extruded([ring_points(11, 6)], 8)
+    shank = extruded([ring_points(5.5, 48)], 45)
+    flat = np.arccos(0.6)
+    angles = np.linspace(flat, 2 * np.pi - flat, 60)
+    milled = [8 * np.c_[np.cos(angles), np.sin(angles)]]
+    cube = trimesh.creation.box((16, 16, 16))
+    diagonal = (np.array(X) + Z) / np.sqrt(2)
+    return {
+        "flange_of_six": Part(
+            joined([extruded(six, 8), moved(hub, by=(0, 0, 8))]), ((Z, 6),)
+        ),
+        "flat_flange": Part(extruded(four, 10), ((Z, 4), (X, 2))),
+        "gear_with_keyway": Part(
+            joined([extruded(wheel, 12), moved(boss, by=(0, 0, 12))])
+        ),
+        "bracket": Part(bent(20, 14, 12, [ring_points(2.2, 16, (12, 6))])),
+        "equal_bracket": Part(bent(20, 20, 12, []), ((diagonal, 2),)),
+        "die": Part(
+            (np.asarray(cube.vertices), np.asarray(cube.faces, np.int32)),
+            ((X, 4), (Y, 4), (Z, 4)),
+        ),
+        "hex_nut": Part(nut, ((Z, 6), (X, 2))),
+        "hex_bolt": Part(joined([head, moved(shank, by=(0, 0, 8))]), ((Z, 6),)),
+        "shaft_with_flat": Part(extruded(milled, 50), ((X, 2),)),
+    }
+
+
+def turns_of(part: Part) -> Float:
+    """All rotations that leave a part as it is, (N, 3, 3); none has a symmetry of any angle."""
+    steps = [
+        Rotation.from_rotvec(2 * np.pi / order * np.array(axis)).as_matrix()
+        for axis, order in part.symmetries
+    ]
+    turns = [np.eye(3)]
+    for turn in turns:  # it grows
+        for step in steps:
+            new = turn @ step
+            if not any(np.abs(new - other).max() < 1e-6 for other in turns):
+                turns.append(new)
+    return np.stack(turns)
+
+
+def degrees_off(found: Float, true: Float, turns: Float) -> float:
+    """Angle between two rotations but for some turns of the thing, degrees."""
+    traces = np.einsum("ij,nij->n", true.T @ found, turns)
+    return float(np.degrees(np.arccos(np.clip((traces.max() - 1) / 2, -1, 1))))
+
+
+def looked_at(
+    system: System, path: Path, thing: int, draw: int, sensor: str
+) -> tuple[Recognition, Float]:
+    """Recognise a part from one view; the result, and its true rotation, (3, 3)."""
+    rng = np.random.default_rng([thing, draw])
+    mesh = load_mesh(path, unit="mm")
+    stable = stable_poses(mesh)
+    lying = stable.rotations[rng.choice(len(stable.shares), p=stable.shares)]
+    turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lying
+    camera = SensedCamera(rotated(mesh, turn), sensor, rng)
+    view = int(rng.integers(len(system.sphere)))
+    result = system.session_with(camera, view, draw, False).run(camera)
+    return result, camera.object_frame.axes @ turn
+
+
+def main(
+    folder: tyro.conf.Positional[Path],
+    models: str = "",
+    draws: int = 20,
+    sensor: str = "wrist",
+) -> None:
+    """Write the parts, or show them.
+
+    Args:
+        folder: of the meshes.
+        models: memory that was taught with them; without it the meshes are written.
+        draws: how often each part is shown.
+        sensor: what the views are taken with.
+    """
+    known = parts()
+    if not models:
+        folder.mkdir(parents=True)
+        for name, part in known.items():
+            trimesh.Trimesh(*part.solid, process=False).export(folder / f"{name}.ply")
+        return
+
+    system = nextview.load(models, max_views=1, viewpoints="40")
+    recogniser = system.models.recogniser
+    assert isinstance(recogniser, VerifiedRecogniser)
+    assert recogniser.card.memory is not None
+    about = {thing.name: thing for thing in recogniser.card.memory.things}
+    rows = []
+    sure_of_all = wrong_of_all = 0
+    for thing, (name, part) in enumerate(progress(known.items(), "parts", len(known))):
+        turns = turns_of(part)
+        right = []
+        sure = []
+        for draw in range(draws):
+            result, true = looked_at(
+                system, folder / f"{name}.ply", thing, draw, sensor
+            )
+            if result.answer != name or result.pose is None:
+                continue
+            off = degrees_off(result.pose[:3, :3], true, turns)
+            right.append(off)
+            if result.confident:
+                sure.append(off)
+                if off > WRONG:
+                    print(
+                        "   ",
+                        name,
+                        draw,
+                        f"{off:.0f}",
+                        result.pose_uncertainty,
+                        [f"{c.probability:.2f}" for c in result.pose_candidates],
+                    )
+        wrong = sum(off > WRONG for off in sure)
+        sure_of_all += len(sure)
+        wrong_of_all += wrong
+        found = in_words(about[name].symmetries)
+        errors = f"{np.median(sure):.1f}, {max(sure):.1f}" if sure else "-"
+        rows.append((name, found, f"{len(right)} of {draws}", len(sure), errors, wrong))
+    print(markdown(COLUMNS, rows))
+    share = wrong_of_all / max(sure_of_all, 1)
+    print(f"{wrong_of_all} of {sure_of_all} confident poses are wrong: {share:.3f}")
+
+
+def in_words(symmetries: Sequence[Symmetry]) -> str:
+    """Orders of some symmetries."""
+    return ", ".join(str(one.order or "any") for one in symmetries) or "none"
+
+
+if __name__ == "__main__":
+    with orderly_end("nothing was written"):
+        tyro.cli(main)

@@ -1,0 +1,192 @@
+"""What studies share: scans, frames in files, results line by line, shares, tables, progress."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from PIL import Image
+from rich.progress import track
+from scipy.stats import binomtest
+
+from nextview.cli.progress import console
+from nextview.data.pool import WorkerDied, each
+from nextview.errors import NextviewError, UsageError
+from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
+from nextview.sensing import Frame
+from nextview.types import Float
+
+SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
+Item = TypeVar("Item")
+Asked = TypeVar("Asked", bound=tuple)
+
+
+def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
+    """The scans in a folder by their names, in order.
+
+    Args:
+        folder: of the scans.
+        formats: suffixes of the files that count.
+
+    Raises:
+        UsageError: there are none.
+    """
+    files = {
+        path.stem: path
+        for path in sorted(folder.iterdir() if folder.is_dir() else ())
+        if path.suffix.lower() in formats
+    }
+    if not files:
+        raise UsageError(f"{folder}: holds no scan, NAME{formats[0]}")
+    return dict(sorted(files.items()))
+
+
+def scans_of(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The scans of things, in the order of their names.
+
+    Raises:
+        UsageError: some are missing.
+    """
+    files = scans_in(folder)
+    missing = [name for name in names if name not in files]
+    if missing:
+        raise UsageError(
+            f"{folder}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
+        )
+    return [files[name] for name in names]
+
+
+def mesh_of(scan: Path) -> Mesh:
+    """A scan in metres, called as its file."""
+    return replace(load_mesh(scan, unit="m"), name=scan.stem)
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float:
+    """Intrinsics, (3, 3), pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def frame_in(folder: Path) -> Frame:
+    """The frame without a pose that a folder holds.
+
+    Args:
+        folder: of depth.png (uint16, millimetres; scale.json has metres a step, if it is another
+            one) and K.json (fx, fy, cx, cy, with the middle of the first pixel at 0).
+    """
+    intrinsics = camera_matrix(*json.loads((folder / "K.json").read_text()))
+    depth = np.asarray(Image.open(folder / "depth.png"))
+    scale = folder / "scale.json"
+    if scale.exists():
+        depth = depth * np.float32(json.loads(scale.read_text()))
+    return Frame(depth, intrinsics)
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The results in a file, one in each line; none if there is no file.
+
+    What a run that was killed left of its last line is cut off.
+    """
+    if not path.exists():
+        return []
+    written = path.read_bytes()
+    whole = written.rfind(b"\n") + 1
+    if whole < len(written):
+        with path.open("r+b") as file:
+            file.truncate(whole)
+    return [json.loads(line) for line in written[:whole].splitlines()]
+
+
+def results(
+    path: Path,
+    fields: Sequence[str],
+    asked: Sequence[Asked],
+    run: Callable[[Asked], dict[str, Any]],
+    what: str,
+    workers: int = 0,
+) -> list[dict[str, Any]]:
+    """Results of all that is asked for; what a file holds already is not run again.
+
+    Args:
+        path: JSON lines, to which each result is added as soon as it is there.
+        fields: names of the values by which a result is known; they begin its line.
+        asked: tuples of these values.
+        run: returns the rest of the line.
+        what: is run, for the progress that is shown.
+        workers: processes; 0 for this one. With more, ``run`` has to be picklable.
+
+    Returns:
+        A line for each that is asked for, in their order.
+
+    Raises:
+        NextviewError: a process has died.
+    """
+
+    def key(values: Any) -> str:
+        return json.dumps(values, default=asdict)
+
+    known = {
+        key([line.get(name) for name in fields]): line for line in read_lines(path)
+    }
+    missing = [item for item in asked if key(item) not in known]
+    done = each(run, missing, workers)
+    with path.open("a") as file:
+        for item, found in progress(done, what, len(missing)) if missing else ():
+            if isinstance(found, WorkerDied):
+                raise NextviewError(f"{key(item)}: {found}")
+            line = json.dumps(
+                dict(zip(fields, item, strict=True)) | found, default=asdict
+            )
+            file.write(f"{line}\n")
+            file.flush()
+            known[key(item)] = json.loads(line)
+    return [known[key(item)] for item in asked]
+
+
+def progress(
+    items: Iterable[Item], what: str, total: int | None = None
+) -> Iterator[Item]:
+    """Some items one after the other, with progress on standard error.
+
+    Args:
+        items: that work is done with.
+        what: is worked on.
+        total: number of items; None to take all of them first, and count.
+    """
+    if total is None:
+        items = list(items)
+        total = len(items)
+    if console.is_terminal:
+        yield from track(items, what, total, console=console)
+        return
+    said = time.monotonic()
+    for number, item in enumerate(items, 1):
+        yield item
+        if time.monotonic() - said > SECONDS_BETWEEN_LINES:
+            print(f"{what}: {number} of {total}", file=sys.stderr, flush=True)
+            said = time.monotonic()
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """The 95 % Wilson interval of a share."""
+    low, high = binomtest(count, total).proportion_ci(method="wilson")
+    return float(low), float(high)
+
+
+def share(count: int, total: int) -> str:
+    """A share with its 95 % Wilson interval, in words; "-" of nothing."""
+    if not total:
+        return "-"
+    low, high = wilson(count, total)
+    return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)

@@ -1,0 +1,128 @@
+"""What the tests of the laboratory share: made-up predictions, and stores of views.
+
+``conftest.py`` makes fixtures of whole pipelines from it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from lab_programs import main
+
+from nextview.data.folders import Entry
+from nextview.geometry.observation import pinhole
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.recognition.belief import Calibration
+from nextview_lab.data.measures import MeasuredView
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.store import DONE, ViewStore, describe
+
+SPHERE = ViewSphere.named("40")
+CLASSES = ["ball", "box", "pillar"]
+"""Of ``some_predictions``."""
+
+
+def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
+    """Random logits and maps of ``n`` objects of three classes."""
+    rng = np.random.default_rng(seed)
+    return Predictions(
+        rng.normal(size=(n, 40, 3)).astype(np.float32),
+        {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
+        rng.random((n, 40)).astype(np.float32),
+        tuple(f"thing_{i}" for i in range(n)),
+        np.arange(n) % 3,
+        tuple(CLASSES),
+        np.array(["test"] * n),
+        np.zeros(n, bool),
+        SPHERE,
+        {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
+        {"lem": ("box",)},
+    )
+
+
+def train_predictions(
+    logits, labels, sphere, classes, azimuth_bins=None, **fields
+) -> Predictions:
+    """Predictions of objects of the training split of which nothing but this is known."""
+    n, v, _ = logits.shape
+    entropy, splits, conflicting = (
+        np.zeros((n, v), np.float32),
+        np.array(["train"] * n),
+        np.zeros(n, bool),
+    )
+    given = (
+        logits,
+        {},
+        entropy,
+        tuple(map(str, range(n))),
+        labels,
+        classes,
+        splits,
+        conflicting,
+        sphere,
+        {},
+        {},
+    )
+    return replace(Predictions(*given, azimuth_bins=azimuth_bins), **fields)
+
+
+def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
+    """Random logits of a store of cluttered scenes.
+
+    A view that hardly shows the target says nothing.
+    """
+    opened, rng = ViewStore.open(store), np.random.default_rng(0)
+    shows = opened.measure("visible_share") > 0.3
+    logits = np.where(
+        shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0
+    ).astype(np.float32)
+    return replace(
+        some_predictions(len(opened)),
+        logits=logits,
+        classes=tuple(classes),
+        names=tuple(opened.names),
+        maps={},
+        valley_classes={},
+        depth_entropy=opened.measure(),
+        store=str(store),
+        calibration=Calibration(1.0, 0.3),
+    )
+
+
+def benchmark(predictions: Path, out: Path, **settings):
+    from nextview_lab.benchmark.classes import ClassSettings, benchmark_classes
+
+    return benchmark_classes(predictions, out, ClassSettings(**settings))
+
+
+def store_of(
+    path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays
+) -> ViewStore:
+    """A store whose objects are rendered, if only these arrays of it hold anything:
+    depth_entropy, image.
+    """
+    both = zip(names, map(str, labels), strict=True)
+    entries = [Entry(Path(f"{name}.off"), name, label, "train") for name, label in both]
+    store = ViewStore.create(path, describe(entries, sphere, size, {}))
+    for name, values in arrays.items():
+        store.group[name if name in store.rendered else f"measures/{name}"][:] = values
+    store.group["status"][:] = DONE
+    return store
+
+
+def show_taught(scans: Path, models: Path, folder: Path, *options: str) -> None:
+    """Taught things through a sensor: views.zarr, and what is said of them, predictions.npz."""
+    store = str(folder / "views.zarr")
+    render = ["render", str(scans), store, "--sensor", "wrist", "--rotated", *options]
+    predict = ["predict", store, str(folder / "predictions.npz")]
+    main([*render, "--workers", "0"])
+    main([*predict, "--models", str(models), "--workers", "0"])
+
+
+def of_depth(depth, distance=3.0) -> MeasuredView:
+    """What a measure is handed where the depth alone is known, from straight ahead."""
+    depth = np.asarray(depth)
+    return MeasuredView(
+        depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance)
+    )

@@ -1,0 +1,243 @@
+"""The benchmark from predictions to a folder of results, against pandas, plain loops and the
+thesis's own tables.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from lab_programs import main, refused
+from pipeline import benchmark
+
+from nextview.recognition.belief import Calibration, RiskBounds, Stopping
+from nextview_lab.benchmark.classes import load
+from nextview_lab.benchmark.leaderboard import promised_risks
+from nextview_lab.benchmark.replay import make_specs, replay, truncate
+from nextview_lab.benchmark.report import report
+from nextview_lab.data.metrics import calibration_error
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.thesis.reproduction import page
+
+
+@pytest.fixture(scope="module")
+def predictions(results):
+    return Predictions.load(results / "p.npz")
+
+
+def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
+    assert (
+        len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
+    )
+    row_of = {name: i for i, name in enumerate(predictions.names)}
+    for row in rows.sample(200, random_state=0).itertuples():
+        i, views = row_of[row.object], list(row.views)
+        assert len(set(views)) == len(views) == row.n_views
+        total = np.exp(predictions.logits[i, views].astype(float).sum(0))
+        belief = total / total.sum()
+        assert row.label == predictions.classes[predictions.labels[i]]
+        assert row.answer == predictions.classes[belief.argmax()]
+        assert row.confidence == pytest.approx(belief.max())
+        legs = list(pairwise(views))
+        assert row.travel == pytest.approx(
+            sum(predictions.sphere.travel[leg] for leg in legs)
+        )
+        assert row.arc == pytest.approx(
+            sum(predictions.sphere.arc[leg] for leg in legs)
+        )
+        if np.isnan(row.threshold):
+            assert row.stop == "fixed views"
+        else:
+            assert row.stop == (
+                "confident" if belief.max() >= row.threshold else "views ran out"
+            )
+            before = [
+                np.exp(predictions.logits[i, views[:k]].astype(float).sum(0))
+                for k in range(1, len(views))
+            ]
+            assert all((b / b.sum()).max() < row.threshold for b in before)
+
+
+def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
+    rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
+    rows["clean"] = ~rows["object"].isin(
+        np.array(predictions.names)[predictions.conflicting]
+    )
+    measures = pd.read_csv(results / "out" / "measures.csv").query("set == 'all'")
+    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
+    for (policy, threshold), cell in rows.groupby(
+        ["policy", "threshold"], observed=True
+    ):
+        moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
+        by_class = cell.groupby("label", observed=True)
+        wanted = {
+            "accuracy": cell.right.mean(),
+            "clean_accuracy": cell.right[cell.clean].mean(),
+            "class_accuracy": by_class.right.mean().mean(),
+            "class_accuracy_std": by_class.right.mean().std(ddof=0),
+            "n_views": cell.n_views.mean(),
+            "travel_all": cell.travel.mean(),
+            "travel_moved": moved.travel.mean(),
+            "class_travel_moved": moved.groupby("label", observed=True)
+            .travel.mean()
+            .mean(),
+            "arc_all": cell.arc.mean(),
+            "confident": len(sure) / len(cell),
+            "confident_accuracy": sure.right.mean(),
+            "calibration_error": calibration_error(
+                cell.confidence.to_numpy(), cell.right.to_numpy()
+            ),
+        }
+        for measure, value in wanted.items():
+            assert summary[policy, threshold, measure] == pytest.approx(
+                value, nan_ok=True
+            ), (policy, measure)
+
+
+def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
+    """Replay cut by the rule of the recogniser's calibration is what the command writes, the
+    threshold's decay too.
+    """
+    p = replace(predictions, calibration=Calibration(0.8, 0.5))
+    p.save(tmp_path / "p.npz")
+    main(
+        [
+            "benchmark",
+            "classes",
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "out"),
+            "--policies",
+            "lem",
+            "spread",
+            "--runs",
+            "3",
+            "--samples",
+            "20",
+            "--thresholds",
+            "0.7",
+        ]
+    )
+    found, specs = load(tmp_path / "out"), make_specs(p, runs=3, seed=0)
+    stopping = Stopping.of(p.calibration, 0.7, max_views=5)
+    assert stopping.threshold_decay == 0.5
+    for name in ("random", "lem", "spread"):
+        paths, rows = (
+            replay(name, specs, stopping.max_views, seed=0),
+            found.episodes(name, 0.7),
+        )
+        ends = truncate(paths, stopping)
+        for column in ("n_views", "confidence", "travel", "arc"):
+            np.testing.assert_array_equal(getattr(ends, column), rows[column])
+        np.testing.assert_array_equal(
+            np.array(p.classes)[ends.answer], rows["answer"].astype(str)
+        )
+        # a threshold that stays
+        assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()
+
+
+def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(
+    results, tmp_path, capsys
+):
+    names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
+    sentences = refused(
+        capsys,
+        "benchmark",
+        "classes",
+        results / "p.npz",
+        tmp_path / "own",
+        "--policies",
+        *names,
+        "--runs",
+        "1",
+    )
+    assert all(part in sentences for part in ("Raises", "thing_11", "lcm", "best-99"))
+    found = load(tmp_path / "own")
+    assert set(found.tables.measures.policy) == {"random", "test_replay:Asked"}
+    assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
+
+
+def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_path):
+    both = replace(predictions, splits=np.array(["train", "test"] * 20))
+    both.save(tmp_path / "both.npz")
+    with pytest.raises(ValueError, match="choose one with --split"):
+        benchmark(tmp_path / "both.npz", tmp_path / "mixed")
+    half = benchmark(
+        tmp_path / "both.npz",
+        tmp_path / "half",
+        split="test",
+        policies=("random",),
+        runs=1,
+        samples=20,
+    )
+    assert half.predictions.names == both.names[1::2]
+
+
+def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
+    text = page(results / "p.npz", samples=200)
+    benchmark(results / "p.npz", tmp_path / "full", samples=200)
+    measures = pd.read_csv(tmp_path / "full" / "measures.csv").query("set == 'all'")
+    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
+    tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(
+        ["policy", "threshold", "measure"]
+    )
+    for name in ("lem", "oracle-gain"):
+        row = next(
+            line
+            for line in text.split("## Every policy")[1].splitlines()
+            if line.startswith(f"| {name} |")
+        )
+        for cell, measure in zip(
+            row.split("|")[2:],
+            ["accuracy", "clean_accuracy", "n_views"],
+            strict=False,
+        ):
+            assert float(cell.split()[0]) == pytest.approx(
+                summary[name, 0.97, measure],
+                abs=0.0051,
+            )
+        test = tests.loc[(name, 0.97, "accuracy")]
+        assert (
+            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}"
+            in text
+        )
+    assert "LCM from a predicted map; no such network" in text
+
+
+def test_measured_error_rates_stand_beside_the_promised_ones(
+    predictions, tmp_path, capsys
+):
+    bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
+    replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(
+        tmp_path / "r.npz"
+    )
+    policies, rates = ("random", "lem", "oracle-gain"), tmp_path / "rates"
+    found = benchmark(
+        tmp_path / "r.npz",
+        rates,
+        policies=policies,
+        risks=(0.1, 0.2),
+        runs=4,
+        samples=50,
+    )
+    rows = pd.read_parquet(rates / "episodes.parquet")
+    risks = promised_risks(found.tables, found.settings["risks"])
+    assert {(row.policy, row.risk, row.threshold) for row in risks} == {
+        (name, *promise)
+        for name in ("random", "lem")
+        for promise in ((0.1, 0.8), (0.2, 0.7))
+    }
+    for row in risks:
+        cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
+        stopped = cell[cell.confidence >= row.threshold]
+        assert row.error == pytest.approx(
+            (stopped.answer.astype(str) != stopped.label.astype(str)).mean()
+        )
+        assert row.confident == pytest.approx(len(stopped) / len(cell))
+        assert row.low <= row.error <= row.high
+    assert any(promise.broken for promise in risks)  # the logits are noise
+    assert capsys.readouterr().out == ""  # the library prints nothing
+    report(rates)
+    assert "Promised error rates" in (rates / "report.html").read_text()

@@ -1,0 +1,133 @@
+"""Captures that are written of a mesh, and recognised: the nearest view, the way there and back."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lab_programs import main
+from recordings import write_png
+
+import nextview
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.folders import read_box, read_capture
+from nextview.data.samples import sample_mesh
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview_lab.data.writing import write_capture
+
+TWELVE = ViewSphere.named("12")
+RADIUS = 0.55
+"""Metres; the sample chair's is 0.54."""
+
+
+# There and back
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """The sample chair on a table, from twelve viewpoints."""
+    folder = tmp_path_factory.mktemp("captures") / "chair"
+    done = list(write_capture(sample_mesh("chair"), folder, TWELVE, RADIUS, table=True))
+    assert done == list(range(1, 13))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def system():
+    return nextview.load(policy="spread", threshold=1.0, max_views=3, viewpoints="12")
+
+
+def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system):
+    """With the box known no pose is off, the same views are taken, and they are believed as
+    those of the mesh.
+    """
+    camera = CapturedCamera(
+        read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json")
+    )
+    found, looked = (
+        system.recognise(camera, start=4),
+        system.recognise(sample_mesh("chair"), start=4),
+    )
+    assert max(view.degrees_off for view in found.views) < 1e-5
+    assert [view.index for view in found.views] == [view.index for view in looked.views]
+    assert [camera.capture.frames.index(taken.frame) for taken in camera.taken] == [
+        v.index for v in looked.views
+    ]
+    assert found.answer == looked.answer == "chair"
+    centre, height = (
+        camera.object.object_frame.centre,
+        -RADIUS * sample_mesh("chair").vertices[:, 2].min(),
+    )
+    np.testing.assert_allclose(centre, [0, 0, height], atol=1e-9)
+    for view in found.views:
+        np.testing.assert_allclose(
+            view.observation.pose, TWELVE.poses[view.index], atol=1e-6
+        )
+
+
+def test_the_object_is_found_without_a_box(captured, system):
+    result = system.recognise(captured, start=4)
+    assert result.answer == "chair"
+    assert all(view.degrees_off < 3 for view in result.views)
+    assert result.views[0].observation.radius == pytest.approx(RADIUS, rel=0.1)
+
+
+def test_an_object_without_a_table_is_found_by_its_masks(tmp_path, system):
+    list(write_capture(sample_mesh("chair"), tmp_path / "free", TWELVE, RADIUS))
+    result = system.recognise(tmp_path / "free", start=0, up="z")
+    assert result.answer == "chair"
+    assert all(view.degrees_off < 3 for view in result.views)
+
+
+# The nearest view
+
+
+def test_every_request_gets_the_nearest_view_that_is_left(captured):
+    capture = read_capture(captured)
+    box = read_box(captured / "box.json")
+    camera = CapturedCamera(capture, box=box)
+    asked = look_at_origin(
+        np.radians([50, 30, 70, 10]), np.radians([130, 128, 131, 310])
+    )
+    left = dict(enumerate(capture.frames))
+    for pose in asked:
+        camera.observe(pose)
+
+        def cosine(i, pose=pose):
+            position = left[i].pose[:3, 3] - box.object_frame.centre
+            return position @ pose[:3, 3] / np.linalg.norm(position)
+
+        assert camera.taken[-1].frame.name == left.pop(max(left, key=cosine)).name
+    assert len(camera.taken) == 4
+
+
+def test_views_that_do_not_show_the_object_are_left_out(captured, tmp_path, system):
+    shutil.copytree(captured, tmp_path / "some")
+    write_png(tmp_path / "some" / "depth" / "000004.png", np.zeros((480, 640)))
+    camera = CapturedCamera(read_capture(tmp_path / "some"))
+    result = system.recognise(camera, start=4)
+    assert list(camera.left_out) == ["000004"]
+    # the next one: 30 degrees round, at 45 up
+    assert camera.taken[0].degrees_off == pytest.approx(20.9, abs=2)
+    assert result.answer == "chair"
+
+
+def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
+    root = Path(__file__).parents[2]
+    section = (
+        (root / "docs" / "your_camera.md")
+        .read_text()
+        .split("## Captured images\n")[1]
+        .split("\n## ")[0]
+    )
+    shutil.copytree(root / "samples", tmp_path / "samples")
+    monkeypatch.chdir(tmp_path)
+    for line in re.search(r"```sh\n(.*?)```", section, re.S)[1].splitlines():
+        main(line.partition("#")[0].split()[1:])
+    assert "It is a chair" in capsys.readouterr().out
+    exec(re.search(r"```python\n(.*?)```", section, re.S)[1], {"nextview": nextview})
+    assert "chair (belief" in capsys.readouterr().out
+
+
+# Frames that do not fit together

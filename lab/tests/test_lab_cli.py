@@ -1,0 +1,221 @@
+"""The command line: its table of commands, how they end, and what they show."""
+
+import io
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import redirect_stdout, suppress
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from factories import run_python
+from lab_programs import COMMANDS, called, main
+
+from nextview.checks import EXTRAS
+from nextview.cli.call_with_arguments import entry, find
+from nextview.cli.option_names import option_names
+from nextview_lab.data.store import ViewStore
+from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
+
+OF_LAB = [name for name in COMMANDS if name.startswith("nextview-lab ")]
+LAB_COMMAND = [sys.executable, "-m", "nextview_lab"]
+
+
+@pytest.mark.parametrize("name", OF_LAB)
+def test_every_command_explains_itself(name, capsys):
+    pytest.importorskip("torch")
+    with pytest.raises(SystemExit) as end:
+        called(f"{name} --help")
+    assert end.value.code == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"usage: {name} ")
+    without = ("nextview demo", "nextview demo-episode", "nextview explore")
+    assert "(required)" in shown or name in without
+    rows = [row.replace("│", " ").rstrip() for row in shown.splitlines()]
+    for row, following in pairwise(rows):  # each option has a help, beside it or below
+        beside = re.search(r"\S {2,}(\S)", row) or re.match(r" +(\S)", following)
+        if re.match(r"  --[a-z]", row):
+            assert beside, row
+            assert beside[1] not in "-(", row
+    assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
+    explained = {row.split()[0] for row in rows if re.match(r"  --[a-z]", row)}
+    assert explained == option_names(entry(COMMANDS[name])[0])
+    assert shown.splitlines()[-1] == f"example: {example_of(name)}"
+
+
+def example_of(name):
+    """The command line in the help of a command, with its program."""
+    return f"{name.partition(' ')[0]} {COMMANDS[name].example}"
+
+
+@pytest.mark.parametrize("name", OF_LAB)
+def test_suggested_next_commands_exist(name):
+    named = re.findall(r"nextview(?:-lab)? \w+(?: \w+)?", COMMANDS[name].then)
+    known = {*COMMANDS, *(" ".join(each.split()[:2]) for each in COMMANDS)}
+    assert all(words in known or words.rpartition(" ")[0] in known for words in named)
+
+
+@pytest.mark.parametrize("preset", [None, "thesis"])
+def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
+    stage = pytest.importorskip("nextview_lab.training.recogniser_training")
+    kind, called = stage.RecogniserRecipe, []
+    recipe = (
+        find("nextview_lab.training.recipes:THESIS_RECOGNISER") if preset else kind()
+    )
+
+    def train(store: str, out: str, recipe: kind = kind()) -> list[str]:
+        called.append(recipe)
+        return []
+
+    monkeypatch.setattr(stage, "train_recogniser", train)
+    main(
+        [
+            "train",
+            "recogniser",
+            "s",
+            "none",
+            *(["--preset", preset] if preset else []),
+            "--epochs",
+            "1",
+        ]
+    )
+    assert called == [replace(recipe, epochs=1)]
+
+
+def interrupted(command, ready):
+    """Ctrl-C for a command, once it is ready."""
+    running = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    while not ready() and running.poll() is None:
+        time.sleep(0.01)
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    return (
+        running.returncode,
+        [
+            line
+            for line in said.splitlines()
+            if line.startswith(("nextview: ", "nextview-lab: "))
+        ][-1],
+    )
+
+
+def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, furniture):
+    store = tmp_path / "v.zarr"
+    command = ["render", str(furniture), str(store), "--size", "32", "--workers", "1"]
+
+    def begun():
+        return len(list(store.glob("image/c/*"))) > 1
+
+    again = "nextview-lab: stopped; run the same command again; it resumes"
+    assert interrupted([*LAB_COMMAND, *command], begun) == (130, again)
+    main(command)
+    assert ViewStore.open(store).done.all()
+
+
+MISSING = [
+    package
+    for packages in (*EXTRAS.values(), *EXTRAS_OF_LAB.values())
+    for package in packages
+]
+HIDDEN = f"""
+from importlib.machinery import PathFinder
+missing, plain = {MISSING!r}, PathFinder.find_spec
+find = lambda name, *more: None if name.partition('.')[0] in missing else plain(name, *more)
+PathFinder.find_spec = staticmethod(find)
+"""
+"""Code that hides packages from the search of installed ones."""
+
+
+NEED_EXTRAS = {
+    "from nextview.viewers.recording import Recorder": "nextview[record]",
+    "import nextview_lab.benchmark.environments": "nextview-lab[envs]",
+    "from nextview_lab.benchmark.classes import benchmark_classes": "nextview-lab[benchmark]",
+    "from nextview_lab.benchmark.report import report": "nextview-lab[benchmark]",
+    "import nextview_lab.benchmark.evaluation_page": "nextview-lab[benchmark]",
+    "from nextview.viewers.page import Page": "nextview[explore]",
+    "from nextview_lab.training.recogniser_training import train_recogniser": "nextview-lab[train]",
+    "from nextview_lab.training.export import export_map": "nextview-lab[train]",
+    "from nextview_lab.training.gain_training import train_gain": "nextview-lab[train]",
+    (
+        "from nextview.data.pool import each;"
+        " list(each(print, [1], None, 'tcp://localhost:1'))"
+    ): "nextview[cluster]",
+}
+WITHOUT_EXTRAS = f"""
+import json
+import nextview
+
+errors = {{}}
+for code in {list(NEED_EXTRAS)!r}:
+    try:
+        exec(code, {{}})
+    except nextview.MissingExtraError as error:
+        errors[code] = str(error)
+print(json.dumps(errors))
+"""
+
+
+@pytest.fixture(scope="module")
+def without_extras():
+    """What each of ``NEED_EXTRAS`` says where no extra is installed."""
+    done = run_python(HIDDEN + WITHOUT_EXTRAS)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("code", NEED_EXTRAS)
+def test_python_without_an_extra_names_it_too(code, without_extras):
+    assert f"pip install '{NEED_EXTRAS[code]}'" in without_extras[code]
+    assert "\n" not in without_extras[code]
+
+
+def test_help_needs_no_extra():
+    """The packages are hidden from the search of installed ones."""
+    ask = "from nextview_lab.cli.main import main; main(['train', 'recogniser', '--help'])"
+    done = run_python(HIDDEN + ask)
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'nextview-lab[train]'" in done.stderr
+    assert done.stdout == run_python(ask).stdout
+
+
+@pytest.fixture(scope="module")
+def completions_for_bash(tmp_path_factory):
+    pytest.importorskip("torch")
+    path = tmp_path_factory.mktemp("bash") / "nextview-lab.sh"
+    said = io.StringIO()
+    with redirect_stdout(said), suppress(SystemExit):
+        called("nextview-lab completion bash")
+    path.write_text(said.getvalue())
+    return path
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("re", {"render", "report"}),
+        ("fit s", {"size"}),
+        ("train recogniser --lay", {"--layers"}),
+    ],
+)
+def test_bash_completes_commands_and_options(words, offered, completions_for_bash):
+    ask = (
+        f"source {completions_for_bash}; f=$(complete -p nextview-lab | sed 's/.*-F \\([^"
+        f" ]*\\).*/\\1/'); COMP_WORDS=(nextview-lab {words});"
+        " COMP_CWORD=$((${#COMP_WORDS[@]}-1)); $f; echo ${COMPREPLY[@]}"
+    )
+    done = subprocess.run(
+        ["bash", "-c", ask], capture_output=True, text=True, check=True
+    )
+    assert set(done.stdout.split()) == offered

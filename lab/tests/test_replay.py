@@ -1,0 +1,339 @@
+"""Replay against episodes one by one, against a live camera, and what entries and oracles
+promise.
+"""
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import pytest
+from pipeline import some_predictions
+from scipy.special import log_softmax, softmax
+
+from nextview.errors import UsageError
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.viewsphere import ViewSphere
+from nextview.policies.base import Evidence
+from nextview.policies.registry import make_policy
+from nextview.recognition.belief import Calibration, Stopping
+from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
+from nextview.recognition.own_stopping import own_stopping
+from nextview.session.episode import Episodes, run_episodes
+from nextview.session.session import Session
+from nextview.simulation.simulated import SimulatedCamera
+from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
+from nextview_lab.data.predictions import Predictions
+from nextview_lab.errors import EntryError
+
+
+@pytest.fixture(scope="module")
+def specs():
+    return make_specs(some_predictions(30), runs=4, seed=0)
+
+
+def evidence_of(predictions: Predictions, objects: np.ndarray):
+    def observe(episodes, views):
+        rows = objects[episodes]
+        logits, maps = (
+            predictions.logits[rows, views],
+            {"lem": predictions.maps["lem"][rows, views]},
+        )
+        return Evidence(logits, maps, seen=logits.any(1))
+
+    return observe
+
+
+@pytest.mark.parametrize(
+    ("threshold_decay", "empty"), [(0.0, False), (0.6, False), (1.0, True)]
+)
+@pytest.mark.parametrize("threshold", [0.0, 0.7, 0.9, 0.99])
+@pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
+def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
+    specs, name, threshold, threshold_decay, empty
+):
+    """A view in which nothing is seen counts neither for the decay nor as the end, as in live
+    use.
+    """
+    p = specs.predictions
+    if empty:
+        p = replace(p, logits=np.where(np.arange(40)[:, None] % 2, p.logits, 0))
+        specs = replace(specs, predictions=p)
+    policy, stopping = (
+        make_policy(name, p.sphere, specs.valley_classes("lem")),
+        Stopping(threshold, 5, threshold_decay),
+    )
+    observe, rng = evidence_of(p, specs.objects), np.random.default_rng(0)
+    episodes = run_episodes(
+        observe, p.sphere, policy, specs.starts, stopping, rng
+    ).outcome
+    paths = replay(name, specs, max_views=5, seed=0)
+    ends = truncate(paths, stopping)
+    for field in ("answer", "confidence", "n_views", "confident", "travel", "arc"):
+        np.testing.assert_allclose(
+            getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field
+        )
+    taken = np.arange(5) < ends.n_views[:, None]
+    np.testing.assert_array_equal(
+        np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views
+    )
+
+
+def uncertain(seen, threshold):
+    """A user's stopping rule."""
+    return (seen.entropy < threshold) | (seen.n_views > 3) & (seen.margin > 0.2)
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.6])
+def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(
+    specs, threshold
+):
+    p, rule = specs.predictions, own_stopping("test_replay:uncertain", threshold, 5)
+    policy, paths = (
+        make_policy("lem", p.sphere, specs.valley_classes("lem")),
+        replay("lem", specs, 5, 0, beliefs=True),
+    )
+    episodes = Episodes(p.sphere, policy, specs.starts, rule, np.random.default_rng(0))
+    observe, stopped = evidence_of(p, specs.objects), np.zeros(len(specs.starts), int)
+    while len(episodes.running):
+        step = episodes.update(
+            observe(episodes.running, episodes.current[episodes.running])
+        )
+        entropy = -(step.belief * np.log2(step.belief)).sum(1)
+        lead = np.subtract(*np.sort(step.belief, 1)[:, [-1, -2]].T)
+        k = len(episodes.steps)
+        np.testing.assert_array_equal(
+            step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5)
+        )
+        stopped[step.episodes] = k
+    ends = truncate(paths, rule)
+    np.testing.assert_array_equal(ends.n_views, stopped)
+    for field in ("answer", "confidence", "confident", "travel"):
+        np.testing.assert_allclose(
+            getattr(ends, field),
+            getattr(episodes.outcome, field),
+            atol=1e-12,
+            err_msg=field,
+        )
+    with pytest.raises(UsageError):
+        truncate(replay("lem", specs, 5, 0), rule)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A user's policy: the next view by number."""
+
+    sphere: ViewSphere
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state, rng):
+        return (state.current + 1) % len(self.sphere)
+
+
+class Raises(Asked):
+    def next_views(self, state, rng):
+        if (state.episodes == 11).any():
+            raise RuntimeError("no idea")
+        return super().next_views(state, rng)
+
+
+class ToItsBack:
+    """Goes round the ring to where the side opposite to that which the recogniser calls 0 is
+    likely to be seen.
+    """
+
+    needs = ("azimuth_bins",)
+
+    def __init__(self, sphere):
+        self.sphere = sphere
+
+    def next_views(self, state, rng):
+        n, rows = self.sphere.azimuths, np.arange(len(state.current))
+        # (B, azimuth bins)
+        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(1)
+        to = (
+            self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)
+        ) % n
+        views = self.sphere.ring[state.current][:, None] * n + to
+        return views[
+            rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)
+        ]
+
+
+def settled(seen, threshold):
+    """A user's rule: two views have changed no belief by more than the threshold."""
+    return np.maximum(seen.change(1), seen.change(2)) <= threshold
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.3])
+def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike(
+    specs, threshold
+):
+    p, rule = specs.predictions, own_stopping(settled, threshold, 9)
+    policy = make_policy("lem", p.sphere, specs.valley_classes("lem"))
+    paths = replay("lem", specs, 9, 0, beliefs=True)
+
+    expected = []
+    for beliefs in paths.beliefs:
+        ends = 9
+        for k in range(2, 9):
+            moved = (
+                abs(beliefs[k] - beliefs[k - 1]).max(),
+                abs(beliefs[k] - beliefs[k - 2]).max(),
+            )
+            if max(moved) <= threshold:
+                ends = k + 1
+                break
+        expected.append(ends)
+    assert sum(n < 9 for n in expected) > 0
+    np.testing.assert_array_equal(truncate(paths, rule).n_views, expected)
+
+    observe = evidence_of(p, specs.objects)
+    rng = np.random.default_rng(0)
+    live = run_episodes(observe, p.sphere, policy, specs.starts, rule, rng).outcome
+    np.testing.assert_array_equal(live.n_views, expected)
+    with pytest.raises(UsageError):
+        truncate(replay("lem", specs, 9, 0), rule)
+
+
+@pytest.mark.parametrize("knows_bins", [False, True])
+def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_bins):
+    calibration, likely = Calibration(0.8, 0.5), None
+    if knows_bins:
+        calibration = msgspec.structs.replace(calibration, bin_correlation=0.1)
+        likely = log_softmax(
+            np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3
+        ).astype(np.float32)
+    specs = replace(
+        specs,
+        predictions=replace(
+            specs.predictions, calibration=calibration, azimuth_bins=likely
+        ),
+    )
+    p = specs.predictions
+    for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
+        views = replay(name, specs, 3, seed=0).views
+        for e in range(0, len(views), 7):
+            i, seen = specs.objects[e], list(views[e, :2])
+            around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
+            sums = {
+                v: p.log_evidence[i, [*seen, v]].astype(float).sum(0)
+                for v in around
+                if v not in seen
+            }
+            belief = {
+                v: calibration.belief(total, 3, 3)[p.labels[i]]
+                for v, total in sums.items()
+            }
+            assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
+
+
+def test_fixed_views_are_the_ones_their_name_says(specs):
+    p = specs.predictions
+    sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][
+        specs.objects
+    ]
+    entropy = p.depth_entropy[specs.objects]
+    by_name = {
+        "best-5": sure,
+        "worst-5": -sure,
+        "high-entropy-5": entropy,
+        "low-entropy-5": -entropy,
+    }
+    for name, values in by_name.items():
+        paths = replay(name, specs, max_views=3, seed=0)
+        taken = np.take_along_axis(values, paths.views, 1)
+        np.testing.assert_allclose(
+            np.sort(taken), np.sort(values)[:, -5:], err_msg=name
+        )
+        total = np.take_along_axis(
+            p.logits[specs.objects], paths.views[..., None], 1
+        ).sum(1)
+        ends = truncate(paths, Stopping(0.1))
+        np.testing.assert_array_equal(ends.n_views, 5)  # whatever is believed
+        np.testing.assert_array_equal(ends.answer, total.argmax(1))
+        np.testing.assert_allclose(
+            ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (
+            "Raises",
+            r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)",
+        ),
+        ("Missing", "cannot be made"),
+    ],
+)
+def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(
+    specs, name, sentence
+):
+    grid = Grid(specs, 4, (0.9,), 5, 0)
+    path = f"test_replay:{name}"
+    assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]
+    assert set(grid.paths) == {"furthest", "test_replay:Asked"}
+    with pytest.raises(ValueError, match=sentence):
+        raise EntryError(grid.failures[path])
+    assert path in grid.failures[path]
+
+
+def test_the_contestants_are_those_that_the_predictions_allow(specs):
+    names = default_entries(specs)
+    assert {"lem", "oracle-valley", "true-lcm", "orbit-8", "orbit-40"} <= set(names)
+    assert not any(name.startswith("lcm") for name in names)
+    p = specs.predictions
+    with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
+    assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
+    # of no valley classes
+    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)
+    assert [name for name in default_entries(other) if "view_area" in name] == [
+        "view_area",
+        "view_area-peak",
+    ]
+    for name, same in (
+        ("view_area", "lem-peak"),
+        ("view_area-oracle-valley", "lem-peak"),
+    ):
+        np.testing.assert_array_equal(
+            replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views
+        )
+    without = make_specs(replace(p, maps={}), 1, 0)
+    assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
+    for name in default_entries(with_lcm):
+        replay(name, with_lcm, 2, 0)
+
+
+def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(
+    furniture, models, predictions
+):
+    p = Predictions.load(predictions).of_split("test")
+    specs = make_specs(p, runs=2, seed=0)
+    networks = Models(
+        NetworkRecogniser(models / "tiny.json", 1),
+        {"lem": MapNetwork(models / "tiny-lem.json", 1)},
+    )
+    # A threshold that some reach: the middle of all confidences after two views.
+    threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
+    for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
+        policy, paths = (
+            make_policy(name, p.sphere, specs.valley_classes("lem")),
+            replay(name, specs, 5, 0),
+        )
+        stopping = Stopping.of(p.calibration, threshold, max_views=5)
+        ends = truncate(paths, stopping)
+        for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):
+            mesh = load_mesh(
+                furniture / p.classes[p.labels[i]] / "test" / f"{p.names[i]}.off"
+            )
+            camera = SimulatedCamera(mesh, 32, p.sphere.distance)
+            live = Session(networks, policy, p.sphere, int(start), stopping).run(camera)
+            assert [view.index for view in live.views] == paths.views[
+                e, : ends.n_views[e]
+            ].tolist()
+            assert live.answer == p.classes[ends.answer[e]]
+            assert live.confident == ends.confident[e]
+            # the store rounds
+            assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)
+            assert live.travel == pytest.approx(ends.travel[e])

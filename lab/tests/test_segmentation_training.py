@@ -1,0 +1,335 @@
+"""The segmentation network: its labelled frames, its training, and the file that is exported."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lab_programs import main
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import ModelError
+from nextview.files import sha256_of
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.recognition.model_card import find_card
+from nextview.segmentation.features import SmallPicture
+from nextview.segmentation.network import (
+    AFFINITY_STEPS,
+    load_network,
+    new_card,
+    write_segmentation_card,
+)
+from nextview_lab.data.labelled_frames import (
+    Example,
+    LabelledFrames,
+    draw_frames,
+    frame_files,
+    output_scores,
+)
+from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, World, photograph, slab
+
+# size, middle of the foot, height of the top and turn of each box, and its label
+BOXES = (
+    ((6.0, 6.0, 0.1), (0.0, 0.0), -0.7, 0.0, BACKGROUND),
+    ((0.7, 0.5, 0.04), (0.0, 0.0), 0.0, 0.3, SURFACE),
+    ((0.16, 0.1, 0.12), (0.03, 0.02), 0.12, 0.8, 0),
+)
+SEED = (5, 0)
+
+
+def reaches(origin, rays, size, middle, top, turn):
+    """How far rays go to a box, by the three pairs of planes that bound it; infinity for a miss."""
+    axes = Rotation.from_euler("z", turn).as_matrix()
+    start = (origin - [*middle, top - size[2] / 2]) @ axes
+    along = rays @ axes
+    with np.errstate(divide="ignore"):
+        bounds = np.array([[-1], [1]]) * size / 2 - start
+        ends = bounds[:, None, None] / along
+    enter = ends.min(0).max(-1)
+    leave = ends.max(0).min(-1)
+    return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+
+def test_labels_and_depth_are_those_of_rays_that_meet_boxes():
+    world = World(np.array([0, 0, 0.05]), 0.1, (25.0, 80.0))
+    for *place, label in BOXES:
+        world.add(slab(*place), label)
+
+    frames = photograph(world, np.random.default_rng(3), (90, 120), 8)
+    shown = set()
+    for frame in frames:
+        rays = PinholeCamera.of(frame.intrinsics, frame.depth.shape).rays
+        turned = rays @ frame.pose[:3, :3].T
+        far = np.stack([reaches(frame.pose[:3, 3], turned, *box[:4]) for box in BOXES])
+        expected = np.array([label for *_, label in BOXES])[far.argmin(0)]
+        inner = ndimage.minimum_filter(expected, 7) == ndimage.maximum_filter(
+            expected, 7
+        )
+        judged = inner & (frame.depth > 0) & np.isfinite(far.min(0))
+
+        assert judged.sum() > 1000
+        assert (frame.labels[judged] == expected[judged]).mean() > 0.995
+        missed = frame.depth[judged] / far.min(0)[judged] - 1
+        assert np.median(np.abs(missed)) < 0.02
+        shown |= set(np.unique(expected[judged]).tolist())
+        assert np.allclose(frame.pose[:3, :3] @ frame.up, [0, 0, 1])
+    assert shown == {BACKGROUND, SURFACE, 0}
+
+
+def test_training_targets_of_a_picture():
+    labels = np.full((20, 30), SURFACE, np.int16)
+    labels[4:8, 5:11] = 0
+    labels[4:8, 11:14] = 1
+    slopes = [np.linspace(-0.3, 0.3, size, dtype=np.float32) for size in (30, 20)]
+    picture = SmallPicture(np.full((20, 30), 2.0, np.float32), tuple(slopes), 1)
+    example = Example.of(picture, labels, None)
+
+    assert example.features.shape[1:] == example.classes.shape == (32, 32)
+    assert (example.classes[20:] == -1).all()
+    assert example.classes[[0, 4, 4], [0, 5, 11]].tolist() == [1, 2, 2]
+    right = AFFINITY_STEPS.index((0, 4))
+    assert example.same[right, 5, 5:11].tolist() == [1, 1, 0, 0, 0, 0]
+    large, small = (
+        24**-0.5,
+        12**-0.5,
+    )  # by the pixels of a thing; the smaller one counts
+    np.testing.assert_allclose(
+        example.compared[right, 5, [0, 5, 9, 11, 13]], [0, large, small, 0, 0]
+    )
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Two files of frames."""
+    files = frame_files(tmp_path_factory.mktemp("drawn"), 4, SEED, most=2)
+    assert [done for done, _ in draw_frames(files, workers=0)] == [0, 1, 2]
+    return files
+
+
+def test_a_varied_frame_is_of_the_same_world(drawn):
+    frames = LabelledFrames.load([file.path for file in drawn])
+    mirrored = set()
+    told = 0
+    for seed in range(6):
+        plain, varied = (
+            frames.example(seed % 4, rng) for rng in (None, np.random.default_rng(seed))
+        )
+        rows, columns = frames.labels.shape[1:]
+        flips = [
+            np.array_equal(turned, varied.classes[:rows, :columns])
+            for turned in (
+                plain.classes[:rows, :columns],
+                plain.classes[:rows, :columns][:, ::-1],
+            )
+        ]
+        assert any(flips)
+        mirrored.add(flips[1])
+        # gravity points nearly where it did, also in a mirror
+        if varied.features[13].any():
+            before, after = (
+                np.linalg.lstsq(x[1:4].reshape(3, -1).T, x[12].ravel())[0]
+                for x in (plain.features, varied.features)
+            )
+            told += 1
+            assert after @ (before * [-1 if flips[1] else 1, 1, 1]) > np.cos(0.2)
+    assert 0 < told < 6
+    assert mirrored == {False, True}
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from nextview_lab.data.labelled_frames import draw_frames, frame_files
+
+finish = os.replace
+def fatal(source, target):
+    if str(target).endswith("00001.npz"):
+        os._exit(9)
+    finish(source, target)
+os.replace = fatal
+list(draw_frames(frame_files(Path(sys.argv[1]), 4, (5, 0), most=2), workers=0))
+"""
+
+
+def test_an_interrupted_drawing_resumes_with_the_same_frames(tmp_path, drawn):
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    assert subprocess.run(command, check=False).returncode == 9
+    files = frame_files(tmp_path, 4, SEED, most=2)
+    assert [file.path.exists() for file in files] == [True, False]
+
+    before = files[0].path.stat()
+    assert [done for done, _ in draw_frames(files, workers=0)] == [1, 2]
+    assert files[0].path.stat() == before
+    whole = [vars(LabelledFrames.load([file.path])) for file in drawn]
+    again = [vars(LabelledFrames.load([file.path])) for file in files]
+    for one, other in zip(whole, again, strict=True):
+        assert all(np.array_equal(one[name], other[name]) for name in one)
+    assert not np.array_equal(whole[0]["depth"], whole[1]["depth"])
+
+
+def test_scores_of_outputs_that_are_right_and_wrong(drawn):
+    frames = LabelledFrames.load([file.path for file in drawn])
+    examples = [frames.example(index, None) for index in range(len(frames))]
+    classes = np.stack([example.classes for example in examples])
+    right = np.concatenate(
+        [
+            classes[:, None] == np.arange(3)[:, None, None],
+            2 * np.stack([example.same for example in examples]) - 1,
+        ],
+        1,
+    )
+    assert output_scores(right, examples) == {
+        "class_accuracy": 1,
+        "thing_iou": 1,
+        "pair_accuracy": 1,
+    }
+    wrong = right.copy()
+    wrong[:, :3] = right[:, [1, 2, 0]]
+    wrong[:, 3:] *= -1
+    assert output_scores(wrong, examples) == {
+        "class_accuracy": 0,
+        "thing_iou": 0,
+        "pair_accuracy": 0,
+    }
+
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("lightning")
+
+from nextview_lab.training import segmentation_training as training
+from nextview_lab.training.architectures import SegmentationNet
+from nextview_lab.training.recipes import Hardware, SegmentationRecipe
+from nextview_lab.training.runs import load_run
+from nextview_lab.training.segmentation_training import fit_segmentation
+
+RECIPE = SegmentationRecipe(
+    frames=8, width=4, epochs=6, batch=2, lr=0.01, validation_share=0.25, seed=3
+)
+EXACT = Hardware(precision="32-true")
+
+
+def losses(run: Path):
+    with (run / "log/metrics.csv").open() as file:
+        return [float(row["loss"]) for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of a few steps, as the command line starts it."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    torch.set_num_threads(1)  # sums of several threads depend on how many there are
+    options = {
+        "frames": RECIPE.frames,
+        "width": RECIPE.width,
+        "epochs": RECIPE.epochs,
+        "batch": RECIPE.batch,
+        "lr": RECIPE.lr,
+        "validation-share": RECIPE.validation_share,
+        "seed": RECIPE.seed,
+        "workers": 0,
+        "precision": EXACT.precision,
+    }
+    words = [
+        word for name, value in options.items() for word in (f"--{name}", str(value))
+    ]
+    main(["train", "segmentation", str(out), *words])
+    return out
+
+
+def test_training_lowers_its_loss(run):
+    found = losses(run)
+    assert len(found) == RECIPE.epochs
+    assert found[-1] < 0.8 * found[0]
+
+
+def test_a_stopped_training_ends_with_the_weights_of_one_that_was_not(
+    tmp_path, run, monkeypatch
+):
+    step = training.SegmentationModule.training_step
+
+    def stopping(self, batch, index):
+        if (self.current_epoch, index) == (2, 1):
+            raise ZeroDivisionError
+        return step(self, batch, index)
+
+    files = training.files_of(run, RECIPE)
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr(training.SegmentationModule, "training_step", stopping)
+        fit_segmentation(files, RECIPE, tmp_path, EXACT)
+    assert len(losses(tmp_path)) == 2
+
+    resumed = fit_segmentation(files, RECIPE, tmp_path, EXACT).state_dict()
+    whole = load_run(SegmentationNet(RECIPE.width), run).state_dict()
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+    assert losses(tmp_path) == losses(run)
+
+
+@pytest.fixture(scope="module")
+def exported(run):
+    pytest.importorskip("onnx")
+    main(["export", "segmentation", str(run), str(run.parent / "models")])
+    return run.parent / "models/segmentation.json"
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (37, 90)])
+def test_the_file_answers_as_the_network(run, exported, shape):
+    network = load_run(SegmentationNet(RECIPE.width), run)
+    seen = np.random.default_rng(1).normal(0, 1, (15, *shape)).astype(np.float32)
+    padded = np.pad(seen, ((0, 0), (0, -shape[0] % 16), (0, -shape[1] % 16)))
+    with torch.no_grad():
+        expected = network(torch.from_numpy(padded)[None])[0].numpy()
+    answer = load_network(exported)(seen)
+    assert answer.shape == (15, *shape)
+    assert answer.dtype == np.float32
+    assert np.abs(answer - expected[:, : shape[0], : shape[1]]).max() < 0.01
+
+
+def other_recogniser(card):
+    """The file of another network, with a card that has its hash."""
+    recogniser = find_card("recogniser-modelnet10").path
+    card.with_suffix(".onnx").write_bytes(recogniser.read_bytes())
+    write_segmentation_card(card, new_card("other", sha256_of(recogniser)))
+
+
+def with_field(name, value):
+    def change(card):
+        card.write_text(json.dumps(json.loads(card.read_text()) | {name: value}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        (lambda card: card.unlink(), r"segmentation\.json: no such file"),
+        (
+            lambda card: card.write_text("{"),
+            r"json: not the card of a segmentation netw",
+        ),
+        (
+            with_field("kind", "recogniser"),
+            r"json: not the card of a segmentation netw",
+        ),
+        (with_field("channels", 14), r"json: its network has other inputs or outputs"),
+        (
+            with_field("sha256", "0" * 64),
+            r"onnx: is not the file that its card describes",
+        ),
+        (lambda card: card.with_suffix(".onnx").unlink(), r"onnx: no such file"),
+        (other_recogniser, r"onnx: has input where it should have features"),
+    ],
+)
+def test_a_broken_network_is_refused_in_one_sentence(
+    tmp_path, exported, broken, sentence
+):
+    card = tmp_path / exported.name
+    for file in (exported, exported.with_suffix(".onnx")):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    broken(card)
+    with pytest.raises(ModelError, match=sentence) as raised:
+        load_network(card)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,344 @@
+"""Methods on a frozen archive: what they are told, what is refused, and how they are compared."""
+
+import json
+import re
+import shutil
+from contextlib import closing
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from frozen_archives import ANSWERS_ALWAYS, as_command, edited
+from lab_programs import main, refused
+from markdown_it import MarkdownIt
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import DatasetError, ResultsError
+from nextview_lab.benchmark.frozen import FrozenArchive
+from nextview_lab.benchmark.line_process import LineProcess
+from nextview_lab.benchmark.standings import KnownShape, leaderboard_of
+from nextview_lab.benchmark.submit import SubmitOptions, submit
+from nextview_lab.cli.benchmark_tables import print_standings
+
+ROOT = Path(__file__).parents[2]
+BLIND = SubmitOptions("fixed", max_views=2)
+
+
+@pytest.fixture
+def own(archive, tmp_path):
+    """An archive that may be damaged."""
+    return shutil.copytree(archive, tmp_path / "archive")
+
+
+@pytest.fixture(scope="module")
+def submitted(archive, tmp_path_factory):
+    """Results of nextview, of a blind rule, and of a method that calls everything a mug."""
+    folder = tmp_path_factory.mktemp("submitted")
+    always = SubmitOptions(
+        command=as_command(folder, ANSWERS_ALWAYS), name="mug", version="1", max_views=2
+    )
+    options = {"geometry": replace(BLIND, policy="geometry"), "fixed": BLIND}
+    for name, how in (options | {"mug": always}).items():
+        submit(archive, folder / f"{name}.json", how)
+    return folder
+
+
+def answering(folder, **answer):
+    """Options of a method that always says the same."""
+    code = (
+        "import json, sys\n"
+        f"for line in sys.stdin: print(json.dumps({answer!r}), flush=True)"
+    )
+    return SubmitOptions(
+        command=as_command(folder, code), name="m", version="1", max_views=2
+    )
+
+
+def test_nextview_names_what_it_sees(submitted):
+    found = json.loads((submitted / "geometry.json").read_text())
+    names = [[said["name"] for said in one["said"]] for one in found["episodes"]]
+    assert names == [["mug"] * 2, ["cracker_box"] * 2]
+    assert found["method"] == "nextview geometry"
+    assert not found["blind"]
+
+
+def test_the_leaderboard_compares_with_the_best_blind_method(
+    archive, submitted, tmp_path, capsys
+):
+    out = tmp_path / "board"
+    main(["leaderboard", str(submitted), str(archive), str(out), "--samples", "100"])
+    text = (out / "leaderboard.md").read_text()
+    rows = {
+        line.split(" | ")[0].strip("| "): line.split(" | ")[1:]
+        for line in text.split("## Differences")[0].splitlines()
+    }
+    version = json.loads((submitted / "fixed.json").read_text())["version"]
+    ours = rows[f"nextview geometry ({version})"]
+    mug = rows["mug (1)"]
+    assert [cell.split()[0] for cell in ours[:5]] == ["1.000"] * 3 + ["0.000"] * 2
+    assert [cell.split()[0] for cell in mug[:5]] == ["0.500"] * 4 + ["0.000"]
+    assert float(ours[5].split()[0]) < 10  # mm
+    assert "## Differences to nextview fixed" in text
+    assert "| mug | 2 views | -50.0 (" in text
+    assert "Too few to tell" in text
+    page = (out / "leaderboard.html").read_text()
+    assert FrozenArchive(archive).sha256 in page
+    assert "nextview geometry" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_goes_on(own, tmp_path):
+    out = tmp_path / "out.json"
+
+    def stopped(done, total, what):
+        next(iter(done))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        submit(own, out, BLIND, track=stopped)
+    assert not out.exists()
+
+    (own / "episodes/0000/000.png").unlink()
+    assert submit(own, out, BLIND).episodes == 2
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ({"name": "mugg", "confidence": 1.0, "confident": True}, "did you mean 'mug'"),
+        ({"name": "mug", "confidence": 2.0, "confident": True}, "between 0 and 1"),
+        ({"name": "mug", "confidence": 1.0}, "confident"),
+        (
+            {"name": None, "confidence": 0.0, "confident": False},
+            "one of free, not None",
+        ),
+        (
+            {"name": None, "confidence": 0.0, "confident": False, "next": 0},
+            "one of free, not 0",
+        ),
+        (
+            {
+                "name": "mug",
+                "confidence": 1.0,
+                "confident": True,
+                "next": 1,
+                "pose": np.diag([2.0, 2, 2, 1]).tolist(),
+            },
+            "scaled by 2",
+        ),
+    ],
+)
+def test_what_is_no_answer_is_refused(archive, tmp_path, answer, said):
+    with pytest.raises(ResultsError, match=said) as raised:
+        submit(archive, tmp_path / "out.json", answering(tmp_path, **answer))
+    assert "episode 0000, view 1" in str(raised.value)
+
+
+def asked(tmp_path, code, wait=60.0, line=b"x" * 100_000):
+    """What a process that runs some code answers to a line, longer than a pipe, given twice."""
+    head = "import os, subprocess, sys, time\nread = sys.stdin.buffer.readline\n"
+    with closing(LineProcess(as_command(tmp_path, head + code))) as process:
+        return [process.ask(line, wait, "method") for _ in range(2)]
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (
+            "read()\nfor _ in range(10**6): print('yes', flush=True)",
+            "'yes' was written before this view was sent",
+        ),
+        (
+            "print('first\\nsecond', flush=True); read(); time.sleep(3)",
+            "was written before this view was sent",
+        ),
+        (
+            "read(); print('a\\n', flush=True); read()",
+            "an empty line was written before",
+        ),
+        (
+            "read(); os.write(1, 'gr\u00fc\u00df'.encode('latin-1')); time.sleep(3)",
+            r"'gr\\xfc\\xdf' is not UTF-8 \(byte 0xfc\)",
+        ),
+        ("read(); os.write(1, b'half \\xc3\\n'); time.sleep(3)", "is not UTF-8"),
+        (
+            "read()\nwhile True: os.write(1, b'z' * 70000)",
+            "'zzz.*' is a line of more than 1 MB",
+        ),
+        ("read(); os.write(1, b'{\"name'); os._exit(7)", "has ended with status 7"),
+        ("read(); os.kill(os.getpid(), 9)", "has ended with status -9"),
+        (
+            "read(); subprocess.Popen(['sleep', '60']); os._exit(3)",
+            "has ended with status 3",
+        ),
+        ("os.close(0); time.sleep(3)", "closed its input or its output"),
+        ("read(); os.close(1); time.sleep(3)", "closed its input or its output"),
+    ],
+)
+def test_a_process_that_breaks_the_protocol_is_told_at_once(tmp_path, code, said):
+    with pytest.raises(ResultsError, match=said) as raised:
+        asked(tmp_path, code)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "time.sleep(3)",
+        "read(1000); time.sleep(3)",
+        "read()\nwhile True: os.write(1, b' '); time.sleep(0.01)",
+    ],
+    ids=["never reads", "reads a part", "never ends its line"],
+)
+def test_a_line_of_any_length_is_waited_for_no_longer_than_told(tmp_path, code):
+    with pytest.raises(ResultsError):
+        asked(tmp_path, code, 0.5)
+
+
+def test_a_changed_image_is_found(own, tmp_path, capsys):
+    path = own / "episodes/0000/000.png"
+    with Image.open(path) as image:
+        pixels = np.array(image)
+    pixels[0, 0] += 1
+    Image.fromarray(pixels).save(path)
+    said = refused(capsys, "submit", own, tmp_path / "out.json", "--policy", "fixed")
+    assert "000.png: is missing, or not the file that the manifest names" in said
+
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(DatasetError):
+        FrozenArchive(own).view("0000", 0)
+    path.unlink()
+    with pytest.raises(DatasetError):
+        FrozenArchive(own).view("0000", 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda v: v["episodes"].pop(), "episode 0001 0 times"),
+        (lambda v: v.update(archive_sha256="0" * 64), "is of another archive"),
+        (lambda v: v.update(format=9), "has format 9"),
+        (lambda v: v["episodes"][0]["said"].pop(), "has 1 view, not 2"),
+        (lambda v: v["episodes"][0]["said"][0].update(view=1), "do not begin with 0"),
+        (lambda v: v["episodes"][0]["said"][0].update(name="x"), "no thing called 'x'"),
+        (
+            lambda v: v["episodes"][0]["said"][0].update(pose=[[1.0] * 4] * 4),
+            "episode 0000: ",
+        ),
+        (
+            lambda v: v["episodes"][0]["said"][0].update(pose=[[0.0] * 10**6] * 4),
+            "].pose[0]",
+        ),
+        (lambda v: v.update(method="nextview geometry"), "another file has the method"),
+        (lambda v: v.update(views=10**9), "$.views"),
+        (lambda v: v.update(version="7" * 100_000), "$.version"),
+        (lambda v: v["episodes"][1]["said"][1].update(view=10**12), "].view"),
+        (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=1e300), "].cpu_sec"),
+        (lambda v: v["episodes"][0]["said"][0].update(name="mug" * 10**6), "].name"),
+        (
+            lambda v: v["episodes"].extend([v["episodes"][1]] * 50_000),
+            "episode 0001 50001 times",
+        ),
+    ],
+)
+def test_a_file_of_results_that_is_not_valid_is_refused(
+    archive, submitted, tmp_path, capsys, change, said
+):
+    folder = shutil.copytree(submitted, tmp_path / "submitted")
+    edited(folder / "mug.json", change)
+    heard = refused(capsys, "leaderboard", folder, archive, tmp_path / "board")
+    assert "mug.json" in heard
+    assert said in heard
+    assert not (tmp_path / "board").exists()
+
+
+NASTY = "<script>alert('a')</script> \x1b[31m|`rm` \u202e_*~$x$ [l](https://a.b)\n# two"
+
+
+def test_names_are_text_in_markdown_html_and_terminals(
+    archive, submitted, tmp_path, capsys
+):
+    folder = shutil.copytree(submitted, tmp_path / "submitted")
+    edited(folder / "fixed.json", lambda v: v.update(method=NASTY, version="<b>|"))
+    board = leaderboard_of(folder, archive, tmp_path / "board", samples=100)
+    print_standings(board)
+    in_terminal = capsys.readouterr()
+    markdown = (tmp_path / "board/leaderboard.md").read_text(encoding="utf-8")
+    page = (tmp_path / "board/leaderboard.html").read_text(encoding="utf-8")
+    rendered = MarkdownIt("gfm-like", {"linkify": False}).render(markdown)
+    for text in (in_terminal.out, in_terminal.err, markdown, page):
+        assert not set(text) & {"\x1b", "\u202e"}
+        assert "# two" not in text.splitlines()
+    for text in (markdown, page, rendered):
+        assert "<script" not in text
+        assert "<b>" not in text
+
+    name = NASTY.replace("\x1b", "\\x1b").replace("\u202e", "\\u202e")
+    name = name.replace("\n", " ")
+    for text in (page, rendered):
+        read = Texts(text)
+        assert f"{name} (<b>|)" in read.of("th", "td")
+        assert f"Differences to {name}" in read.of("h2")
+        assert len(read.of("td", "th")) == sum(
+            len(table.headings) * (1 + len(table.rows)) for table in board.tables
+        )
+        assert not {"script", "b", "em", "code", "del"} & {tag for tag, _ in read.found}
+    assert "a" not in {tag for tag, _ in Texts(rendered).found}
+
+
+class Texts(HTMLParser):
+    """The elements of a page of HTML, and the text in each."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, ""))
+
+    def handle_data(self, data):
+        if self.found:
+            tag, before = self.found[-1]
+            self.found[-1] = (tag, before + data)
+
+    def of(self, *tags):
+        """The texts of some elements."""
+        return [text.strip() for tag, text in self.found if tag in tags]
+
+
+def test_the_method_of_the_page_runs(archive, tmp_path):
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    (tmp_path / "results").mkdir()
+    how = SubmitOptions(
+        command=as_command(tmp_path, code), name="all mugs", version="1"
+    )
+    submit(archive, tmp_path / "results/mugs.json", how)
+    board = leaderboard_of(
+        tmp_path / "results", archive, tmp_path / "board", samples=100
+    )
+    assert board.reference is None
+    assert [cell.split()[0] for cell in board.tables[0].rows[0][1:4]] == ["0.500"] * 3
+
+
+def test_poses_are_compared_modulo_symmetries(tmp_path):
+    trimesh.creation.cylinder(0.03, 0.1, sections=180).export(tmp_path / "can.ply")
+    can = KnownShape(tmp_path / "can.ply", "can")
+    true = np.eye(4)
+    true[:3, :3] = Rotation.from_euler("xyz", (10, 20, 30), degrees=True).as_matrix()
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("zx", (77, 183), degrees=True).as_matrix()
+    assert can.turn(true @ turn, true) == pytest.approx(3, abs=0.1)
+    assert can.distance(true, true) < 0.05
+
+    raised = true.copy()
+    raised[:3, 3] = 0.004 * true[:3, 2]  # along its axis: only the ends are elsewhere
+    aside = true.copy()
+    aside[:3, 3] = 0.004 * true[:3, 0]
+    assert can.distance(raised, true) < 0.1
+    assert can.distance(aside, true) == pytest.approx(2.2, abs=0.4)

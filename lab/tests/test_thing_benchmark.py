@@ -1,0 +1,429 @@
+"""The benchmark of next views of taught things: scans to tables, replays, statistics."""
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import trimesh
+from lab_programs import main
+from msgspec.structs import replace as replace_record
+
+from nextview.errors import DatasetError, ResultsError, UsageError
+from nextview.files import read_record
+from nextview.geometry.mesh import UNITS, load_mesh
+from nextview.policies.base import EpisodeState
+from nextview.recognition.evidence import Evidence
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview_lab.benchmark import things as stage
+from nextview_lab.benchmark.confusable import Alikeness
+from nextview_lab.benchmark.thing_episodes import (
+    EPISODE_SPHERE,
+    VISIBLE_SHARES,
+    Setting,
+    ThingEpisode,
+    hiding_boxes,
+)
+from nextview_lab.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
+from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun, opened
+from nextview_lab.benchmark.thing_tables import summarise_things
+from nextview_lab.benchmark.things import ThingSettings, benchmark_things
+
+SETTINGS = ThingSettings(
+    views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200
+)
+
+
+class FarAzimuth:
+    """A policy of a user: goes to the free view that is farthest round, and looks at its inputs."""
+
+    needs = ("outlook",)
+    seen = []  # noqa: RUF012  # what it was given, for the test
+
+    def __init__(self, viewpoints):
+        self.viewpoints = viewpoints
+
+    def next_views(self, state, rng):
+        self.seen.append(state.outlook[0].hypotheses)
+        far = np.where(state.free[0], self.viewpoints.arc[state.current[0]], -1)
+        return np.array([far.argmax()])
+
+
+@pytest.fixture(scope="module")
+def settings(knobs_memory):
+    return replace(SETTINGS, models=str(knobs_memory))
+
+
+@pytest.fixture(scope="module")
+def made(shared, knobs, settings):
+    """A folder of results."""
+    return (
+        shared(
+            "knobs_results",
+            lambda f: benchmark_things(knobs, f / "out", settings, workers=0),
+        )
+        / "out"
+    )
+
+
+@pytest.fixture
+def results(made, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(made, tmp_path / "out")
+
+
+def episode_of(knobs_memory, knobs, thing, folder=None, occlusion="none"):
+    things = opened(str(knobs_memory))
+    mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
+    return ThingEpisode(
+        things, lambda: mesh, thing, 0, Setting("wrist", occlusion), folder
+    )
+
+
+# From scans to tables
+
+
+def test_the_command_prints_and_writes_tables_of_all_policies(
+    knobs, knobs_memory, results, capsys, monkeypatch
+):
+    monkeypatch.setattr(
+        stage, "work", lambda job: pytest.fail("nothing was left to do")
+    )
+    line = [
+        "benchmark",
+        "things",
+        knobs,
+        results,
+        "--models",
+        knobs_memory,
+        "--views",
+        1,
+        2,
+    ]
+    line += ["--policies", "random", "geometry", "--repeats", 1, "--workers", 0]
+    main([str(word) for word in line])
+    shown = capsys.readouterr().out
+    assert "geometry" in shown
+    assert "All things: share named right after views; 3 things" in shown
+    text = (results / "tables.md").read_text()
+    assert text.count("| geometry | ") == 2 + 2 * 3  # two tables; three tests for each
+    for name in (
+        "measures.csv",
+        "tests.csv",
+        "things.csv",
+        "table.tex",
+        "accuracy.png",
+    ):
+        assert (results / name).stat().st_size > 100
+
+
+def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
+    knobs, results, settings, monkeypatch
+):
+    sensed = []
+    observe = SensedCamera.observe
+    monkeypatch.setattr(
+        SensedCamera,
+        "observe",
+        lambda self, pose: sensed.append(1) or observe(self, pose),
+    )
+    before = {file: file.read_bytes() for file in (results / "runs").iterdir()}
+    benchmark_things(knobs, results, settings, workers=0)
+    assert not sensed
+    assert before == {file: file.read_bytes() for file in (results / "runs").iterdir()}
+
+    FarAzimuth.seen.clear()
+    own = f"{__name__}:FarAzimuth"
+    tables = benchmark_things(
+        knobs, results, replace(settings, policies=(own,)), workers=0
+    )
+    assert len(sensed) <= 3  # the second view of each episode
+    assert list(tables.measures["policy"].unique()) == ["random", "geometry", own]
+    hypotheses = FarAzimuth.seen[0]
+    assert hypotheses.belief.sum() == pytest.approx(1)
+    assert hypotheses.poses.shape == (len(hypotheses.things), 4, 4)
+    away = EPISODE_SPHERE.arc.max(1)
+    travel = tables.measures.query(
+        "policy == @own and measure == 'travel, rad' and views == 2"
+    )
+    assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
+
+
+def scaled(scans, unit, folder):
+    """The same things saved in another unit."""
+    folder.mkdir()
+    for scan in scans.glob("*.ply"):
+        mesh = trimesh.load(scan, process=False)
+        mesh.apply_scale(1 / UNITS[unit])
+        mesh.export(folder / scan.name)
+    return folder
+
+
+def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
+    knobs, settings, tmp_path
+):
+    scans = scaled(knobs, "cm", tmp_path / "cm")
+    with pytest.raises(DatasetError, match=r"is not in m, .* give unit='cm'"):
+        benchmark_things(scans, tmp_path / "out", settings, workers=0)
+
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for scan in knobs.glob("*.ply"):
+        trimesh.load(scan).apply_translation((0, 0.1, 0)).export(moved / scan.name)
+    with pytest.raises(DatasetError, match="was taught from: it lies elsewhere"):
+        benchmark_things(moved, tmp_path / "out2", settings, workers=0)
+
+
+def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
+    knobs_memory, knobs, tmp_path
+):
+    file = tmp_path / "episode"
+    fresh = episode_of(knobs_memory, knobs, 0, file)
+    views = [fresh.start, (fresh.start + 3) % len(EPISODE_SPHERE)]
+    found, _ = fresh.verified(views)
+    direct = fresh.things([fresh.observation(view) for view in sorted(views)])
+    np.testing.assert_allclose(found.belief, direct.belief, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(found.poses, direct.poses, atol=1e-6)
+
+    fresh.save()
+    again = episode_of(knobs_memory, knobs, 0, file)
+    again._mesh = lambda: pytest.fail("it was sensed again")
+    assert again.start == fresh.start
+    for name, values in vars(again.verified(views)[0]).items():
+        np.testing.assert_array_equal(values, getattr(found, name))
+    kept, seen = again.observation(views[0]), fresh.observation(views[0])
+    np.testing.assert_array_equal(kept.scene.depth, seen.scene.depth)
+    assert kept.radius == seen.radius
+    # Within the errors of a sensor that is a few millimetres off, at half a metre.
+    assert again.pose_error(views) < 8
+
+
+def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
+    episode = episode_of(knobs_memory, knobs, 0, occlusion="none")
+    standing = episode.stage.standing
+    for low, high in VISIBLE_SHARES.values():
+        boxes = hiding_boxes(standing, (low, high), (0, 1))
+        camera = SensedCamera(
+            standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
+        )
+        shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
+        assert low - 0.08 < np.mean(shares) < high + 0.08
+
+
+# Policies
+
+
+def state_at(view, visited=()):
+    mask = np.zeros((1, len(EPISODE_SPHERE)), bool)
+    mask[0, [view, *visited]] = True
+    nothing = Evidence(np.zeros((1, 1)))
+    return EpisodeState(
+        np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1
+    )
+
+
+def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
+    taken = [8]
+    for _ in range(7):
+        state = state_at(taken[-1], taken)
+        taken.append(
+            int(
+                RingSteps(EPISODE_SPHERE).next_views(state, np.random.default_rng(0))[0]
+            )
+        )
+    assert sorted(taken) == list(range(8, 16))
+    assert taken[1] == 11  # three steps of 45 degrees ahead
+    after = RingSteps(EPISODE_SPHERE).next_views(
+        state_at(taken[-1], taken), np.random.default_rng(0)
+    )
+    assert int(after[0]) not in taken
+
+
+@pytest.mark.long  # a whole benchmark
+def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
+    knobs, knobs_memory
+):
+    for thing in range(3):
+        episode = episode_of(knobs_memory, knobs, thing)
+        others = [v for v in range(0, len(EPISODE_SPHERE), 5) if v != episode.start]
+        best = max(episode.named_right([episode.start, view]) for view in others)
+        view = int(
+            TruthCeiling(episode).next_views(
+                episode.state([episode.start], ()), np.random.default_rng(0)
+            )[0]
+        )
+        assert episode.named_right([episode.start, view]) >= best
+
+
+# A recogniser of a user's own
+
+
+class AlwaysCan:
+    """Believes in the can whatever it sees; its classes are not in alphabetical order."""
+
+    classes = ("plain", "can", "knob")
+
+    def belief(self, observations):
+        return np.array([0.01, 0.98, 0.01])
+
+
+def test_a_recogniser_of_ones_own_is_shown_the_same_episodes_without_a_memory(
+    knobs, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    line = ["benchmark", "things", knobs, out, "--recogniser", f"{__name__}:AlwaysCan"]
+    line += ["--views", 1, 2, "--policies", "random", "fixed", "--workers", 0]
+    main([str(word) for word in line])
+    assert "fixed" in capsys.readouterr().out
+    assert not (out / "memory").exists()
+    runs = [
+        read_record(file, EpisodeRuns, "runs", ResultsError)
+        for file in sorted((out / "runs").iterdir())
+    ]
+    assert [each.thing for each in runs] == ["can", "knob", "plain"]
+    right = {each.thing: each.runs["fixed"][0].right for each in runs}
+    assert right == {"can": [True] * 2, "knob": [False] * 2, "plain": [False] * 2}
+
+    settings = replace(SETTINGS, recogniser=f"{__name__}:AlwaysCan")
+    with pytest.raises(UsageError, match="geometry goes by the hypotheses of a memory"):
+        benchmark_things(knobs, tmp_path / "new", settings, workers=0)
+
+
+# The best blind rule
+
+
+def test_policies_are_compared_with_the_best_blind_rule_of_other_episodes(
+    knobs, settings, tmp_path
+):
+    asked = replace(settings, policies=("geometry",), reference="best-blind")
+    out = tmp_path / "out"
+    tables = benchmark_things(knobs, out, asked, workers=0)
+    assert tables.reference in BLIND_RULES
+    assert set(tables.tests["policy"]) == {"geometry"}
+    assert (
+        f"The best blind rule is {tables.reference}: "
+        in (out / "tables.md").read_text()
+    )
+    record = json.loads((out / "benchmark.json").read_text())
+    assert record["reference"] == "best-blind"
+    assert record["compared_with"] == tables.reference
+    start = [
+        {
+            read_record(f, EpisodeRuns, "runs", ResultsError)
+            .runs[tables.reference][0]
+            .views[0]
+            for f in (folder / "runs").iterdir()
+        }
+        for folder in (out, out / "choosing")
+    ]
+    assert start[0] != start[1]  # chosen where it is not compared
+    with pytest.raises(UsageError, match="--choose-seed another value than --seed"):
+        benchmark_things(knobs, out, replace(asked, choose_seed=0), workers=0)
+
+
+# Statistics
+
+
+def runs_of(thing, right, confidence, views, p_value=None, policy="random"):
+    pose = [1.0 if each else None for each in right]
+    times = [0.01] * (len(views) - 1)
+    explained = p_value or [None] * len(views)
+    spent = [0.1] * len(views)
+    made = ThingRun(views, right, confidence, explained, times, spent, pose)
+    return EpisodeRuns(thing, 0, {policy: [made]})
+
+
+def both(thing, random, other):
+    """An episode with two policies, each (right, confidence, views)."""
+    runs = {}
+    for policy, given in (("random", random), ("spread", other)):
+        runs |= runs_of(thing, *given, policy=policy).runs
+    return EpisodeRuns(thing, 0, runs)
+
+
+def test_measures_are_those_of_a_hand_count():
+    wrong = ([False, False, True], [0.5, 0.98, 0.6], [0, 4, 1])
+    good = ([False, True, True], [0.5, 0.9, 0.99], [0, 4, 2])
+    episodes = [
+        both("a_x", wrong, good),
+        both("a_y", good, good),
+        both("b_x", wrong, good),
+    ]
+    alike = Alikeness(
+        ("a_x", "a_y", "b_x"), ("a_y", "a_x", "a_x"), np.array([0.1, 0.2, 0.3])
+    )
+    how = ThingSettings(views=(1, 2, 3), threshold=0.97, families=True, samples=2000)
+    tables = summarise_things(episodes, alike, how)
+    rows = tables.measures.set_index(["set", "policy", "measure", "views"])["value"]
+    random = rows["all", "random"]
+    assert random["accuracy", 2] == pytest.approx(1 / 3)
+    assert random["accuracy", 3] == 1
+    assert random["views until confident", 0] == pytest.approx((2 + 3 + 2) / 3)
+    assert random["confident", 0] == 1
+    assert random["wrong, of the confident", 0] == pytest.approx(2 / 3)
+    assert random["pose error, 95 %", 3] == 1
+    steps = np.pi / 4 * np.cos(EPISODE_SPHERE.elevation[0])
+    assert random["travel, rad", 2] == pytest.approx(
+        np.pi * np.cos(EPISODE_SPHERE.elevation[0]), abs=0.2
+    )
+    assert steps > 0
+    difference = tables.tests.query(
+        "set == 'all' and measure == 'accuracy' and views == 2"
+    )
+    assert difference["difference"].iloc[0] == pytest.approx(2 / 3)
+    # Two families: in a quarter of the samples both draws are the family b, and so on.
+    assert difference["low"].iloc[0] == pytest.approx(0.5)
+    assert difference["high"].iloc[0] == pytest.approx(1)
+    assert (rows["confusable half", "random"]["accuracy", 2]) == 0
+
+
+def paired(names, pose):
+    """An episode of each name; the policies are equally right, and find it with these errors."""
+    episodes = []
+    for name, (by_random, by_spread) in zip(names, pose, strict=True):
+        runs = {}
+        for policy, error in (("random", by_random), ("spread", by_spread)):
+            (run,) = runs_of(name, [True, True], [0.5, 0.6], [0, 1]).runs["random"]
+            runs[policy] = [replace_record(run, pose_error=[1.0, error])]
+        episodes.append(EpisodeRuns(name, 0, runs))
+    return episodes
+
+
+def test_p_values_of_families_are_those_of_a_brute_force():
+    rng = np.random.default_rng(4)
+    names = tuple(f"{letter}_{k}" for letter in "abcdefgh" for k in range(2))
+    alike = Alikeness(names, names, np.arange(16.0))
+    how = ThingSettings(views=(1, 2), threshold=0.97, families=True, samples=100)
+    right = rng.random((16, 2)) < (0.3, 0.9)
+    episodes = [
+        both(
+            name,
+            ([False, bool(a)], [0.5, 0.6], [0, 1]),
+            ([False, bool(b)], [0.5, 0.6], [0, 1]),
+        )
+        for name, (a, b) in zip(names, right, strict=True)
+    ]
+    tests = summarise_things(episodes, alike, how).tests
+    row = tests.query("set == 'all' and measure == 'accuracy'").iloc[0]
+    lead = (right[:, 1].astype(float) - right[:, 0]).reshape(8, 2).sum(1)
+    sums = [abs(np.dot(signs, lead)) for signs in product((1, -1), repeat=8)]
+    assert row["p"] == pytest.approx(np.mean(np.array(sums) >= abs(lead.sum())))
+    assert row["families"] == 8
+
+    pose = rng.gamma(2, 2, (16, 2)) * (2, 1)
+    tests = summarise_things(paired(names, pose), alike, how).tests
+    row = tests.query("set == 'all' and measure == 'pose error, 95 %'").iloc[0]
+
+    def far(errors):
+        ordered = np.sort(errors)
+        return ordered[int(np.ceil(0.95 * len(ordered) - 1e-9)) - 1]
+
+    assert row["difference"] == pytest.approx(far(pose[:, 1]) - far(pose[:, 0]))
+    count = 0
+    for signs in product((0, 1), repeat=8):
+        swapped = np.where(np.repeat(signs, 2)[:, None] == 1, pose[:, ::-1], pose)
+        apart = abs(far(swapped[:, 1]) - far(swapped[:, 0]))
+        count += apart >= abs(row["difference"]) - 1e-9
+    assert row["p"] == pytest.approx(count / 2**8)

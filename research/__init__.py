@@ -1,3 +1,0 @@
-"""Rival systems, agents, measures and studies that plug into nextview from outside, as a user's
-own code does.
-"""
