@@ -8,25 +8,26 @@ things that have moved.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.scene.world import (
+from nextview.segmentation.view import View
+from nextview.things.library import Hypotheses
+from nextview.things.register import register
+from nextview.things.score import score, total
+from nextview.things.world import (
     CLEAR_SHARE,
+    MOVED,
+    MOVED_SHARE,
     NEW_OBJECT,
     Thing,
     World,
+    corrected,
     world_points,
 )
-from nextview.segmentation.view import View
-from nextview.things.library import Hypotheses
-from nextview.things.register import CAMERA_SHIFT, CAMERA_TURN, camera_error, register
-from nextview.things.score import Score, score, total
 from nextview.types import Float, Index
 
-MOVED = 60.0  # nats that another pose has to explain better, for a thing to have moved
-MOVED_SHARE = 0.3  # the same of what the thing explains: errors of scan and pose are alike
 ALONE = (0.5, 0.3, 0.2, 0.12, 0.06, 0.03)  # reaches of the registration in one view, radii
 MOST_GONE = 0.7  # share of a stranger that is seen through when it is gone
 BEHIND = 0.015  # metres behind a stranger, from which on it is seen through
@@ -65,47 +66,10 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
     named = [one for one in world.things if one.row >= 0]
     if named:
         rows = np.array([one.row for one in named])
-        known = [one for one in named if one.share > CLEAR_SHARE]
-        if known and not camera_stands:
-            view = _corrected(world, view, np.array([one.row for one in known]))
+        if not camera_stands:
+            view = corrected(world, view)
         return _compared(world, view, named, rows, camera_stands)
     return _without_gone_strangers(Changes(world, view))
-
-
-def _corrected(world: World, view: View, rows: Index) -> View:
-    """Return the view with the pose of its camera that explains the known things best.
-
-    One error of the camera is compared with motions of things: the error that all things together
-    tell, and that which each of them tells.
-    """
-    some = world.hypotheses[rows]
-    groups = [rows, *([row] for row in rows)] if len(rows) > 1 else [rows]
-    tried = [view]
-    for group in groups:
-        tried.append(camera_error(world.library, view, world.hypotheses[np.array(group)]))
-    usual = [_usual(world.scores[row]) for row in rows]
-    values = []
-    for one in tried:
-        value = -_cost(view, one)
-        for found, most in zip(score(world.library, one, some), usual, strict=True):
-            if found is not None:
-                value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
-        values.append(value)
-    return tried[int(np.argmax(values))]
-
-
-def _usual(row: Sequence[Score | None]) -> float:
-    """Return what a hypothesis explains in a pixel that shows it, nats."""
-    seen = sum(one.seen for one in row if one is not None)
-    return total(row) / max(1.0, seen)
-
-
-def _cost(given: View, believed: View) -> float:
-    """Return the cost of an error of a camera, nats."""
-    turn = believed.camera[:3, :3] @ given.camera[:3, :3].T
-    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-    shift = np.linalg.norm(believed.camera[:3, 3] - given.camera[:3, 3])
-    return float((angle / CAMERA_TURN) ** 2 + (shift / CAMERA_SHIFT) ** 2) / 2
 
 
 def _compared(

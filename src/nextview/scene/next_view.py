@@ -18,7 +18,6 @@ from scipy import ndimage
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
 from nextview.scene.objects import SceneObject
-from nextview.scene.world import World, points_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
@@ -35,6 +34,7 @@ from nextview.things.expected_images import (
 from nextview.things.expected_views import expected_views
 from nextview.things.leading import MOST_LEADING, Hypotheses
 from nextview.things.unseen_space import MeasuredDepth
+from nextview.things.world import World, points_of
 from nextview.types import Float, Index, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table

@@ -2,46 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, softmax
 
 from nextview.geometry.axes import upright_axes
 from nextview.recognition.poses import (
     PoseCandidate,
     PoseUncertainty,
-    distinct,
     place_in_words,
     uncertainty_of,
 )
-from nextview.scene.world import STRANGER_GAIN, Thing, World, points_of
 from nextview.sensing.view_warning import ViewWarning
-from nextview.things.register import (
-    ALIKE_POINTS,
-    CAMERA_SHIFT,
-    MATCHING_ERROR,
-    normal_equations,
-)
-from nextview.things.score import PIXEL_GAIN
-from nextview.types import Float, Index, Mask
+from nextview.things.naming import CONFIDENT, named, pose_candidates, why_in_doubt
+from nextview.things.register import CAMERA_SHIFT
+from nextview.things.world import Thing, World, points_of
+from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
     from nextview.scene.state import SceneState
 
 UNKNOWN_NAME = "unknown"
-PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats count once
-# log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
-# explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
-LARGEST_LEAD = 0.1
-CONFIDENT = 0.97  # belief from which on a name is confident
 SETTLED_VIEWS = 2  # views after which an unknown object is settled
 TOUCHING = 0.015  # metres of depth between two objects that touch
-LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,63 +107,6 @@ class SceneObject:
 SEEN_POINTS = 400
 
 
-@dataclass(frozen=True, eq=False)
-class Named:
-    """What is believed of a named thing of a world.
-
-    Attributes:
-        rows: hypotheses of its place, the likeliest first, (N,) int64.
-        probabilities: of each, (N,) float64; the rest of 1 is that of a stranger.
-        right: probability that the likeliest name is right.
-        lead: over the likeliest other name, nats.
-        share: of what the likeliest hypothesis could explain.
-    """
-
-    rows: Index
-    probabilities: Float
-    right: float
-    lead: float
-    share: float
-
-    def beliefs(self, world: World) -> dict[str, float]:
-        """Return the belief in each name, the likeliest first."""
-        found: dict[str, float] = {}
-        for row, probability in zip(self.rows, self.probabilities, strict=True):
-            name = world.library.names[int(world.hypotheses.things[row])]
-            found[name] = found.get(name, 0.0) + float(probability)
-        return found
-
-
-def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | None:
-    """Return what is believed of a thing with a hypothesis; None if every name is ruled out.
-
-    Args:
-        world: the world.
-        thing: one of its things.
-        ruled_out: names that it cannot have.
-    """
-    rows = world.rivals(thing.row)
-    totals = world.totals[rows]
-    of_row = totals[rows == thing.row]
-    names = np.array(world.library.names)[world.hypotheses.things[rows]]
-    kept = (totals > 0) & (totals <= of_row) & ~np.isin(names, list(ruled_out))
-    rows, totals = rows[kept], totals[kept]
-    if not len(rows):
-        return None
-    order = np.argsort(-totals, kind="stable")
-    rows, totals = rows[order], totals[order]
-
-    seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
-    every = np.append(totals, STRANGER_GAIN * seen) / PIXELS_ALIKE
-    probabilities = softmax(every)[:-1]
-    others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
-    lead = float(totals[0] - totals[others].max(initial=0.0))
-    share = float(totals[0]) / max(1.0, PIXEL_GAIN * seen)
-    odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(totals[0], 1.0))
-    odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
-    return Named(rows, probabilities, float(expit(odds)), lead, share)
-
-
 def objects_of(state: SceneState) -> tuple[SceneObject, ...]:
     """Return the objects of a scene, in the order in which they were found.
 
@@ -242,63 +171,6 @@ def _object(
         beliefs=found.beliefs(world),
         candidates=candidates,
         doubt="" if sure else why_in_doubt(world, thing, found),
-    )
-
-
-def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
-    """Return the main reason why a name is not confident, in words."""
-    things = world.hypotheses.things[found.rows]
-    terms = {
-        f"it explains its pixels by {100 * found.share:.0f} %, as well as it could be": (
-            OF_SHARE * (found.share - 0.7)
-        ),
-        "few pixels show it": OF_GAIN * (np.log(max(thing.gain, 1.0)) - np.log(1000)),
-    }
-    rival = things[things != things[0]]
-    if len(rival):
-        name = world.library.names[int(rival[0])]
-        terms[f"{name} explains the views nearly as well"] = OF_LEAD * (
-            min(found.lead / max(thing.gain, 1.0), LARGEST_LEAD) - LARGEST_LEAD
-        )
-    return min(terms, key=lambda one: terms[one])
-
-
-def pose_candidates(world: World, found: Named) -> tuple[PoseCandidate, ...]:
-    """Return the distinct poses of the hypotheses of a place, the likeliest first."""
-    rows = found.rows
-    some = world.hypotheses[rows]
-    left = np.zeros((len(rows), 6, 6))
-    for view in world.views:
-        left += normal_equations(world.library, view, some, 0.03, 96)[0]
-    radius = world.library.radii[some.things]
-    left *= 1 / MATCHING_ERROR**2 / ALIKE_POINTS
-    # a pose is known to its thing's own size, at least
-    left[:, range(3), range(3)] += 1.0
-    left[:, range(3, 6), range(3, 6)] += 1 / radius[:, None] ** 2
-    variances = np.diagonal(np.linalg.inv(left), axis1=1, axis2=2)
-    degrees = np.degrees(np.sqrt(variances[:, :3].sum(1)))
-    millimetres = 1000 * np.sqrt(variances[:, 3:].sum(1))
-    shares = found.probabilities / found.probabilities.sum()
-    every = []
-    for k, row in enumerate(rows):
-        thing = int(some.things[k])
-        surface = world.library.caster.surfaces[thing]
-        every.append(
-            PoseCandidate(
-                thing=surface.name,
-                label=thing,
-                pose=world.hypotheses.pose(int(row), world.library),
-                probability=float(shares[k]),
-                degrees=float(degrees[k]),
-                millimetres=float(millimetres[k]),
-                centre=surface.centroid,
-                vertices=surface.vertices,
-                faces=surface.faces,
-                symmetry=world.library.symmetries.get(surface.name),
-            )
-        )
-    return tuple(
-        every[k] for k in distinct(every) if k == 0 or shares[k] > LEAST_LISTED
     )
 
 

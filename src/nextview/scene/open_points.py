@@ -12,8 +12,8 @@ from nextview.scene.next_view import (
     TableGround,
     outline_of,
 )
-from nextview.scene.unexplained import UnexplainedPatch
 from nextview.scene.objects import SceneObject
+from nextview.scene.unexplained import UnexplainedPatch
 from nextview.types import Float
 
 

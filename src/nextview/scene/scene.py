@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, overload
@@ -36,7 +35,6 @@ from nextview.scene.view_policies import (
     SceneChoice,
     ScenePolicy,
 )
-from nextview.scene.world import Thing, World
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.segmentation.view import View
 from nextview.sensing.frame import Frame
@@ -63,6 +61,7 @@ from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.things.library import Library
 from nextview.things.recogniser import VerifiedRecogniser
+from nextview.things.world import Thing, World
 from nextview.types import Float
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from nextview.geometry.axes import upright_axes
 from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
-from nextview.scene.world import Thing, World
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
+from nextview.things.world import Thing, World
 
 EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 UNSEEN_GROUND = ViewWarning(

@@ -14,8 +14,7 @@ import numpy as np
 from nextview.checks import number
 from nextview.errors import SessionError, UsageError
 from nextview.scene.body import Body, Tracked
-from nextview.scene.body_pixels import BodyPixels, registered
-from nextview.scene.body_pixels import SURPRISE
+from nextview.scene.body_pixels import SURPRISE, BodyPixels, registered
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
 from nextview.sensing.facets import Noise

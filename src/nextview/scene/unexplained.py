@@ -13,10 +13,10 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.axes import upright_axes
-from nextview.scene.world import World
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
+from nextview.things.world import World
 from nextview.types import Float, Mask
 
 NEAR_DEVIATIONS = (

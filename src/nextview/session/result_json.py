@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from nextview.session.result import Recognition
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty
+from nextview.session.result import Recognition
 from nextview.session.view import View
 from nextview.types import Float
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
-from nextview.recognition.model_card import Symmetry
 from nextview.geometry.pinhole import PinholeCamera
+from nextview.recognition.model_card import Symmetry
 from nextview.things.depth_view import NOT_MEASURED, THING, DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.registration import (

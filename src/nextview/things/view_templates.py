@@ -10,7 +10,6 @@ also shifted towards the occluder. The score of depths is their mean squared dif
 intersection. All scores are a few matrix products.
 """
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial

@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from nextview.segmentation.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.propose import propose
-from nextview.things.register import register
+from nextview.things.register import (
+    CAMERA_SHIFT,
+    CAMERA_TURN,
+    camera_error,
+    register,
+)
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
 
@@ -30,6 +35,8 @@ RIVALS_OF_ONE = 2
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
 LEAST_OWN = 0.5  # share of a stranger that nothing else explains, at least
+MOVED = 60.0  # nats that another pose has to explain better, for a thing to have moved
+MOVED_SHARE = 0.3  # the same of what the thing explains: errors of scan and pose are alike
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 
@@ -312,6 +319,50 @@ class World:
             things=tuple(things),
             keys=self.keys[rows],
         )
+
+
+def corrected(world: World, view: View) -> View:
+    """Return a view with the pose of its camera that explains the known things best.
+
+    One error of the camera is compared with motions of things: the error that all things together
+    tell, and that which each of them tells.
+
+    Args:
+        world: before the view.
+        view: the view.
+    """
+    known = [one.row for one in world.things if one.row >= 0 and one.share > CLEAR_SHARE]
+    if not known:
+        return view
+    rows = np.array(known)
+    some = world.hypotheses[rows]
+    groups = [rows, *([row] for row in rows)] if len(rows) > 1 else [rows]
+    tried = [view]
+    for group in groups:
+        tried.append(camera_error(world.library, view, world.hypotheses[np.array(group)]))
+    usual = [_usual(world.scores[row]) for row in rows]
+    values = []
+    for one in tried:
+        value = -_cost(view, one)
+        for found, most in zip(score(world.library, one, some), usual, strict=True):
+            if found is not None:
+                value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
+        values.append(value)
+    return tried[int(np.argmax(values))]
+
+
+def _usual(row: Sequence[Score | None]) -> float:
+    """Return what a hypothesis explains in a pixel that shows it, nats."""
+    seen = sum(one.seen for one in row if one is not None)
+    return total(row) / max(1.0, seen)
+
+
+def _cost(given: View, believed: View) -> float:
+    """Return the cost of an error of a camera, nats."""
+    turn = believed.camera[:3, :3] @ given.camera[:3, :3].T
+    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+    shift = np.linalg.norm(believed.camera[:3, 3] - given.camera[:3, 3])
+    return float((angle / CAMERA_TURN) ** 2 + (shift / CAMERA_SHIFT) ** 2) / 2
 
 
 SETTLED_VIEWS = 3  # views after which poses are not refined

@@ -1,0 +1,38 @@
+"""The view of one object that is chosen by its pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nextview.geometry.observation import Observation
+from nextview.segmentation.instances import Instances
+from nextview.segmentation.view import View
+from nextview.sensing.frame import Frame
+
+NOT_LEVEL = np.inf  # height of pixels of which no plane is known
+
+
+def view_of(observation: Observation) -> View:
+    """Return the view of an object that an observation shows, in metres.
+
+    Args:
+        observation: a view of the object, with a scale; its pixels are the only segment.
+    """
+    radius = float(observation.radius or 1.0)
+    scene = observation.scene
+    if scene is None:
+        depth, target = observation.depth, observation.depth > 0
+        pose, intrinsics, support = observation.pose, observation.intrinsics, None
+    else:
+        depth, target = scene.depth, scene.target
+        pose, intrinsics, support = scene.pose, scene.intrinsics, scene.support
+    pose = pose.copy()
+    pose[:3, 3] *= radius
+    metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32) * np.float32(radius)
+    frame = Frame(metres, intrinsics, pose, pixel_centre=0.5)
+    height = np.full(depth.shape, NOT_LEVEL, np.float32)
+    if support is not None:
+        height = frame.along(support[:3], float(support[3]) * radius)
+    none = np.zeros(depth.shape, bool)
+    instances = Instances((target & (frame.depth > 0),), none, none)
+    return View.of(frame, instances, frame.depth > 0, height, np.inf)
