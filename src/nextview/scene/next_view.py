@@ -25,16 +25,8 @@ from nextview.session.limits import Limits
 from nextview.session.reach import Reach
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
-from nextview.things.expected_images import (
-    OBSTACLE_REACH,
-    SUPPORT_NEAR,
-    ExpectedSensor,
-    SeenSurroundings,
-)
-from nextview.things.expected_views import expected_views
-from nextview.things.leading import MOST_LEADING, Hypotheses
-from nextview.things.unseen_space import MeasuredDepth
-from nextview.things.world import World, points_of
+from nextview.things.expected_views import Outlook
+from nextview.things.world import World
 from nextview.types import Float, Index, Mask
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table
@@ -48,7 +40,6 @@ UNKNOWN_WORTH = (
     1.0  # nats, information of a view of an unknown object from the far side
 )
 SURE_WORTH = 0.1  # the same for a settled object, which may be two or hide another one
-OBSTACLE_EVERY = 5  # pixels of the grid from one measured obstacle to the next
 SOME_POINTS = 60  # sampled points of an object for the occlusion test
 
 
@@ -372,55 +363,9 @@ def _information(
     to_object = np.eye(4)
     to_object[:3, :3] = axes
     to_object[:3, 3] = -axes @ one.place
-    caster = world.library.caster
-    number = {name: row for row, name in enumerate(world.library.names)}
-    kept = one.candidates[:MOST_LEADING]
-    belief = np.array(
-        [each.probability * one.beliefs.get(each.thing, 0.0) for each in kept]
-    )
-    leading = Hypotheses(
-        np.array([number[each.thing] for each in kept]),
-        np.stack([to_object @ each.pose for each in kept]),
-        belief / max(belief.sum(), 1e-12),
-    )
-    cameras = to_object @ views.poses
-    grid = world.views[-1].grid()
-    depth = grid.depth[grid.depth > 0]
-    sensor = ExpectedSensor(
-        float(1 / tops[-1].frame.intrinsics[0, 0]),
-        float(np.median(tops[-1].noise.at(depth))),
-    )
-    around = _surroundings(world, one, tops, to_object)
-    return expected_views(
-        caster, leading, cameras, sensor, around, len(one.pixels)
-    ).information("thing")
-
-
-def _surroundings(
-    world: World, one: SceneObject, tops: Sequence[TableTop], to_object: Float
-) -> SeenSurroundings:
-    """Return what was measured around an object, in a frame with its origin in the object."""
-    points = [np.zeros((0, 3))]
-    for view, owner in zip(world.views, world.owners, strict=True):
-        others = np.flatnonzero((owner != one.number) & (view.grid().depth.ravel() > 0))
-        points.append(points_of(view, others[::OBSTACLE_EVERY]))
-    beside = np.concatenate(points) @ to_object[:3, :3].T + to_object[:3, 3]
-    own = one.seen_points @ to_object[:3, :3].T + to_object[:3, 3]
-    floor = float(own[:, 2].min())
-    away = np.linalg.norm(beside[:, :2], axis=1)
-    on_support = np.abs(beside[:, 2] - floor) < SUPPORT_NEAR
-    reach = float(np.quantile(away[on_support], 0.95)) if on_support.any() else 0.0
-    near = np.linalg.norm(beside, axis=1) < OBSTACLE_REACH * float(
-        np.linalg.norm(own, axis=1).max()
-    )
-    seen = [
-        MeasuredDepth(
-            view.depth, to_object @ view.camera, view.frame.intrinsics.astype(np.float64)
-        )
-        for view in world.views
-    ]
-    obstacles = beside[near & (beside[:, 2] > floor + SUPPORT_NEAR)]
-    return SeenSurroundings(obstacles, floor, reach, tuple(seen))
+    thing = world.thing(one.number)
+    outlook = Outlook.of(world, thing, one.candidates, one.beliefs, to_object)
+    return outlook.expect(to_object @ views.poses).information("thing")
 
 
 def _from_another_side(

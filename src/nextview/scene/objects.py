@@ -17,9 +17,9 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.sensing.view_warning import ViewWarning
+from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import CONFIDENT, named, pose_candidates, why_in_doubt
-from nextview.things.register import CAMERA_SHIFT
-from nextview.things.world import Thing, World, points_of
+from nextview.things.world import Thing, World
 from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class SceneObject:
     def pose_uncertainty(self) -> PoseUncertainty | None:
         """Uncertainty of ``pose``; None without a pose."""
         same = [one for one in self.candidates if one.thing == self.name]
-        return uncertainty_of(same, 1000 * CAMERA_SHIFT) if same else None
+        return uncertainty_of(same, 1000 * CAMERA_ERROR[1]) if same else None
 
     @property
     def symmetry(self) -> Any:
@@ -192,7 +192,7 @@ def seen_points(world: World, number: int) -> Float:
     found = [np.zeros((0, 3))]
     for view, owner in zip(world.views, world.owners, strict=True):
         cells = np.flatnonzero(owner == number)
-        found.append(points_of(view, cells[:: max(1, len(cells) // SEEN_POINTS)]))
+        found.append(view.points(cells[:: max(1, len(cells) // SEEN_POINTS)]))
     return np.concatenate(found)
 
 

@@ -653,9 +653,7 @@ def _library_of(system: System) -> Library:
             f"{recogniser.name}: a scene needs things of known geometry, and these models have"
             " none; a session recognises one object by its class"
         )
-    things = recogniser.things
-    symmetries = dict(zip(things.names, things.symmetries, strict=True))
-    return Library(things.verifier.caster.surfaces, symmetries)
+    return recogniser.library
 
 
 def _carried(instances: Instances, top: TableTop) -> Instances:

@@ -188,6 +188,14 @@ class View:
             stride / float(self.frame.intrinsics[0, 0]),
         )
 
+    def points(self, cells: Index) -> Float:
+        """Return the measured points of pixels of the grid, (N,), in the world, (N, 3), metres."""
+        grid = self.grid()
+        line, column = np.divmod(cells, grid.depth.shape[1])
+        z = grid.depth[line, column].astype(np.float64)
+        own = np.stack([grid.x[column] * z, grid.y[line] * z, z], 1)
+        return own @ self.camera[:3, :3].T + self.camera[:3, 3]
+
     def hiding(self, mask: Mask, margin: float) -> Mask:
         """Return what is in front of a segment beside it, and the shadow of that, (H, W) bool.
 

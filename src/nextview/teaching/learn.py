@@ -44,10 +44,19 @@ from nextview.teaching.memory_card import (
     Pair,
     card_of,
     fitted,
-    with_verification,
+    with_scores,
 )
 from nextview.teaching.memory_fit import (
     VIEWS_FITTED,
+)
+from nextview.teaching.shown_views import (
+    VIEWS_SHOWN,
+    NeverConfident,
+    Shown,
+    ShownThings,
+    show,
+    summary,
+    to_be_shown,
 )
 from nextview.teaching.sizes import check_sizes
 from nextview.teaching.symmetries import named_symmetries
@@ -65,26 +74,12 @@ from nextview.teaching.thing_views import (
     teach,
 )
 from nextview.teaching.unfinished_things import finished, part_of, stamp_of
-from nextview.teaching.verification_fit import (
-    GROWTH,
-    VIEWS_VERIFIED,
-    NeverConfident,
-    Shown,
-    VerifiedFit,
-    class_of_things,
-    fit_verification,
-    show,
-    to_be_shown,
-    with_new_things,
-)
 from nextview.teaching.view_features import Arrays, features_of, without_features
 from nextview.things.memory import (
     Memory,
-    TaughtRecogniser,
     check_features,
     open_memory,
 )
-from nextview.things.taught import TaughtThings
 
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
@@ -594,15 +589,12 @@ def _write(
         () if old is None else old.training.commands,
         work.how.sensor,
     )
-    verified = _verified(card, memory, old, work)
-    if verified is not None:
-        card = with_verification(card, memory, verified)
-        if verified.accuracy:
-            first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
-            confused = tuple(
-                (first[a], first[b], share) for a, b, share in verified.confused
-            )
-            fit = replace(fit, accuracy=verified.accuracy, confused=confused)
+    tested = _tested(card, memory, work)
+    if tested is not None and tested.accuracy:
+        card = with_scores(card, tested)
+        first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
+        confused = tuple((first[a], first[b], share) for a, b, share in tested.confused)
+        fit = replace(fit, accuracy=tested.accuracy, confused=confused)
 
     with new_folder(out, overwrite=True, last=CARD) as part:
         weights = _save(part, card, memory)
@@ -624,25 +616,24 @@ def _write(
         len(classes),
         fit.accuracy,
         confused_names,
-        _notes(taught, _unseen(taught, verified)),
+        _notes(taught, _unseen(taught, tested)),
         tuple(left_out),
     )
-    if verified is None:
+    if tested is None:
         return learned
     known = [source.name for source, arrays in taught if VERTICES in arrays]
     return replace(
         learned,
-        by_outline=verified.by_outline,
-        judged=verified.things,
+        judged=tested.things,
         never_confident=tuple(
-            (known[one.thing], _why_never(one, classes)) for one in verified.never
+            (known[one.thing], _why_never(one, classes)) for one in tested.never
         ),
     )
 
 
 def _why_never(one: NeverConfident, classes: Sequence[str]) -> str:
     """Reason why a thing is never named with confidence, in words."""
-    views = max(VIEWS_VERIFIED)
+    views = max(VIEWS_SHOWN)
     tests = "its test" if one.tests == 1 else f"any of {one.tests} tests"
     after = f"not in {tests} of {views} views"
     if one.confused is not None:
@@ -659,17 +650,11 @@ def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
     return weights
 
 
-def _verified(
-    card: ModelCard,
-    memory: Memory,
-    old: ModelCard | None,
-    work: Work,
-) -> VerifiedFit | None:
-    """Recognise rendered views of things of known geometry, and fit to the results.
+def _tested(card: ModelCard, memory: Memory, work: Work) -> ShownThings | None:
+    """Recognise rendered views of things of known geometry.
 
-    All things are tested, or a random sample of very many. If things are added, only the new ones
-    are tested: the weights stay until there are GROWTH times as many things as in their fit. The
-    result is None without known geometry.
+    All things are tested, or a random sample of very many. The result is None without known
+    geometry.
     """
     if not memory.surfaces.counts.any():
         return None
@@ -678,53 +663,16 @@ def _verified(
     shutil.rmtree(folder, ignore_errors=True)  # left by an earlier run
     folder.mkdir()
     _save(folder, card, memory)
-    recogniser = TaughtRecogniser(folder / CARD, threads=1)
-    known = TaughtThings.of(recogniser)
-    assert known is not None
-
-    labels = class_of_things(recogniser, known)
-    before = None if old is None or old.memory is None else old.memory.verification
-    rng = np.random.default_rng(work.how.seed)
-    every = range(len(labels))
-
-    if (
-        old is None
-        or old.memory is None
-        or before is None
-        or len(labels) >= GROWTH * before.things
-    ):
-        shown, unseen = _shown(folder, every, len(labels), rng, work)
-        verified = fit_verification(shown, labels)
-    else:
-        names = [thing.name for thing in old.memory.things]
-        carried = np.array(
-            [names.index(name) if name in names else -1 for name in known.names]
-        )
-        new = np.flatnonzero(carried < 0).tolist()
-        shown, unseen = _shown(folder, new, len(labels), rng, work)
-        verified = with_new_things(before, shown, labels, carried)
-    return replace(verified, unseen=tuple(known.names[thing] for thing in unseen))
-
-
-def _shown(
-    folder: Path,
-    things: Sequence[int],
-    known: int,
-    rng: np.random.Generator,
-    work: Work,
-) -> tuple[list[Shown], list[int]]:
-    """Test things with the memory in parallel, in a fixed order.
-
-    Returns:
-        The results, and the things that were not visible.
-    """
-    items = to_be_shown(things, known, rng)
+    about = card.memory
+    assert about is not None
+    known = np.flatnonzero(memory.surfaces.counts[:, 0])
+    names = [about.things[int(number)].name for number in known]
+    items = to_be_shown(len(names), np.random.default_rng(work.how.seed))
     show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
     found = dict(_all_done(show_one, items, work, "testing simulated views"))
-
-    shown = [one for item in sorted(found) for one in found[item]]
+    shown: list[Shown] = [one for item in sorted(found) for one in found[item]]
     unseen = {thing for thing, _ in items} - {one.thing for one in shown}
-    return shown, sorted(unseen)
+    return summary(shown, [names[thing] for thing in sorted(unseen)])
 
 
 def _all_done(

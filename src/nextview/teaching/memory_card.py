@@ -23,6 +23,7 @@ from nextview.teaching.memory_fit import (
     fit_without_features,
     size_evidence,
 )
+from nextview.teaching.shown_views import ShownThings
 from nextview.teaching.thing_sources import ThingSource
 from nextview.teaching.thing_views import (
     CONTENT,
@@ -32,7 +33,6 @@ from nextview.teaching.thing_views import (
     UPRIGHT,
     VERTICES,
 )
-from nextview.teaching.verification_fit import VerifiedFit
 from nextview.teaching.view_features import Arrays
 from nextview.things.memory import AZIMUTHS, Memory
 from nextview.things.stored_surfaces import StoredSurfaces
@@ -162,38 +162,16 @@ def card_of(
     ).made_by(command())
 
 
-def with_verification(
-    card: ModelCard,
-    memory: Memory,
-    verified: VerifiedFit,
-) -> ModelCard:
-    """Add the fits to the surfaces to a card; residuals are 0 for unknown geometry.
+def with_scores(card: ModelCard, tested: ShownThings) -> ModelCard:
+    """Add the results of tests to a card.
 
     Args:
         card: card of the memory.
-        memory: the memory.
-        verified: fits to the surfaces.
-
-    Returns:
-        The extended card.
+        tested: results of its tests in simulated views.
     """
-    about = card.memory
-    assert about is not None
-    verification = verified.verification
-    if verification.usual:
-        usual = np.zeros(len(about.things))
-        usual[memory.surfaces.counts[:, 0] > 0] = verification.usual
-        verification = replace_record(verification, usual=tuple(usual.tolist()))
-
     scores = dict(card.scores)
-    if verified.accuracy:
-        scores["verified by geometry"] = by_views(verified.accuracy)
-        scores["the same by outline"] = by_views(verified.by_outline)
-    return replace_record(
-        card,
-        memory=replace_record(about, verification=verification),
-        scores=scores,
-    )
+    scores["verified by geometry"] = by_views(tested.accuracy)
+    return replace_record(card, scores=scores)
 
 
 def by_views(shares: Sequence[float]) -> dict[str, float]:

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
 
-from nextview.errors import ObservationError
-from nextview.geometry.observation import Observation
-from nextview.things.depth_view import THING, DepthView
-from nextview.things.leading import Hypotheses
+from nextview.segmentation.view import View
+from nextview.things.expected_model import Leading
 from nextview.things.surface import SurfaceCaster
 from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.types import Float, Float32, Mask
@@ -26,7 +25,7 @@ SUPPORT_NEAR = 0.01
 OWN_MARGIN = 0.005
 # distance within which an obstacle may occlude the thing, radii of the thing
 OBSTACLE_REACH = 4.0
-OBSTACLE_ROWS = 120  # rows of a depth image in the search for obstacles
+OBSTACLE_EVERY = 5  # pixels of the grid from one measured obstacle to the next
 # distance within which unobserved space may occlude the thing, radii of the thing
 UNSEEN_REACH = 4.0
 UNSEEN_EVERY = 2  # unobserved space is looked up at every second row and column
@@ -43,30 +42,6 @@ class ExpectedSensor:
 
     pitch: float
     noise: float
-
-    @classmethod
-    def of(cls, views: Sequence[DepthView]) -> "ExpectedSensor":
-        """Estimate the camera from views of the thing.
-
-        Args:
-            views: views of the thing, at least one.
-
-        Returns:
-            Mean pixel pitch and mean noise of the views.
-
-        Raises:
-            ObservationError: there is no view.
-        """
-        if not views:
-            raise ObservationError(
-                "the sensor cannot be estimated without a view that shows the thing"
-            )
-        noise = []
-        for view in views:
-            thing = view.kind == THING
-            noise.append(np.median(view.noise[thing] / view.depth[thing] ** 2))
-        pitch = np.mean([view.pitch for view in views])
-        return cls(float(pitch), float(np.mean(noise)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,62 +70,42 @@ class SeenSurroundings:
     @classmethod
     def of(
         cls,
-        observations: Sequence[Observation],
-        caster: SurfaceCaster,
-        hypotheses: Hypotheses,
+        views: Sequence[View],
+        owners: Sequence[Mask],
+        own: Float,
+        to_object: Float,
     ) -> "SeenSurroundings":
-        """Collect the measurements of some views around the thing.
+        """Collect what some views measured around a thing.
 
         Args:
-            observations: views of the thing with their scenes. Observations without a scene are
-                ignored.
-            caster: surfaces of the things.
-            hypotheses: leading hypotheses. The support surface is at the lowest point of the first
-                one.
+            views: of the thing.
+            owners: pixels of their grids that show the thing, (P,) bool each.
+            own: points on the thing, (N, 3), object frame, metres.
+            to_object: from the world to the object frame, (4, 4).
 
         Returns:
             Obstacles and the support surface.
         """
-        surface = caster.surfaces[hypotheses.things[0]]
-        pose = hypotheses.poses[0]
-        floor = float((surface.vertices @ pose[2, :3] + pose[2, 3]).min())
-        radius = surface.radius
-
-        seen = [_beside(observation) for observation in observations]
-        points = np.concatenate([np.zeros((0, 3)), *seen])
+        floor = float(own[:, 2].min())
+        radius = float(np.linalg.norm(own - own.mean(0), axis=1).max())
+        found = [np.zeros((0, 3))]
+        for view, mine in zip(views, owners, strict=True):
+            others = np.flatnonzero(~mine & (view.grid().depth.ravel() > 0))
+            found.append(view.points(others[::OBSTACLE_EVERY]))
+        points = np.concatenate(found) @ to_object[:3, :3].T + to_object[:3, 3]
         height = points[:, 2] - floor
         away = np.linalg.norm(points[:, :2], axis=1)
         on_support = np.abs(height) < SUPPORT_NEAR
         reach = float(np.quantile(away[on_support], 0.95)) if on_support.any() else 0.0
-
-        in_file = (points - pose[:3, 3]) @ pose[:3, :3]
-        low = surface.vertices.min(0) - OWN_MARGIN
-        high = surface.vertices.max(0) + OWN_MARGIN
-        own = ((in_file > low) & (in_file < high)).all(1)
         near = np.linalg.norm(points, axis=1) < OBSTACLE_REACH * radius
-        obstacles = points[(height > SUPPORT_NEAR) & near & ~own]
-        images = (MeasuredDepth.of(observation) for observation in observations)
-        return cls(
-            obstacles,
-            floor,
-            reach,
-            tuple(image for image in images if image is not None),
+        near &= cKDTree(own).query(points)[0] > OWN_MARGIN
+        seen = (
+            MeasuredDepth(
+                view.depth, to_object @ view.camera, view.frame.intrinsics
+            )
+            for view in views
         )
-
-
-def _beside(observation: Observation) -> Float:
-    """Measured points of a view that do not belong to the thing, (N, 3), object frame, metres."""
-    scene = observation.scene
-    if scene is None or observation.radius is None:
-        return np.zeros((0, 3))
-    every = max(1, scene.depth.shape[0] // OBSTACLE_ROWS)
-    depth = scene.depth[::every, ::every].astype(np.float64) * observation.radius
-    target = scene.target[::every, ::every]
-    rows, columns = np.nonzero((depth > 0) & np.isfinite(depth) & ~target)
-    pixels = np.stack([columns * every + 0.5, rows * every + 0.5, np.ones(len(rows))])
-    rays = np.linalg.inv(scene.intrinsics) @ pixels
-    in_camera = (rays * depth[rows, columns]).T
-    return in_camera @ scene.pose[:3, :3].T + scene.pose[:3, 3] * observation.radius
+        return cls(points[near & (height > SUPPORT_NEAR)], floor, reach, tuple(seen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +156,7 @@ class HypothesisImages:
 
 def rendered_images(
     caster: SurfaceCaster,
-    hypotheses: Hypotheses,
+    hypotheses: Leading,
     cameras: Float,
     scene: SeenSurroundings,
     side: int,
@@ -273,7 +228,7 @@ def rendered_images(
 
 def _windows(
     caster: SurfaceCaster,
-    hypotheses: Hypotheses,
+    hypotheses: Leading,
     cameras: Float,
     side: int,
 ) -> tuple[Float, Float, Float]:

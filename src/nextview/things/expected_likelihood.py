@@ -19,8 +19,7 @@ from nextview.things.expected_images import (
     ExpectedSensor,
     HypothesisImages,
 )
-from nextview.things.registration import SCAN_ERROR, RegistrationPrior
-from nextview.things.verification import PixelModel
+from nextview.things.expected_model import SCAN_ERROR, ExpectedModel
 from nextview.types import Float, Float32, Index, Mask
 
 # stride of the pixels in the fit of one hypothesis to another
@@ -35,13 +34,13 @@ LARGEST_DEVIATION = 12.0
 TABLE_STEPS = 20  # table entries per standard deviation
 
 
-def _displaced(images: HypothesisImages, prior: RegistrationPrior) -> Float:
+def _displaced(images: HypothesisImages, model: ExpectedModel) -> Float:
     """Standard deviation of the displacement that each camera's pose error causes, (V,), metres.
 
-    It corresponds to ``RegistrationPrior.displaced`` for views that were taken.
+    It corresponds to the displacement for views that were taken.
     """
     away = np.linalg.norm(images.origins - images.centre, axis=1).astype(np.float64)
-    return np.hypot(prior.camera, prior.aim * away)
+    return np.hypot(model.camera, model.aim * away)
 
 
 def _pairs(count: int) -> tuple[Index, Index]:
@@ -53,14 +52,14 @@ def _pairs(count: int) -> tuple[Index, Index]:
 def depth_variance(
     images: HypothesisImages,
     sensor: ExpectedSensor,
-    pixels: PixelModel,
+    model: ExpectedModel,
 ) -> Float32:
     """Variance of the measured depth of each hypothesis.
 
     Args:
         images: the hypotheses as each view would show them.
         sensor: its expected noise.
-        pixels: model of the pixels.
+        model: of the pixels and the cameras.
 
     Returns:
         (V, H, P) float32, square metres.
@@ -68,14 +67,14 @@ def depth_variance(
     depth = np.where(np.isfinite(images.depth), images.depth, 1)
     steepness = np.sqrt(1 - images.cosine**2) / images.cosine
     noise = sensor.noise * depth**2
-    sideways = pixels.steep * sensor.pitch * depth * steepness
+    sideways = model.steep * sensor.pitch * depth * steepness
     return (noise**2 + SCAN_ERROR**2 + sideways**2).astype(np.float32)
 
 
 def gaps_after_alignment(
     images: HypothesisImages,
     sensor: ExpectedSensor,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
 ) -> Float32:
     """Depth differences of all pairs of hypotheses that remain after registration.
 
@@ -86,7 +85,7 @@ def gaps_after_alignment(
     Args:
         images: renderings of the hypotheses in each view.
         sensor: expected noise of the camera.
-        prior: prior of the registration.
+        model: of the pixels and the cameras.
 
     Returns:
         Differences, (V, pairs, P) float32, metres; 0 where at least one of the two is not visible.
@@ -125,13 +124,13 @@ def gaps_after_alignment(
     weights = both[..., some] / (FITTED_SURFACE_ERROR**2 + noise**2)
     weights = weights / (1 + (distance / FITTED_REACH) ** 2)
     used = np.maximum(both[..., some].sum(2, keepdims=True), 1)
-    weights = (weights * np.minimum(1, prior.pixels / used)).astype(np.float32)
+    weights = (weights * np.minimum(1, model.pixels / used)).astype(np.float32)
     thinned = np.stack([column[..., some] for column in columns], 2)
     weighted = thinned * weights[:, :, None]
 
     held = np.zeros((len(images.origins), 1, 6))
-    held[..., :3] = 1 / prior.tilt**2
-    held[..., 3:] = 1 / _displaced(images, prior)[:, None, None] ** 2
+    held[..., :3] = 1 / model.tilt**2
+    held[..., 3:] = 1 / _displaced(images, model)[:, None, None] ** 2
 
     left = (weighted @ thinned.swapaxes(2, 3)).astype(np.float64)
     left += held[..., None] * np.eye(6)
@@ -146,8 +145,7 @@ def divergences(
     images: HypothesisImages,
     gaps: Float32,
     sensor: ExpectedSensor,
-    pixels: PixelModel,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
 ) -> tuple[Float, Float]:
     """Expected differences of the mean log-likelihood of two hypotheses, and of their pixels.
 
@@ -155,8 +153,7 @@ def divergences(
         images: renderings of the hypotheses in each view.
         gaps: depth differences, see ``gaps_after_alignment``.
         sensor: expected noise of the camera.
-        pixels: model of the pixels.
-        prior: prior of the registration.
+        model: of the pixels and the cameras.
 
     Returns:
         Mean of both directions, (V, H, H), and share of the pixels that differ, (V, H, H).
@@ -168,7 +165,7 @@ def divergences(
     if not len(first):
         return divergence, different
 
-    judged = _Judged.of(images, sensor, pixels, prior)
+    judged = _Judged.of(images, sensor, model)
     forth = judged.ratio(first, second, gaps)
     back = judged.ratio(second, first, gaps)
     both_ways = np.maximum((forth + back) / 2, 0)
@@ -183,23 +180,21 @@ def divergences(
 def different_pixels(
     images: HypothesisImages,
     sensor: ExpectedSensor,
-    pixels: PixelModel,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
 ) -> Mask:
     """Pixels in which two registered hypotheses differ by more than the noise.
 
     Args:
         images: renderings of two hypotheses.
         sensor: the camera.
-        pixels: model of the pixels.
-        prior: prior of the registration.
+        model: of the pixels and the cameras.
 
     Returns:
         Mask, (V, P) bool.
     """
     first, second = _pairs(2)
-    gaps = gaps_after_alignment(images, sensor, prior)
-    judged = _Judged.of(images, sensor, pixels, prior)
+    gaps = gaps_after_alignment(images, sensor, model)
+    judged = _Judged.of(images, sensor, model)
     return judged.different(first, second, gaps)[:, 0]
 
 
@@ -241,16 +236,14 @@ class _Judged:
         cls,
         images: HypothesisImages,
         sensor: ExpectedSensor,
-        pixels: PixelModel,
-        prior: RegistrationPrior,
+        model: ExpectedModel,
     ) -> "_Judged":
         """Prepare the likelihoods of the pixels of each view.
 
         Args:
             images: renderings of the hypotheses in each view.
             sensor: expected noise of the camera.
-            pixels: model of the pixels.
-            prior: prior of the registration.
+            model: of the pixels and the cameras.
 
         Returns:
             The inputs of the likelihoods.
@@ -258,25 +251,25 @@ class _Judged:
         shows = np.isfinite(images.depth)
         size = images.step / sensor.pitch  # size of a rendered pixel, camera pixels
         within, beside = _rings(shows, images.side)
-        deep = np.clip(within * size.mean(1)[:, None, None] / pixels.edge, 0.1, 1)
+        deep = np.clip(within * size.mean(1)[:, None, None] / model.edge, 0.1, 1)
 
         away = np.linalg.norm(images.origins - images.centre, axis=1)
         metres = images.step.mean(1) * away
-        displaced = _displaced(images, prior).astype(np.float32)
+        displaced = _displaced(images, model).astype(np.float32)
         beside = beside * (metres / displaced)[:, None, None]
         return cls(
             shows=shows,
             lost=np.where(shows, np.maximum(1 - images.cosine / GRAZING_COSINE, 0), 0),
-            deviation=np.sqrt(depth_variance(images, sensor, pixels)),
-            hole=(pixels.hole * images.cosine).astype(np.float32),
-            missing=(pixels.outlier * deep).astype(np.float32),
+            deviation=np.sqrt(depth_variance(images, sensor, model)),
+            hole=(model.hole * images.cosine).astype(np.float32),
+            missing=(model.outlier * deep).astype(np.float32),
             apart=1 - np.exp(-0.5 * beside**2),
             behind=images.behind[:, None],
             clear=images.clear[:, None],
             area=size.prod(1)[:, None].astype(np.float64),
-            enough=prior.pixels,
-            outlier=pixels.outlier,
-            matches=_match_table(pixels.outlier),
+            enough=model.pixels,
+            outlier=model.outlier,
+            matches=_match_table(model.outlier),
         )
 
     def ratio(self, true: Index, other: Index, gaps: Float32) -> Float:

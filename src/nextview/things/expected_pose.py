@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 
 from nextview.things.expected_images import ExpectedSensor, HypothesisImages
-from nextview.things.registration import (
+from nextview.things.expected_model import (
     OUTLINE_PIXELS,
     SCAN_ERROR,
-    RegistrationPrior,
+    ExpectedModel,
     inverses,
 )
 from nextview.things.surface import Surface
@@ -64,7 +64,7 @@ def sharper_poses(
     pose: Float,
     covariance: Float,
     sensor: ExpectedSensor,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
     taken: int,
 ) -> Float:
     """Logarithm of the reduction of the surface error by each view.
@@ -86,10 +86,10 @@ def sharper_poses(
     """
     rotation = pose[:3, :3]
     centre = rotation @ surface.centre.astype(np.float64) + pose[:3, 3]
-    told = _information(images, centre, sensor, prior)
+    told = _information(images, centre, sensor, model)
 
     away = np.linalg.norm(images.origins - centre, axis=1)
-    displaced = (prior.camera**2 + (prior.aim * away) ** 2) * (1 + 1 / taken)
+    displaced = (model.camera**2 + (model.aim * away) ** 2) * (1 + 1 / taken)
     before = np.tile(covariance, (len(away), 1, 1))
     before[:, 3:, 3:] += displaced[:, None, None] * np.eye(3)
     after = inverses(inverses(before) + told)
@@ -102,7 +102,7 @@ def _information(
     images: HypothesisImages,
     centre: Float,
     sensor: ExpectedSensor,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
 ) -> Float:
     """Fisher information of each view about rotation and translation of the first hypothesis, (V,
     6, 6).
@@ -116,14 +116,14 @@ def _information(
     noise = SCAN_ERROR**2 + (sensor.noise * depth**2) ** 2
     area = (images.step / sensor.pitch).prod(1)[:, None]
     weights = (seen / noise).astype(np.float32)
-    inside = _summed(arms, images.normals[:, 0], weights, seen * area, prior)
+    inside = _summed(arms, images.normals[:, 0], weights, seen * area, model)
 
     aside = _outward(images, shows)
     rim = seen * (np.abs(aside).sum(2) > 0)
     deviation = SCAN_ERROR**2 + (OUTLINE_PIXELS * sensor.pitch * depth) ** 2
     width = (images.step / sensor.pitch).mean(1)[:, None]
     weights = (rim / deviation).astype(np.float32)
-    return inside + _summed(arms, aside, weights, rim * width, prior)
+    return inside + _summed(arms, aside, weights, rim * width, model)
 
 
 def _summed(
@@ -131,14 +131,14 @@ def _summed(
     directions: Float32,
     weights: Float32,
     pixels: Float32,
-    prior: RegistrationPrior,
+    model: ExpectedModel,
 ) -> Float:
     """Fisher information of pixels that constrain a thing in some directions, (V, 6, 6)."""
     moved = np.concatenate([np.cross(arms, directions), directions], 2).astype(
         np.float64
     )
     # As in the registration: the errors of neighbouring pixels are correlated.
-    count = np.minimum(pixels.sum(1), prior.pixels) / np.maximum(
+    count = np.minimum(pixels.sum(1), model.pixels) / np.maximum(
         (weights > 0).sum(1),
         1,
     )

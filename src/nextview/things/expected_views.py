@@ -2,21 +2,19 @@
 
 The value of a view is its expected information about the thing, or about thing and pose (Denzler
 and Brown, "Information theoretic sensor data selection", IEEE TPAMI 2002), under the likelihood of
-the verifier. ``expected_images`` renders the hypotheses, and ``expected_likelihood`` predicts their
+their pixels. ``expected_images`` renders the hypotheses, and ``expected_likelihood`` predicts their
 log-likelihood ratios.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
-from nextview.things.depth_view import DepthView, depth_view
+from nextview.recognition.poses import PoseCandidate
 from nextview.things.expected_images import (
     ExpectedSensor,
     SeenSurroundings,
@@ -27,22 +25,14 @@ from nextview.things.expected_likelihood import (
     divergences,
     gaps_after_alignment,
 )
+from nextview.things.expected_model import MOST_LEADING, ExpectedModel, Leading
 from nextview.things.expected_pose import sharper_poses
-from nextview.things.leading import Hypotheses
-from nextview.things.registration import (
-    Alignment,
-    RegistrationPrior,
-    pose_covariances,
-)
 from nextview.things.surface import SurfaceCaster
-from nextview.things.verification import PixelModel
-from nextview.things.verifier import Verified, Verifier
-from nextview.things.weighing import EvidenceWeights
+from nextview.things.world import Thing, World
 from nextview.types import Float, Index, Mask
 
 Goal = Literal["thing", "pose"]
 
-SENSOR_SIDE = 24  # rows and columns of a view for the estimate of the camera's noise
 RENDERED_SIDE = 18  # rows and columns of the rendered images
 PICTURE_SIDE = 64  # rows and columns of the pictures for display
 # Bhattacharyya distance of two Gaussians of equal variance, as a share of their divergence
@@ -67,7 +57,7 @@ class ExpectedViews:
             zeros if it was not requested.
     """
 
-    hypotheses: Hypotheses
+    hypotheses: Leading
     divergence: Float
     different: Float
     found: Float
@@ -194,18 +184,16 @@ class ExpectedViews:
 
 def expected_views(
     caster: SurfaceCaster,
-    hypotheses: Hypotheses,
+    hypotheses: Leading,
     cameras: Float,
     sensor: ExpectedSensor,
     surroundings: SeenSurroundings | None = None,
     taken: int = 1,
-    weights: EvidenceWeights = EvidenceWeights(),
-    pixels: PixelModel = PixelModel(),
-    prior: RegistrationPrior = RegistrationPrior(),
+    model: ExpectedModel = ExpectedModel(),
     side: int = RENDERED_SIDE,
     covariance: Float | None = None,
 ) -> ExpectedViews:
-    """Predict the information of candidate views, with the weights of the verifier.
+    """Predict the information of candidate views.
 
     Args:
         caster: surfaces of the things.
@@ -215,10 +203,8 @@ def expected_views(
         sensor: the camera.
         surroundings: occluders and background; none by default.
         taken: number of views so far. Further views have less weight, see
-            ``EvidenceWeights.correlation``.
-        weights: weight of the geometry.
-        pixels: model of the pixels.
-        prior: prior of the registration.
+            ``ExpectedModel.correlation``.
+        model: of the pixels and the cameras.
         side: rows and columns of the rendered images.
         covariance: covariance of rotation and translation of the first hypothesis, (6, 6), if the
             reduction of its pose error is requested.
@@ -229,9 +215,9 @@ def expected_views(
     cameras = np.asarray(cameras, np.float64)
     scene = SeenSurroundings.nothing() if surroundings is None else surroundings
     rendered = rendered_images(caster, hypotheses, cameras, scene, side)
-    weight = weights.geometry / (1 + weights.correlation * taken)
-    moved = gaps_after_alignment(rendered, sensor, prior)
-    divergence, different = divergences(rendered, moved, sensor, pixels, prior)
+    weight = model.geometry / (1 + model.correlation * taken)
+    moved = gaps_after_alignment(rendered, sensor, model)
+    divergence, different = divergences(rendered, moved, sensor, model)
     pixels_shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
     found = pixels_shown / (pixels_shown + HALF_FOUND)
     sharper = np.zeros(len(cameras))
@@ -245,7 +231,7 @@ def expected_views(
             pose,
             covariance,
             sensor,
-            prior,
+            model,
             taken,
         )
 
@@ -283,74 +269,68 @@ class Outlook:
         surroundings: measured surroundings of the thing.
         place: position of the last camera, (3,) float64, object frame, metres.
         taken: number of views so far.
-        weights: weight of the geometry.
-        pixels: model of the pixels.
-        prior: prior of the registration.
-        likeliest: registration of the first hypothesis.
-        views: the registered views.
+        covariance: of rotation and translation of the first hypothesis, (6, 6) float64.
+        model: of the pixels and the cameras.
     """
 
     caster: SurfaceCaster
-    hypotheses: Hypotheses
+    hypotheses: Leading
     sensor: ExpectedSensor
     surroundings: SeenSurroundings
     place: Float
     taken: int
-    weights: EvidenceWeights
-    pixels: PixelModel
-    prior: RegistrationPrior
-    likeliest: Alignment
-    views: tuple[DepthView, ...]
+    covariance: Float
+    model: ExpectedModel = ExpectedModel()
 
     @classmethod
     def of(
         cls,
-        verifier: Verifier,
-        verified: Verified,
-        observations: Sequence[Observation],
+        world: World,
+        thing: Thing,
+        poses: Sequence[PoseCandidate],
+        beliefs: Mapping[str, float],
+        to_object: Float,
     ) -> "Outlook":
         """Collect the state after some views.
 
         Args:
-            verifier: verifier of the surfaces.
-            verified: its result for the views.
-            observations: the views in the order in which they were taken; those that do not show
-                the thing are ignored.
-
-        Returns:
-            The state.
-
-        Raises:
-            ObservationError: no view shows the thing, or its scale is not known.
+            world: what explains the views.
+            thing: the one that is looked at.
+            poses: that it may have, the likeliest first.
+            beliefs: in the names of the library.
+            to_object: from the world to the object frame, whose z is up, (4, 4).
         """
-        found = (
-            (each, depth_view(each, SENSOR_SIDE)) for each in observations if each.seen
+        number = {name: row for row, name in enumerate(world.library.names)}
+        kept = poses[:MOST_LEADING]
+        belief = np.array([one.probability * beliefs.get(one.thing, 0) for one in kept])
+        leading = Leading(
+            np.array([number[one.thing] for one in kept]),
+            np.stack([to_object @ one.pose for one in kept]),
+            belief / max(belief.sum(), 1e-12),
         )
-        seen = [(each, view) for each, view in found if view is not None]
-        sensor = ExpectedSensor.of([view for _, view in seen])
-        hypotheses = Hypotheses.leading(verified)
-        used = [each for each, _ in seen]
-        row = np.flatnonzero(verified.things == hypotheses.things[0])[:1]
-
+        view = world.views[-1]
+        depth = view.grid().depth
+        sensor = ExpectedSensor(
+            float(1 / view.frame.intrinsics[0, 0]),
+            float(np.median(view.noise.at(depth[depth > 0]))),
+        )
+        owners = [owner == thing.number for owner in world.owners]
+        points = [
+            one.points(np.flatnonzero(mine))
+            for one, mine in zip(world.views, owners, strict=True)
+        ]
+        own = np.concatenate(points) @ to_object[:3, :3].T + to_object[:3, 3]
+        variances = [np.radians(kept[0].degrees) ** 2 / 3] * 3
+        variances += [(kept[0].millimetres / 1000) ** 2 / 3] * 3
         return cls(
-            caster=verifier.caster,
-            hypotheses=hypotheses,
-            sensor=sensor,
-            surroundings=SeenSurroundings.of(used, verifier.caster, hypotheses),
-            place=seen[-1][1].origin,
-            taken=len(used),
-            weights=verifier.weights,
-            pixels=verifier.pixels,
-            prior=verifier.prior,
-            likeliest=verified.alignment(row, verifier),
-            views=tuple(view for _, view in seen),
+            world.library.caster,
+            leading,
+            sensor,
+            SeenSurroundings.of(world.views, owners, own, to_object),
+            (to_object @ view.camera)[:3, 3],
+            sum(bool(mine.any()) for mine in owners),
+            np.diag(variances),
         )
-
-    @cached_property
-    def covariance(self) -> Float:
-        """Covariance of rotation and translation of the first hypothesis, (6, 6) float64."""
-        found = pose_covariances(self.caster, self.likeliest, self.views, self.prior)
-        return found[0]
 
     @property
     def distance(self) -> float:
@@ -394,7 +374,7 @@ class Outlook:
         if not others:
             return None
         rows = np.array([order[0], others[0]])
-        two = Hypotheses(things[rows], self.hypotheses.poses[rows], np.full(2, 0.5))
+        two = Leading(things[rows], self.hypotheses.poses[rows], np.full(2, 0.5))
         images = rendered_images(
             self.caster,
             two,
@@ -405,7 +385,7 @@ class Outlook:
 
         shows = np.isfinite(images.depth[0])
         pictures = np.where(shows, 255 * images.cosine[0], 0).astype(np.uint8)
-        different = different_pixels(images, self.sensor, self.pixels, self.prior)[0]
+        different = different_pixels(images, self.sensor, self.model)[0]
         return RivalPictures(
             two.things,
             pictures.reshape(2, side, side),
@@ -429,8 +409,6 @@ class Outlook:
             self.sensor,
             self.surroundings,
             self.taken,
-            self.weights,
-            self.pixels,
-            self.prior,
+            self.model,
             covariance=self.covariance if goal == "pose" else None,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -12,6 +13,10 @@ import numpy as np
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.view_templates import ViewTemplates, templates_of
 from nextview.types import Float, Float32, Index
+
+# errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
+CAMERA_ERROR = 0.006, 0.004
+LEAST_CAMERA_ERROR = 1e-4  # metres: a more accurate camera counts as exact
 
 
 class Library:
@@ -24,6 +29,7 @@ class Library:
         templates: their depth images from all directions.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
         radii: radius of each, (T,) float64, metres.
+        camera: standard deviations of the pose of a camera: radians and metres.
     """
 
     def __init__(
@@ -42,9 +48,21 @@ class Library:
         self.names = tuple(surface.name for surface in surfaces)
         self.symmetries = symmetries
         self.caster = SurfaceCaster(surfaces)
+        self.camera = CAMERA_ERROR
         self.templates: ViewTemplates = templates_of(self.caster, threads)
         self.centres = self.caster.centres.astype(np.float64)
         self.radii = self.caster.radii.astype(np.float64)
+
+    def for_cameras(self, place: float, aim: float) -> Library:
+        """Return the library for cameras with another accuracy of their poses.
+
+        Args:
+            place: standard deviation of the position, metres.
+            aim: standard deviation of the orientation, radians.
+        """
+        other = copy(self)
+        other.camera = aim, max(place, LEAST_CAMERA_ERROR)
+        return other
 
     def __len__(self) -> int:
         """Number of things."""

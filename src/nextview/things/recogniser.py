@@ -15,13 +15,13 @@ from nextview.geometry.observation import Observation
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
+from nextview.things.expected_views import Outlook
 from nextview.things.library import Library
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
-from nextview.things.register import CAMERA_SHIFT
 from nextview.things.target import view_of
 from nextview.things.world import World, corrected
-from nextview.types import Float, Floats, Index, Mask
+from nextview.types import Floats, Index, Mask
 
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"
@@ -88,6 +88,26 @@ class VerifiedRecogniser(TaughtRecogniser):
         other._last = None
         return other
 
+    @property
+    def in_any_orientation(self) -> VerifiedRecogniser:
+        """The same recogniser: things need not rest on anything to be recognised."""
+        return self
+
+    def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
+        """The same recogniser for cameras with another pose accuracy.
+
+        Args:
+            place: standard deviation of the position of a camera along each axis, metres.
+            aim: standard deviation of its viewing direction, radians.
+
+        Returns:
+            A copy that shares the memory.
+        """
+        other = copy(self)
+        other.library = self.library.for_cameras(place, aim)
+        other._last = None
+        return other
+
     @cached_property
     def least_p_value(self) -> float:
         """Smallest value of the test for unknown objects: it has no bound."""
@@ -144,10 +164,10 @@ class VerifiedRecogniser(TaughtRecogniser):
         return JointBelief(
             belief / belief.sum(),
             poses=pose_candidates(world, found, self.labels),
-            camera_error=1000 * CAMERA_SHIFT if moves else 0.0,
+            camera_error=1000 * self.library.camera[1] if moves else 0.0,
             p_value=found.right,
             doubt=why_in_doubt(world, thing, found) if found.right < 0.5 else "",
-            found=world,
+            found=(world, thing, found.beliefs(world)),
         )
 
     def explained(self, observations: Sequence[Observation]) -> World:
@@ -173,11 +193,10 @@ class VerifiedRecogniser(TaughtRecogniser):
         Returns:
             The leading hypotheses and their surroundings; None where nothing explains the views.
         """
-        if not isinstance(joint.found, World):
+        if joint.found is None:
             return None
-        from nextview.things.expected_views import Outlook
-
-        return Outlook.of(joint.found, joint.poses, joint.belief, self.labels)
+        world, thing, beliefs = joint.found
+        return Outlook.of(world, thing, joint.poses, beliefs, np.eye(4))
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:

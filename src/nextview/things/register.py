@@ -25,8 +25,6 @@ LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a 
 DAMPING = 0.01  # weight of the present pose, points
 OUTLINE_STEP = 4  # pixels, to which the outline of a segment is told
 OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matches
-# errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
-CAMERA_TURN, CAMERA_SHIFT = 0.006, 0.004
 MATCHING_ERROR = 0.002  # metres, of a point on the right surface
 ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
 
@@ -176,7 +174,7 @@ def camera_error(library: Library, view: View, some: Hypotheses, count: int = 96
     Returns:
         The view with another ``camera``.
     """
-    told = np.r_[np.full(3, CAMERA_TURN**-2.0), np.full(3, CAMERA_SHIFT**-2.0)]
+    told = np.repeat(np.array(library.camera) ** -2.0, 3)
     moved = np.zeros(6)
     for reach in (0.15, 0.1, 0.06, 0.04, 0.03):
         left, right = normal_equations(library, view, some, reach, count)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.types import Float, Float32, Mask
 
 SIGHT_STEPS = 20  # sample points on each line of sight
@@ -34,24 +33,6 @@ class MeasuredDepth:
     depth: Float32
     pose: Float
     intrinsics: Float
-
-    @classmethod
-    def of(cls, observation: Observation) -> "MeasuredDepth | None":
-        """Depth of the whole scene of a view.
-
-        Args:
-            observation: the view.
-
-        Returns:
-            The depth; None if the observation has no scene or no scale.
-        """
-        scene = observation.scene
-        if scene is None or observation.radius is None:
-            return None
-        pose = scene.pose.astype(np.float64)
-        pose[:3, 3] *= observation.radius
-        depth = scene.depth * np.float32(observation.radius)
-        return cls(depth, pose, scene.intrinsics.astype(np.float64))
 
     def shows_free(self, points: Float32) -> Mask:
         """Whether the camera observed free space at some points.

@@ -17,12 +17,7 @@ from numpy.typing import NDArray
 from nextview.segmentation.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.propose import propose
-from nextview.things.register import (
-    CAMERA_SHIFT,
-    CAMERA_TURN,
-    camera_error,
-    register,
-)
+from nextview.things.register import camera_error, register
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
 
@@ -343,7 +338,7 @@ def corrected(world: World, view: View) -> View:
     usual = [_usual(world.scores[row]) for row in rows]
     values = []
     for one in tried:
-        value = -_cost(view, one)
+        value = -_cost(view, one, world.library.camera)
         for found, most in zip(score(world.library, one, some), usual, strict=True):
             if found is not None:
                 value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
@@ -357,12 +352,12 @@ def _usual(row: Sequence[Score | None]) -> float:
     return total(row) / max(1.0, seen)
 
 
-def _cost(given: View, believed: View) -> float:
+def _cost(given: View, believed: View, error: tuple[float, float]) -> float:
     """Return the cost of an error of a camera, nats."""
     turn = believed.camera[:3, :3] @ given.camera[:3, :3].T
     angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
     shift = np.linalg.norm(believed.camera[:3, 3] - given.camera[:3, 3])
-    return float((angle / CAMERA_TURN) ** 2 + (shift / CAMERA_SHIFT) ** 2) / 2
+    return float((angle / error[0]) ** 2 + (shift / error[1]) ** 2) / 2
 
 
 SETTLED_VIEWS = 3  # views after which poses are not refined
@@ -522,14 +517,5 @@ def world_points(world: World, row: Sequence[Score | None]) -> Float:
     found = [np.zeros((0, 3))]
     for view, one in zip(world.views, row, strict=False):
         if one is not None:
-            found.append(points_of(view, one.cells[one.gain > 0]))
+            found.append(view.points(one.cells[one.gain > 0]))
     return np.concatenate(found)
-
-
-def points_of(view: View, cells: Index) -> Float:
-    """Return the measured points of pixels of the grid, (N,), in the world, (N, 3), metres."""
-    grid = view.grid()
-    line, column = np.divmod(cells, grid.depth.shape[1])
-    z = grid.depth[line, column].astype(np.float64)
-    own = np.stack([grid.x[column] * z, grid.y[line] * z, z], 1)
-    return own @ view.camera[:3, :3].T + view.camera[:3, 3]
