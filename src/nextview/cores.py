@@ -1,6 +1,11 @@
 """How many cores are used: one setting for processes, threads of networks, and parallel objects."""
 
 import os
+from contextlib import AbstractContextManager
+from functools import lru_cache
+from typing import Any
+
+from threadpoolctl import ThreadpoolController
 
 from nextview.checks import whole
 
@@ -50,3 +55,19 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    """Return a controller of the thread pools below NumPy."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Limit NumPy's matrix products to one thread in this context.
+
+    They are small, and the threads of BLAS spin while they wait for each other. That takes the
+    cores from the networks; on a computer that is busy otherwise, a search takes several times as
+    long.
+    """
+    return _blas().limit(limits=1)

@@ -10,16 +10,15 @@ from scipy.special import expit, logit
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty
 from nextview.scene.motion import BodyState, MotionModel, Rest
 from nextview.scene.objects import SceneObject
-from nextview.session.tracks import caster_of
-from nextview.things.surface import Surface, SurfaceCaster
-from nextview.types import Float, Float32
+from nextview.things.library import Library
+from nextview.things.surface import Surface
+from nextview.types import Float
 
 LOSSES = 0.1  # expected number of losses a second
 RETURNS = 1.0  # expected number of times a second that a lost thing is in view again
 # error of the expected pose, radii, up to which a registration finds the thing and nothing else
 WIDEST = 0.5
 MOST_ODDS = 30.0  # log-odds that a pose is right
-FARTHEST_DEVIATIONS = 4.0  # at which a point may be on a surface
 LEAST_DEGREES = (
     0.5  # standard deviation of the orientation with which a thing is taken over
 )
@@ -61,7 +60,7 @@ class Body:
         number: of the object in the scene.
         name: of the thing.
         surface: in the frame of its scan.
-        caster: of rays at it.
+        thing: its number in the library.
         seen: state of its motion in the last frame that shows it.
         unseen: time since that frame, seconds.
         rest: its pose in case that it rests.
@@ -75,7 +74,7 @@ class Body:
     number: int
     name: str
     surface: Surface
-    caster: SurfaceCaster
+    thing: int
     seen: BodyState
     unseen: float
     rest: Rest
@@ -88,6 +87,7 @@ class Body:
     def of(
         cls,
         one: SceneObject,
+        library: Library,
         model: MotionModel,
         motion: Float | None = None,
     ) -> Body | None:
@@ -95,6 +95,7 @@ class Body:
 
         Args:
             one: the object.
+            library: with its thing.
             model: of its motion.
             motion: of the object since the scene has seen it, (4, 4), in the world; None for none.
         """
@@ -102,19 +103,20 @@ class Body:
             return None
         posed = one.candidates[0]
         pose = posed.pose if motion is None else motion @ posed.pose
-        return cls._placed(one.number, posed, pose, model)
+        return cls._placed(one.number, library, posed, pose, model)
 
     @classmethod
     def _placed(
         cls,
         number: int,
+        library: Library,
         posed: PoseCandidate,
         pose: Float,
         model: MotionModel,
     ) -> Body:
         """Start with a thing in a pose, (4, 4), metres, as uncertain as that of a candidate."""
-        caster = caster_of(posed)
-        surface = caster.surfaces[0]
+        thing = library.names.index(posed.thing)
+        surface = library.caster.surfaces[thing]
 
         rotation = pose[:3, :3]
         deviations = [
@@ -132,7 +134,7 @@ class Body:
         )
 
         return cls(
-            number, posed.thing, surface, caster, state, 0.0, Rest.at(state), state
+            number, posed.thing, surface, thing, state, 0.0, Rest.at(state), state
         )
 
     @property
@@ -228,39 +230,6 @@ class Body:
         if body.rests:
             body = replace(body, state=rest.state_of(state, rest.covariance))
         return body
-
-    def log_density(self, points: Float32, noise: Float32) -> Float:
-        """Log-density of measured points on the surface in its expected pose.
-
-        Args:
-            points: (N, 3), world, metres.
-            noise: standard deviation of each, (N,), metres.
-
-        Returns:
-            Log-densities along the distance from the surface, (N,), 1/metres, of which one half
-            may be elsewhere.
-        """
-        state = self.state
-        density = np.full(len(points), -np.inf)
-        local = (points - state.centre) @ state.rotation + self.surface.centre
-        farthest = FARTHEST_DEVIATIONS * np.hypot(2 * self.displaced, noise.max())
-        tree = self.surface.nearby
-        apart, nearest = tree.query(
-            local, distance_upper_bound=float(farthest) + self.surface.spacing
-        )
-        near = np.flatnonzero(np.isfinite(apart))
-        if not len(near):
-            return density
-
-        apart = np.asarray(apart)[near]
-        away = (local[near] - tree.data[np.asarray(nearest)[near]]) @ state.rotation.T
-        away /= np.maximum(apart, 1e-9)[:, None]
-        arms = points[near] - state.centre
-        rows = np.concatenate([np.cross(arms, away), away], axis=1)
-        variance = np.einsum("ni,ij,nj->n", rows, state.pose_covariance, rows)
-        variance += noise[near] ** 2 + (self.surface.spacing / 2) ** 2
-        density[near] = -0.5 * (apart**2 / variance + np.log(8 * np.pi * variance))
-        return density
 
 
 def _displaced(state: BodyState, radius: float) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.checks import did_you_mean, one_line
+from nextview.cores import one_blas_thread
 from nextview.errors import ModelError, ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.scene.changes import changes
@@ -47,7 +48,6 @@ from nextview.sensing.plausibility import check_sizes
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.session.judging import one_blas_thread
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.reach import (
     Reach,
@@ -211,6 +211,11 @@ class Scene:
     def objects(self) -> tuple[SceneObject, ...]:
         """Objects on the table, in the order in which they were found."""
         return self._state.objects
+
+    @property
+    def library(self) -> Library:
+        """The things that the scene knows."""
+        return self._state.world.library
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:

@@ -14,9 +14,10 @@ import numpy as np
 from nextview.checks import number
 from nextview.errors import SessionError, UsageError
 from nextview.scene.body import Body, Tracked
-from nextview.scene.body_pixels import SURPRISE, BodyPixels, registered
+from nextview.scene.followed import SURPRISE, followed, view_to_follow
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
+from nextview.segmentation.view import View
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
@@ -77,6 +78,7 @@ class Tracker:
             raise SessionError(
                 "there is nothing to follow before the first frame of the scene"
             )
+        self._library = scene.library
         top = scene.tops[-1]
         self._noise = top.noise
         self._ground = top.plane if top.shows_ground else None
@@ -84,7 +86,7 @@ class Tracker:
         starts = {thing.number: thing.pose for thing in since if not thing.lost}
         bodies = {}
         for one in scene.objects:
-            fresh = Body.of(one, self.model)
+            fresh = Body.of(one, self._library, self.model)
             if fresh is None:
                 continue
             body = self._bodies.get(one.number)
@@ -92,7 +94,7 @@ class Tracker:
                 body = fresh
             elif one.number in starts and body.rests:
                 motion = body.pose @ np.linalg.inv(starts[one.number])
-                body = Body.of(one, self.model, motion)
+                body = Body.of(one, self._library, self.model, motion)
             assert body is not None
             bodies[one.number] = body
         self._bodies = bodies
@@ -136,20 +138,15 @@ class Tracker:
         bodies = {
             key: body.after(seconds, self.model) for key, body in self._bodies.items()
         }
+        view = view_to_follow(frame, self._noise, self._ground)
         for key, body in bodies.items():
-            others = [other for name, other in bodies.items() if name != key]
-            bodies[key] = self._followed(body, seconds, others, frame)
+            bodies[key] = self._followed(body, seconds, view)
         self._bodies = bodies
         return self.things
 
-    def _followed(
-        self, body: Body, seconds: float, others: Sequence[Body], frame: Frame
-    ) -> Body:
+    def _followed(self, body: Body, seconds: float, view: View) -> Body:
         """Register a thing in a frame."""
-        pixels = BodyPixels.around(body, others, frame, self._noise, self._ground)
-        if pixels is None:
-            return body.judged(seconds, 0.0, 0.0)
-        found = registered(body, pixels)
+        found = followed(self._library, view, body)
         body = body.judged(seconds, found.evidence, found.visible)
         # few things that stand are moved in a frame: a few pixels do not tell it
         enough = SURPRISE if body.rests else 0.0

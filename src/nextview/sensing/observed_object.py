@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,11 +54,6 @@ NO_PLANE = ViewWarning(
     "no support plane is seen, so where the object ends below is guessed: support=False if it"
     " stands on none",
 )
-
-
-Parter = Callable[["ObservedObject", SegmentedFrame], Mask | None]
-"""Function of an object after a frame, and of the segmented frame, that returns other pixels of the
-object, (H, W) bool; None if they stay as they are."""
 
 
 @dataclass(frozen=True)
@@ -171,17 +165,15 @@ class ObservedObject:
         """Number of times that earlier observations have changed."""
         return self.state.revision
 
-    def add(self, frame: Frame, part: Parter | None = None) -> Observation:
+    def add(self, frame: Frame) -> Observation:
         """Process a frame and return its observation from three object radii.
 
         An ObservationError is raised if the object is not found; the frame is then not used.
 
         Args:
             frame: of a depth camera.
-            part: corrects the pixels of the object. Not used for a frame with a mask, for a known
-                object frame, and for an object without a support plane.
         """
-        self.state = self._after(frame, part)
+        self.state = self._after(frame)
         return self.state.observations[-1]
 
     def add_again(self, frame: Frame, number: int) -> None:
@@ -202,7 +194,7 @@ class ObservedObject:
             warnings=(REPEATED,),
         )
 
-    def _after(self, frame: Frame, part: Parter | None) -> ObjectState:
+    def _after(self, frame: Frame) -> ObjectState:
         """Return the state after a frame, running all stages from frame to observation."""
         known = self._known_frames
         known.refuse(frame)
@@ -211,21 +203,7 @@ class ObservedObject:
         warnings = tuple(check_mistakes(segmented, known))
 
         pixels = self._pixels(segmented)
-        after = self._with_pixels(pixels, segmented, up, warnings)
-        if (
-            part is None
-            or frame.mask is not None
-            or self.known is not None
-            or after.sightings[-1].plane is None
-        ):
-            return after
-
-        thing = copy(self)
-        thing.state = after
-        other = part(thing, segmented)
-        if other is None:
-            return after
-        return self._with_pixels(other, segmented, up, warnings)
+        return self._with_pixels(pixels, segmented, up, warnings)
 
     def _with_pixels(
         self,

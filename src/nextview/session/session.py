@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.checks import one_line, plugin_errors, whole
+from nextview.cores import one_blas_thread
 from nextview.errors import (
     NoViewLeftError,
     ObservationError,
@@ -45,10 +46,8 @@ from nextview.sensing.plausibility import (
     check_last_view,
     check_observation,
 )
-from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
-from nextview.session.judging import Judge, one_blas_thread
 from nextview.session.limits import Limits, checked_limits, in_words
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import (
@@ -61,8 +60,6 @@ from nextview.session.reach import (
 )
 from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
-from nextview.session.target import parted_from_neighbours
-from nextview.session.tracks import Track
 from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
@@ -686,7 +683,7 @@ class Session:
             known = [one.frame for one in object.sightings[self._before :]]
             number = repeated(frame, known, any_mask=True)
             if number is None:
-                object.add(frame, self._parted)
+                object.add(frame)
             else:
                 object.add_again(frame, self._before + number)
             self._refuse_disagreement(object)
@@ -700,16 +697,6 @@ class Session:
         except BaseException:
             object.state = before
             raise
-
-    def _parted(self, object: ObservedObject, seen: SegmentedFrame) -> Mask | None:
-        """Part the object from its neighbours, see ``session.target.parted_from_neighbours``."""
-        judge = Judge(self.models, self.sphere, self.stopping, self.unknown)
-        before = None
-        if self.views and self.object is not None:
-            result = self._recognition(self.views, self.object)
-            frames = tuple(range(len(self.object.sightings)))
-            before = Track(0, copy(self.object), frames, result)
-        return parted_from_neighbours(object, seen, judge, before)
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Reject frames whose object is as large as the camera distance only in combination.

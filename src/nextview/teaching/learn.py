@@ -120,14 +120,12 @@ class Learned:
         out: folder of the memory.
         things: number of things.
         classes: number of their classes.
-        accuracy: share of correct answers. With geometry: after 1, 2 and 3 views, with weights that
-            were fitted to other things. Otherwise: after 1, 2, 3 and 5 held-out views, by features
+        accuracy: share of correct answers. With geometry: after 1, 2 and 3 simulated views. Otherwise: after 1, 2, 3 and 5 held-out views, by features
             and size. A thing of a class of several is recognised by the others of that class. () if
             nothing was tested, as after a removal.
         confused: pairs of things that are most often confused, with the share of the cases.
         notes: notes for the user, a sentence each.
         left_out: what could not be learned and why, a phrase each.
-        by_outline: with geometry: the accuracy in the same cases by outline and size alone.
         judged: number of things in this test.
         never_confident: things that no test names with confidence after all its views, and why: a
             sentence about each.
@@ -140,7 +138,6 @@ class Learned:
     confused: tuple[tuple[str, str, float], ...]
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
-    by_outline: tuple[float, ...] = ()
     judged: int = 0
     never_confident: tuple[tuple[str, str], ...] = ()
 
@@ -172,12 +169,9 @@ class Learned:
         shown = self.accuracy[:3]
         views = ", ".join(str(k) for k in VIEWS_FITTED[: len(shown)])
         named = f"named right after {views} views: {_percent(shown)}"
-        if not self.by_outline:
+        if self.judged in (0, self.things):
             return named
-        of_some = "" if self.judged == self.things else f", of {self.judged} of them"
-        return (
-            f"{named} (by outline and size alone {_percent(self.by_outline)}{of_some})"
-        )
+        return f"{named} ({self.judged} of them were tested)"
 
 
 def _percent(shares: Sequence[float]) -> str:
@@ -735,14 +729,14 @@ def _holds_views(file: Path) -> bool:
         return False
 
 
-def _unseen(taught: Sequence[Pair], verified: VerifiedFit | None) -> set[str]:
+def _unseen(taught: Sequence[Pair], tested: ShownThings | None) -> set[str]:
     """Names of the things that the sensor does not see."""
     of_features = {
         source.name
         for source, arrays in taught
         if arrays["held_out"].size and not arrays["held_out"].any()
     }
-    return of_features if verified is None else of_features | set(verified.unseen)
+    return of_features if tested is None else of_features | set(tested.unseen)
 
 
 def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ log-likelihood ratios.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -280,7 +280,7 @@ class Outlook:
     place: Float
     taken: int
     covariance: Float
-    model: ExpectedModel = ExpectedModel()
+    model: ExpectedModel = field(default_factory=ExpectedModel)
 
     @classmethod
     def of(

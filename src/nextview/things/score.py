@@ -45,6 +45,7 @@ class Score:
         seen: pixels of the grid in which it is measured, or seen through; those on its outline
             count less.
         through: those of them that are seen through.
+        hidden: pixels in which something is in front of it.
     """
 
     cells: NDArray[np.int32]
@@ -52,6 +53,7 @@ class Score:
     paid: float
     seen: float
     through: float
+    hidden: float
 
     @property
     def total(self) -> float:
@@ -88,6 +90,7 @@ def score(
                     one.paid * count,
                     one.seen * count,
                     one.through * count,
+                    one.hidden * count,
                 )
             found[row] = one
     return found
@@ -186,6 +189,7 @@ def _scored(
         piece, grid.sizes, shown, got, on & (likely > -2), front, measured > 0
     )
     seen = (weight * (got & ~front)).sum((1, 2))
+    hidden = (weight * front).sum((1, 2))
     held = on | front
     for row in range(len(some)):
         if not shown[row].any():
@@ -197,6 +201,7 @@ def _scored(
             float(paid[row]),
             float(seen[row]),
             float(through[row]),
+            float(hidden[row]),
         )
 
 

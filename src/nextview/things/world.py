@@ -488,7 +488,7 @@ def _weak(mask: Mask) -> Score:
     """Return the score of a stranger with such pixels of the grid, (P,) bool."""
     cells = np.flatnonzero(mask).astype(np.int32)
     gain = np.full(len(cells), STRANGER_GAIN, np.float32)
-    return Score(cells, gain, 0.0, float(len(cells)), 0.0)
+    return Score(cells, gain, 0.0, float(len(cells)), 0.0, 0.0)
 
 
 def _expected(world: World, row: Sequence[Score | None], view: View) -> Index:

@@ -1,0 +1,115 @@
+"""Register a followed thing with a frame, by the score and the steps of scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nextview.scene.body import Body
+from nextview.scene.motion import BodyState
+from nextview.segmentation.view import LEVEL, View
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import Frame
+from nextview.sensing.planes import Plane
+from nextview.things.library import Hypotheses, Library
+from nextview.things.naming import PIXELS_ALIKE
+from nextview.things.register import normal_equations
+from nextview.things.score import SCAN_ERROR, score
+from nextview.types import Float
+
+SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves
+POINTS = 96  # of a thing that are compared
+INDEPENDENT_POINTS = 60.0  # of them, whose errors are not alike
+# error of the expected pose that is left before each step, as a share
+ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
+LONGEST_STEP = 0.5  # radians, or radii
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A thing that is registered with a frame.
+
+    Attributes:
+        state: of its motion.
+        errors: covariance of the measured pose without the prediction, (6, 6); None if no pixel
+            shows the thing.
+        evidence: log-likelihood of the pixels over all motions, against that without the thing
+            (Laplace's approximation).
+        visible: share of the pixels on it that nothing in front hides.
+    """
+
+    state: BodyState
+    errors: Float | None
+    evidence: float
+    visible: float
+
+
+def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
+    """Return the view of a frame without a segmentation.
+
+    Args:
+        frame: with a pose.
+        noise: of its depth.
+        ground: on which things stand; None if it is not known.
+    """
+    none = np.zeros(frame.shape, bool)
+    surface = none
+    if ground is not None:
+        height = np.abs(frame.along(ground.normal, ground.offset))
+        surface = height < LEVEL * noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
+    labels = np.zeros(frame.shape, np.int32)
+    camera = frame.camera_to_world
+    return View(frame, camera, noise, labels, labels, surface, none, frame.depth > 0)
+
+
+def followed(library: Library, view: View, body: Body) -> Followed:
+    """Register a thing with the pixels around it.
+
+    Args:
+        library: with the thing.
+        view: of the frame.
+        body: the thing in its expected pose.
+    """
+    expected = state = body.state
+    information = expected.information
+    radius = float(library.radii[body.thing])
+    away = float(np.linalg.norm(state.centre - view.camera[:3, 3]))
+    error = np.hypot(view.noise.at(away) * away**2, SCAN_ERROR)
+    weight = INDEPENDENT_POINTS / POINTS / error**2
+    motion = np.zeros(6)
+    told = np.zeros((6, 6))
+    for share in ERRORS_LEFT:
+        reach = float(np.hypot(share * body.displaced, 2 * error)) / radius
+        left, right = normal_equations(library, view, _pose(body, state), reach, POINTS)
+        told = weight * left[0]
+        change = np.linalg.solve(
+            told + information, weight * right[0] - information @ motion
+        )
+        longest = np.abs(change / np.repeat([1.0, radius], 3)).max()
+        state = state.displaced(change * min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP)))
+        motion = expected.motion_to(state)
+
+    (found,) = score(library, view, _pose(body, state))
+    if found is None or found.seen + found.hidden == 0:
+        return Followed(expected, None, 0.0, 0.0)
+    visible = found.seen / (found.seen + found.hidden)
+    if found.seen == 0:
+        return Followed(expected, None, 0.0, visible)
+    _, volume = np.linalg.slogdet(np.eye(6) + expected.pose_covariance @ told)
+    evidence = found.total / PIXELS_ALIKE
+    evidence -= 0.5 * float(motion @ information @ motion) + 0.5 * float(volume)
+    anywhere = np.diag(np.repeat([1.0, 1 / radius**2], 3))
+    return Followed(
+        expected.measured(motion, np.linalg.inv(told + information)),
+        np.linalg.inv(told + anywhere),
+        evidence,
+        visible,
+    )
+
+
+def _pose(body: Body, state: BodyState) -> Hypotheses:
+    """Return a thing in some state."""
+    return Hypotheses.of(
+        np.array([body.thing]), state.rotation[None], state.centre[None]
+    )
