@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from factories import pose_at
 from labelled_worlds import FLOOR, LabelledCamera
+from nextview.things.depth_view import MetricImage
+from nextview.things.stability import is_stable
 from scipy.spatial.transform import Rotation
 from test_verification import mesh_of, verifier_of
 
 from nextview.sensing import ObservedObject
-from nextview.things.depth_view import MetricImage
-from nextview.things.stability import is_stable
 from nextview_lab.worlds.worlds import BACKGROUND, slab
 
 SIZE = (0.16, 0.06, 0.04)

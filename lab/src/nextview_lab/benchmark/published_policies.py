@@ -156,7 +156,7 @@ def _simulated(
     depth = images.depth[:, truths]
     if rng is None:
         return depth
-    deviation = np.sqrt(depth_variance(images, outlook.sensor, outlook.pixels))
+    deviation = np.sqrt(depth_variance(images, outlook.sensor, outlook.model))
     noise = rng.standard_normal(depth.shape, np.float32)
     return depth + noise * deviation[:, truths]
 
@@ -169,9 +169,9 @@ def _entropies(outlook: Outlook, images: HypothesisImages, seen: Float32) -> Flo
         images: the hypotheses as each view would show them.
         seen: simulated images, see ``_simulated``.
     """
-    weights = outlook.weights
-    weight = weights.geometry / (1 + weights.correlation * outlook.taken)
-    variance = depth_variance(images, outlook.sensor, outlook.pixels)
+    model = outlook.model
+    weight = model.geometry / (1 + model.correlation * outlook.taken)
+    variance = depth_variance(images, outlook.sensor, outlook.model)
     log_belief = np.log(outlook.hypotheses.belief)
 
     scores = np.empty((*seen.shape[:2], len(log_belief)))
@@ -181,7 +181,7 @@ def _entropies(outlook: Outlook, images: HypothesisImages, seen: Float32) -> Flo
             images.depth[:, row, None],
             variance[:, row, None],
             images.behind[:, None],
-            outlook.pixels.outlier,
+            outlook.model.outlier,
         )
         scores[..., row] = log_belief[row] + weight * mean
 

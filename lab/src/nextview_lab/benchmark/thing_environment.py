@@ -15,17 +15,17 @@ from nextview.errors import DatasetError
 from nextview.geometry.mesh import UNITS
 from nextview.policies.learned_tables import cells_from
 from nextview.teaching.thing_sources import find_things
-from nextview.things.leading import MOST_LEADING
-from nextview.things.taught import TaughtThings
+from nextview.things.expected_model import MOST_LEADING
 from nextview.types import Float, Index
 from nextview_lab.benchmark.environments import Rules, ViewsEnv
+from nextview_lab.benchmark.known_things import things_of
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     Occlusion,
     Setting,
     ThingEpisode,
 )
-from nextview_lab.benchmark.thing_runs import opened, scan_of
+from nextview_lab.benchmark.thing_runs import scan_of
 from nextview_lab.extras import extras
 from nextview_lab.training.rollout import value_of
 
@@ -80,7 +80,7 @@ class RecogniseThingsEnv(ViewsEnv):
         """
         super().__init__(EPISODE_SPHERE, Rules(**rules))
         self.draws = whole(draws, "the number of draws", 1)
-        self.things: TaughtThings = opened(models)
+        self.things = things_of(models, None)
         files = {thing.name: thing.path for thing in find_things(Path(scans)).things}
         missing = [name for name in self.things.names if name not in files]
         if missing:

@@ -28,6 +28,7 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
+from nextview.recognition.protocol import log_evidence_of_views
 from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
@@ -35,10 +36,8 @@ from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_views import Outlook
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
-from nextview.things.taught import TaughtThings
-from nextview.things.verifier import Verified
 from nextview.types import Float
-from nextview_lab.benchmark.own_things import OwnAnswer, OwnThings
+from nextview_lab.benchmark.known_things import Answer, KnownThings
 from nextview_lab.benchmark.pose_recall import add_s
 
 Occlusion = Literal["none", "half", "heavy"]
@@ -80,7 +79,7 @@ class ThingEpisode:
 
     def __init__(
         self,
-        things: TaughtThings | OwnThings,
+        things: KnownThings,
         mesh: Callable[[], Mesh],
         thing: int,
         draw: int,
@@ -105,11 +104,11 @@ class ThingEpisode:
         self._seed = (setting.seed, thing, draw)
         self._setting = setting
         self._kept = KeptArrays(folder)
-        own = isinstance(things, OwnThings)
+        own = things.library is None
         self._answers = KeptArrays(None) if own else self._kept
         self._stage: _Stage | None = None
         self._views: dict[int, Observation] = {}
-        self._verified: dict[frozenset[int], tuple[Verified | OwnAnswer, float]] = {}
+        self._verified: dict[frozenset[int], tuple[Answer, float]] = {}
         if "start" not in self._kept:
             self._kept["start"] = np.array(self._first_view())
         self.start = int(self._kept["start"])
@@ -161,14 +160,12 @@ class ThingEpisode:
         """Return the views in which the thing is visible."""
         return [view for view in views if self.observation(view).seen]
 
-    def verified(self, views: Sequence[int]) -> tuple[Verified | OwnAnswer, float]:
+    def verified(self, views: Sequence[int]) -> tuple[Answer, float]:
         """Return the verification of some views, and its CPU time in seconds."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
             name = "-".join(map(str, sorted(used)))
-            own = isinstance(self.things, OwnThings)
-            answer: Any = OwnAnswer if own else Verified
-            needed = {f.name: f"{name}.{f.name}" for f in fields(answer)}
+            needed = {f.name: f"{name}.{f.name}" for f in fields(Answer)}
             # The cache of an earlier version is incomplete and outdated.
             if not all(
                 one in self._answers for one in (*needed.values(), f"{name}.seconds")
@@ -176,7 +173,7 @@ class ThingEpisode:
                 self._verify(name, sorted(used))
             parts = {part: self._answers[one] for part, one in needed.items()}
             self._verified[used] = (
-                answer(**parts),
+                Answer(**parts),
                 float(self._answers[f"{name}.seconds"]),
             )
         return self._verified[used]
@@ -198,14 +195,9 @@ class ThingEpisode:
         return float(self.verified(views)[0].belief[self.thing])
 
     def p_value(self, views: Sequence[int]) -> float | None:
-        """Return the share of known things that are explained as badly.
-
-        See ``TaughtThings.p_value``.
-        """
-        observations = [self.observation(view) for view in sorted(self.seen(views))]
-        things: Any = self.things
-        found: float | None = things.p_value(observations, self.verified(views)[0])
-        return found
+        """Return the value of the test for unknown things; None if there is none."""
+        value = float(self.verified(views)[0].p_value)
+        return None if np.isnan(value) else value
 
     def pose_error(self, views: Sequence[int]) -> float | None:
         """Return the pose error (ADD-S) in the last view, millimetres.
@@ -236,8 +228,9 @@ class ThingEpisode:
     @cached_property
     def _surface(self) -> Surface:
         """Return the surface of the thing in the memory; without a memory, that of its file."""
-        if isinstance(self.things, TaughtThings):
-            return self.things.verifier.caster.surfaces[self.thing]
+        taught = self.things.surface(self.thing)
+        if taught is not None:
+            return taught
         return Surface.from_mesh(self._mesh(), self.things.names[self.thing])
 
     def state(self, views: Sequence[int], needs: Sequence[str]) -> EpisodeState:
@@ -255,9 +248,8 @@ class ThingEpisode:
         joint = None
         if "joint" in needs:
             assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
-            assert isinstance(self.things, TaughtThings)
             views_seen = [self.observation(view) for view in seen]
-            total = self.things.log_evidence(views_seen).sum(0)
+            total = log_evidence_of_views(recogniser, views_seen).sum(0)
             here = EPISODE_SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
 
@@ -272,13 +264,9 @@ class ThingEpisode:
             outlook=[self.outlook(views)] if "outlook" in needs else None,
         )
 
-    def outlook(self, views: Sequence[int]) -> Outlook:
+    def outlook(self, views: Sequence[int]) -> Outlook | None:
         """Return the prediction of further views for the choice of the next view."""
-        observations = [self.observation(view) for view in self.seen(views)]
-        found, _ = self.verified(views)
-        assert isinstance(self.things, TaughtThings)  # see ``policies_of``
-        assert isinstance(found, Verified)
-        return Outlook.of(self.things.verifier, found, observations)
+        return self.things.outlook([self.observation(view) for view in self.seen(views)])
 
 
 @dataclass(frozen=True, eq=False)

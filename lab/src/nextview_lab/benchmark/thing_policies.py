@@ -12,9 +12,8 @@ from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy
-from nextview.things.taught import TaughtThings
 from nextview.types import Index
-from nextview_lab.benchmark.own_things import OwnThings
+from nextview_lab.benchmark.known_things import KnownThings
 from nextview_lab.benchmark.published_policies import (
     PredictedEntropy,
     SampledInformation,
@@ -136,7 +135,7 @@ def rules_of(sphere: Viewpoints, grid: ViewSphere) -> dict[str, Callable[[], Pol
 
 def policies_of(
     names: tuple[str, ...],
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
 ) -> dict[str, Callable[[ThingEpisode], Policy]]:
     """Return functions that create the named policies for an episode.
 
@@ -176,11 +175,11 @@ def policies_of(
 def _refuse_needs(
     name: str,
     needs: tuple[str, ...],
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
 ) -> None:
     """Reject a policy that needs the hypotheses of a memory if there is none; UsageError."""
     lacking = sorted({"joint", "outlook"} & set(needs))
-    if lacking and isinstance(things, OwnThings):
+    if lacking and things.library is None:
         raise UsageError(
             f"the policy {name} goes by the hypotheses of a memory of taught things, which"
             f" recogniser {things.recogniser.name} does not have; leave it out"

@@ -6,7 +6,7 @@ Workers import this module, so it imports neither pandas nor matplotlib.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -18,13 +18,10 @@ from nextview.checks import number, whole
 from nextview.errors import DatasetError, PolicyError, UsageError, option
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
-from nextview.recognition.model_card import find_models
 from nextview.simulation.sensor import sensor_named
-from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
-from nextview.things.taught import TaughtThings
 from nextview_lab.benchmark.jobs import Job, Settings
-from nextview_lab.benchmark.own_things import OwnThings, own_things
+from nextview_lab.benchmark.known_things import KnownThings, things_of
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     Occlusion,
@@ -210,32 +207,6 @@ class ThingJob(Job):
     draw: int
 
 
-@lru_cache(maxsize=1)
-def opened(models: str) -> TaughtThings:
-    """Open the things with known geometry of a memory.
-
-    Raises:
-        UsageError: there are none.
-    """
-    recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
-    things = TaughtThings.of(recogniser)
-    if things is None:
-        raise UsageError(
-            f"{models}: knows the geometry of no thing; teach it with --unit"
-        )
-    return things
-
-
-def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
-    """Open the things of your own recogniser, or else of a memory.
-
-    Args:
-        models: folder or name of the memory.
-        recogniser: MODULE:NAME of your own; None for the memory.
-    """
-    return opened(models) if recogniser is None else own_things(recogniser)
-
-
 def work(job: ThingJob) -> None:
     """Run the policies of a job, and write the results."""
     how: ThingSettings = job.settings
@@ -259,7 +230,7 @@ def work(job: ThingJob) -> None:
 
 
 def scan_of(
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
     thing: int,
     file: Path,
     unit: str,
@@ -277,9 +248,9 @@ def scan_of(
             not be comparable.
     """
     mesh = load_mesh(file, unit=unit)
-    if isinstance(things, OwnThings):
+    surface = things.surface(thing)
+    if surface is None:
         return mesh
-    surface = things.verifier.caster.surfaces[thing]
     if _apart(mesh, surface) <= SCAN_APART:
         return mesh
 

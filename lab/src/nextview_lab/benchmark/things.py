@@ -19,10 +19,9 @@ from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.surface import Surface
-from nextview.things.taught import TaughtThings
 from nextview_lab.benchmark.confusable import how_alike
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
-from nextview_lab.benchmark.own_things import OwnThings
+from nextview_lab.benchmark.known_things import KnownThings
 from nextview_lab.benchmark.results import write_compared
 from nextview_lab.benchmark.thing_policies import (
     BEST_BLIND,
@@ -121,10 +120,10 @@ def benchmark_things(
 
 def _allowed(
     settings: ThingSettings,
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
 ) -> tuple[str, ...]:
     """Return the included policies: the reference, and the requested ones."""
-    own = isinstance(things, OwnThings)
+    own = things.library is None
     all_of_them = [name for name in THING_POLICIES if not (own and name in OF_MEMORIES)]
     first = [] if settings.reference == BEST_BLIND else [settings.reference]
     return tuple(dict.fromkeys([*first, *(settings.policies or all_of_them)]))
@@ -133,14 +132,14 @@ def _allowed(
 def _replayed(
     jobs: list[ThingJob],
     settings: ThingSettings,
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
     workers: int | None,
     track: TrackProgress,
 ) -> list[EpisodeRuns]:
     """Return the runs of all episodes; missing ones are computed."""
     made = {
         "memory_sha256": ""
-        if isinstance(things, OwnThings)
+        if things.library is None
         else things.recogniser.card.sha256,
         "recogniser": settings.recogniser or "",
         "sensor": settings.sensor,
@@ -184,13 +183,13 @@ def best_blind(
 
 
 def _surfaces(
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
     scans: dict[str, Path],
     settings: ThingSettings,
 ) -> list[Surface]:
     """Return the surfaces of all taught things, or else of the scans."""
-    if isinstance(things, TaughtThings):
-        return list(things.verifier.caster.surfaces)
+    if things.library is not None:
+        return list(things.library.caster.surfaces)
     return [
         Surface.from_mesh(load_mesh(scans[name], unit=settings.unit), name)
         for name in things.names
@@ -222,7 +221,7 @@ def _jobs(
     scans: dict[str, Path],
     out: Path,
     settings: ThingSettings,
-    things: TaughtThings | OwnThings,
+    things: KnownThings,
 ) -> list[ThingJob]:
     """Return all episodes of a run."""
     return [

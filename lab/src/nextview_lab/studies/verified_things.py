@@ -36,6 +36,10 @@ from typing import Literal
 import numpy as np
 import trimesh
 import tyro
+from nextview.things.taught import TaughtThings
+from nextview.things.unknown import KnownResiduals
+from nextview.things.verifier import Verified
+from nextview.things.weighing import EvidenceWeights
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -50,10 +54,6 @@ from nextview.recognition.model_card import Symmetry
 from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
-from nextview.things.taught import TaughtThings
-from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import Verified
-from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float
 from nextview_lab.studies.shared import markdown, progress, scans_of
 
