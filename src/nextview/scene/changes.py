@@ -28,7 +28,14 @@ from nextview.things.world import (
 )
 from nextview.types import Float, Index
 
-ALONE = (0.5, 0.3, 0.2, 0.12, 0.06, 0.03)  # reaches of the registration in one view, radii
+ALONE = (
+    0.5,
+    0.3,
+    0.2,
+    0.12,
+    0.06,
+    0.03,
+)  # reaches of the registration in one view, radii
 MOST_GONE = 0.7  # share of a stranger that is seen through when it is gone
 BEHIND = 0.015  # metres behind a stranger, from which on it is seen through
 
@@ -117,7 +124,9 @@ def _compared(
     told = Changes(world, view, tuple(moved), tuple(gone), tuple(stand), wrong)
     if wrong or not changed:
         return _without_gone_strangers(told)
-    return _without_gone_strangers(replace(told, world=_after(world, told, alone, new_poses)))
+    return _without_gone_strangers(
+        replace(told, world=_after(world, told, alone, new_poses))
+    )
 
 
 def _after(
@@ -128,11 +137,11 @@ def _after(
     dropped: set[int] = set()
     for one in left:
         dropped |= set(world.rivals(one.row).tolist())
-    dropped -= {
-        one.row for one in world.things if one.row >= 0 and one not in left
-    }
+    dropped -= {one.row for one in world.things if one.row >= 0 and one not in left}
     world = _forgotten(world, [one.number for one in left])
-    kept = np.array([row for row in range(len(world.scores)) if row not in dropped], np.int64)
+    kept = np.array(
+        [row for row in range(len(world.scores)) if row not in dropped], np.int64
+    )
     world = world.with_rows(kept)
     some = alone[np.array(list(new_poses.values()), np.int64)]
     nothing = ((None,) * len(world.views),) * len(some)
@@ -180,11 +189,14 @@ def _without_gone_strangers(told: Changes) -> Changes:
     gone = [
         one
         for one in world.things
-        if one.row < 0 and _seen_through(world_points(world, one.scores), view) > MOST_GONE
+        if one.row < 0
+        and _seen_through(world_points(world, one.scores), view) > MOST_GONE
     ]
     if not gone:
         return told
-    kept = [row for row in world.strangers if not any(row is one.scores for one in gone)]
+    kept = [
+        row for row in world.strangers if not any(row is one.scores for one in gone)
+    ]
     world = _forgotten(world, [one.number for one in gone])
     things = tuple(one for one in world.things if one not in gone)
     world = replace(world, strangers=tuple(kept), things=things)

@@ -57,7 +57,9 @@ def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
     surface = none
     if ground is not None:
         height = np.abs(frame.along(ground.normal, ground.offset))
-        surface = height < LEVEL * noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
+        surface = (
+            height < LEVEL * noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
+        )
     labels = np.zeros(frame.shape, np.int32)
     camera = frame.camera_to_world
     return View(frame, camera, noise, labels, labels, surface, none, frame.depth > 0)
@@ -87,7 +89,9 @@ def followed(library: Library, view: View, body: Body) -> Followed:
             told + information, weight * right[0] - information @ motion
         )
         longest = np.abs(change / np.repeat([1.0, radius], 3)).max()
-        state = state.displaced(change * min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP)))
+        state = state.displaced(
+            change * min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
+        )
         motion = expected.motion_to(state)
 
     (found,) = score(library, view, _pose(body, state))

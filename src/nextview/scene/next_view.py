@@ -66,7 +66,9 @@ class TableGround:
     floor: float
 
     @classmethod
-    def of(cls, tops: Sequence[TableTop], objects: Sequence[SceneObject]) -> TableGround:
+    def of(
+        cls, tops: Sequence[TableTop], objects: Sequence[SceneObject]
+    ) -> TableGround:
         """Lay a grid over the visible part of the plane.
 
         Args:

@@ -73,7 +73,7 @@ class SceneObject:
 
     @property
     def pose(self) -> Float | None:
-        """Pose of the scan in the world, scan-to-world, (4, 4), metres; None for an unknown object."""
+        """Pose of the scan in the world, (4, 4), metres; None for an unknown object."""
         return self.candidates[0].pose if self.candidates else None
 
     @property
@@ -208,7 +208,9 @@ def touching(world: World) -> set[tuple[int, int]]:
                 (np.s_[:-gap], np.s_[gap:]),
             ):
                 beside = (number[one] != number[two]) & (number[one] > 0)
-                beside &= (number[two] > 0) & (np.abs(depth[one] - depth[two]) < TOUCHING)
+                beside &= (number[two] > 0) & (
+                    np.abs(depth[one] - depth[two]) < TOUCHING
+                )
                 low = np.minimum(number[one][beside], number[two][beside])
                 high = np.maximum(number[one][beside], number[two][beside])
                 found |= set(zip(low.tolist(), high.tolist(), strict=True))

@@ -61,6 +61,7 @@ from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.things.library import Library
 from nextview.things.recogniser import VerifiedRecogniser
+from nextview.things.several import SeveralRecognisers
 from nextview.things.world import Thing, World
 from nextview.types import Float
 
@@ -653,7 +654,7 @@ def _library_of(system: System) -> Library:
         ModelError: it has none.
     """
     recogniser = system.models.recogniser
-    if not isinstance(recogniser, VerifiedRecogniser):
+    if not isinstance(recogniser, VerifiedRecogniser | SeveralRecognisers):
         raise ModelError(
             f"{recogniser.name}: a scene needs things of known geometry, and these models have"
             " none; a session recognises one object by its class"
@@ -716,7 +717,11 @@ def _look(
     return Look(
         True,
         tuple(number for number in new if number not in old),
-        tuple(Move(number, old[number].pose, new[number].pose) for number in moved if number in new and number in old),
+        tuple(
+            Move(number, old[number].pose, new[number].pose)
+            for number in moved
+            if number in new and number in old
+        ),
         tuple(number for number in lost if number not in ended),
         tuple(joined),
         (*state.tops[-1].warnings, *state.remarks),

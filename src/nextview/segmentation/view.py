@@ -207,7 +207,10 @@ class View:
         rows, columns = within(mask)
         size = max(rows.stop - rows.start, columns.stop - columns.start)
         rows, columns = within(mask, round(margin * size))
-        part = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
+        part = (
+            slice(rows.start, rows.stop, step),
+            slice(columns.start, columns.stop, step),
+        )
         depth = self.depth[part]
         own = mask[part] & (depth > 0)
         nearest = ndimage.distance_transform_edt(
@@ -224,7 +227,9 @@ class View:
             hiding |= (depth == 0) & hiding[tuple(measured)]
         every = np.zeros(mask.shape, bool)
         large = np.repeat(np.repeat(hiding, step, 0), step, 1)
-        every[rows, columns] = large[: rows.stop - rows.start, : columns.stop - columns.start]
+        every[rows, columns] = large[
+            : rows.stop - rows.start, : columns.stop - columns.start
+        ]
         return every & ~mask
 
     @cached_property
@@ -242,7 +247,10 @@ class View:
         for mask in _parts(self.pieces, 2 * self.fewest):
             owner = int(np.bincount(self.labels[mask]).argmax())
             whole = self.labels == owner if owner else mask
-            if np.count_nonzero(mask) <= MOST_PARTED * np.count_nonzero(whole) or not owner:
+            if (
+                np.count_nonzero(mask) <= MOST_PARTED * np.count_nonzero(whole)
+                or not owner
+            ):
                 yield Segment(mask, whole & ~mask)
 
     def unions(self) -> Iterator[Segment]:

@@ -201,7 +201,9 @@ def _never(shown: Sequence[Shown]) -> list[NeverConfident]:
     """Things that were never confident and right after all views of a test."""
     found = []
     for thing in sorted({one.thing for one in shown}):
-        own = [one for one in shown if one.thing == thing and one.views == VIEWS_SHOWN[-1]]
+        own = [
+            one for one in shown if one.thing == thing and one.views == VIEWS_SHOWN[-1]
+        ]
         if not own or any(one.confident and one.named == one.truth for one in own):
             continue
         wrong = Counter(one.named for one in own if one.named != one.truth)

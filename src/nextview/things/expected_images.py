@@ -100,9 +100,7 @@ class SeenSurroundings:
         near = np.linalg.norm(points, axis=1) < OBSTACLE_REACH * radius
         near &= cKDTree(own).query(points)[0] > OWN_MARGIN
         seen = (
-            MeasuredDepth(
-                view.depth, to_object @ view.camera, view.frame.intrinsics
-            )
+            MeasuredDepth(view.depth, to_object @ view.camera, view.frame.intrinsics)
             for view in views
         )
         return cls(points[near & (height > SUPPORT_NEAR)], floor, reach, tuple(seen))

@@ -137,7 +137,10 @@ class Hypotheses:
     def __getitem__(self, rows: Index | slice) -> Hypotheses:
         """Return some of them, by indices, mask or slice."""
         return Hypotheses(
-            self.things[rows], self.rotations[rows], self.centres[rows], self.sizes[rows]
+            self.things[rows],
+            self.rotations[rows],
+            self.centres[rows],
+            self.sizes[rows],
         )
 
     def pose(self, row: int, library: Library) -> Float:

@@ -28,7 +28,9 @@ SCORED_OF_ONE = 3
 KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2
 COARSER = 2  # grid on which they are rendered to choose among them
-HIDING_MARGIN = 1.0  # sizes of the segment, within which something may hide a part of it
+HIDING_MARGIN = (
+    1.0  # sizes of the segment, within which something may hide a part of it
+)
 
 
 def propose(
@@ -134,5 +136,7 @@ def matched(
     # number of pixels that the hypothesis would show, and how much of the segment it covers
     side = 2 * np.sqrt(25 / 24) * library.radii[some.things]
     side *= view.frame.pinhole.fx / np.maximum(seen.middle[:, 2], 0.05)
-    covered = seen.fill * side**2 * (match & own).mean(1) / max(1, np.count_nonzero(mask))
+    covered = (
+        seen.fill * side**2 * (match & own).mean(1) / max(1, np.count_nonzero(mask))
+    )
     return np.where(share > 0, share * np.minimum(1, covered), share)

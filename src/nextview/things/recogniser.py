@@ -159,8 +159,12 @@ class VerifiedRecogniser(TaughtRecogniser):
         others = np.where(np.arange(classes) == best, 0, belief)
         rest = others.sum() or 1.0
         right = min(found.right, belief[best])
-        belief = np.where(np.arange(classes) == best, right, others * (1 - right) / rest)
-        moves = sum(view.frame.camera_to_world is not view.camera for view in world.views)
+        belief = np.where(
+            np.arange(classes) == best, right, others * (1 - right) / rest
+        )
+        moves = sum(
+            view.frame.camera_to_world is not view.camera for view in world.views
+        )
         return JointBelief(
             belief / belief.sum(),
             poses=pose_candidates(world, found, self.labels),

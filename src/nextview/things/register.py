@@ -91,7 +91,9 @@ class Projected:
     fill: Float32
 
     @classmethod
-    def of(cls, library: Library, view: View, some: Hypotheses, count: int) -> Projected:
+    def of(
+        cls, library: Library, view: View, some: Hypotheses, count: int
+    ) -> Projected:
         """Project points of hypotheses.
 
         Args:
@@ -162,7 +164,9 @@ def register(
     return some
 
 
-def camera_error(library: Library, view: View, some: Hypotheses, count: int = 96) -> View:
+def camera_error(
+    library: Library, view: View, some: Hypotheses, count: int = 96
+) -> View:
     """Correct the pose of a camera by things that are known to stand where they are.
 
     Args:

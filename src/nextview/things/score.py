@@ -21,7 +21,9 @@ from nextview.types import Float, Float32, Index, Mask
 
 PIXEL_GAIN = 1.5  # nats, of a pixel that is measured exactly where it should be
 OUTLIER = -4.0  # nats, of a pixel that is not measured where it should be
-NOT_MEASURED = -0.5  # nats, of a pixel without a measurement on a surface that faces the camera
+NOT_MEASURED = (
+    -0.5
+)  # nats, of a pixel without a measurement on a surface that faces the camera
 LEFT_OVER = -1.5  # nats, of a pixel of the same piece that is not explained
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
 # error of the surface of a thing: of its scan, metres, and of its pose, radii
@@ -138,8 +140,9 @@ def _windows(
         rows = order[-most:]
         order = order[:-most]
         height, width = size[rows].max(0).tolist()
-        yield np.sort(rows), _Window(
-            first[np.sort(rows), 0], first[np.sort(rows), 1], height, width
+        yield (
+            np.sort(rows),
+            _Window(first[np.sort(rows), 0], first[np.sort(rows), 1], height, width),
         )
 
 

@@ -18,8 +18,10 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_of
 from nextview.recognition.protocol import JointBelief, least_p_value
+from nextview.things.library import Library
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
+from nextview.things.surface import Surface
 from nextview.types import Floats
 
 EXPLAINED = 0.02  # p-value from which a scan explains the views
@@ -71,10 +73,6 @@ class SeveralRecognisers:
                 f"{together}: several collections are memories of things and at most one network"
             )
 
-        for name, memory in memories.items():
-            if memory.things.residuals is None:
-                what = "does not say how well its things are usually explained"
-                raise ModelError(f"{name}: {what}; teach them again")
         self.memories = tuple(memories.values())
         self.network = next(iter(networks.values()), None)
         self._collections: dict[str, NetworkRecogniser] = {**memories, **networks}
@@ -107,6 +105,22 @@ class SeveralRecognisers:
     def least_p_value(self) -> float:
         """Largest of the smallest p-values of the collections: each of them may have to tell."""
         return max(least_p_value(member) for member in self.members)
+
+    @cached_property
+    def library(self) -> Library:
+        """The things of known geometry of all collections, by their names in ``classes``."""
+        surfaces: list[Surface] = []
+        symmetries: dict[str, Any] = {}
+        first = 0
+        for memory in self.memories:
+            for surface, label in zip(
+                memory.library.caster.surfaces, memory.labels, strict=True
+            ):
+                name = self.classes[first + int(label)]
+                symmetries[name] = memory.library.symmetries.get(surface.name)
+                surfaces.append(replace(surface, name=name))
+            first += len(memory.classes)
+        return Library(surfaces, symmetries)
 
     @cached_property
     def in_any_orientation(self) -> SeveralRecognisers:

@@ -28,7 +28,9 @@ def view_of(observation: Observation) -> View:
         pose, intrinsics, support = scene.pose, scene.intrinsics, scene.support
     pose = pose.copy()
     pose[:3, 3] *= radius
-    metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32) * np.float32(radius)
+    metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32) * np.float32(
+        radius
+    )
     frame = Frame(metres, intrinsics, pose, pixel_centre=0.5)
     height = np.full(depth.shape, NOT_LEVEL, np.float32)
     if support is not None:

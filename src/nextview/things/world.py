@@ -23,7 +23,9 @@ from nextview.types import Float, Float32, Index, Mask
 
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
 STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
-EXPLAINED = 0.6  # share of a segment that is explained, from which on it is not searched
+EXPLAINED = (
+    0.6  # share of a segment that is explained, from which on it is not searched
+)
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
@@ -31,7 +33,9 @@ CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explain
 MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
 LEAST_OWN = 0.5  # share of a stranger that nothing else explains, at least
 MOVED = 60.0  # nats that another pose has to explain better, for a thing to have moved
-MOVED_SHARE = 0.3  # the same of what the thing explains: errors of scan and pose are alike
+MOVED_SHARE = (
+    0.3  # the same of what the thing explains: errors of scan and pose are alike
+)
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 
@@ -186,9 +190,7 @@ class World:
             if gains[worst] > NEW_OBJECT:
                 break
             kept = [row for row in kept if row != worst]
-        things = [
-            Thing(0, max(row, -1), rows[row], gains[row]) for row in kept
-        ]
+        things = [Thing(0, max(row, -1), rows[row], gains[row]) for row in kept]
         return replace(self, things=tuple(things))
 
     def numbered(self) -> World:
@@ -326,7 +328,9 @@ def corrected(world: World, view: View) -> View:
         world: before the view.
         view: the view.
     """
-    known = [one.row for one in world.things if one.row >= 0 and one.share > CLEAR_SHARE]
+    known = [
+        one.row for one in world.things if one.row >= 0 and one.share > CLEAR_SHARE
+    ]
     if not known:
         return view
     rows = np.array(known)
@@ -334,7 +338,9 @@ def corrected(world: World, view: View) -> View:
     groups = [rows, *([row] for row in rows)] if len(rows) > 1 else [rows]
     tried = [view]
     for group in groups:
-        tried.append(camera_error(world.library, view, world.hypotheses[np.array(group)]))
+        tried.append(
+            camera_error(world.library, view, world.hypotheses[np.array(group)])
+        )
     usual = [_usual(world.scores[row]) for row in rows]
     values = []
     for one in tried:
@@ -374,9 +380,7 @@ def _since_it_stands(row: Sequence[Score | None]) -> tuple[Score | None, ...]:
     return tuple(row)
 
 
-def _greedy(
-    rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]
-) -> list[int]:
+def _greedy(rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]) -> list[int]:
     """Choose rows, the one that adds most to what is explained first.
 
     Args:

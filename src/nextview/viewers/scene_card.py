@@ -135,9 +135,7 @@ def _object_card(thing: SceneObject) -> str:
     if thing.touches:
         where += f", touches {', '.join(str(number) for number in thing.touches)}"
 
-    beliefs = sorted(thing.beliefs.items(), key=lambda pair: -pair[1])[
-        :PAGE_CANDIDATES
-    ]
+    beliefs = sorted(thing.beliefs.items(), key=lambda pair: -pair[1])[:PAGE_CANDIDATES]
     rows = "".join(
         f'<tr><td>{escape(name.replace("_", " "))}</td><td><div class="bar">'
         f'<b style="width:{100 * belief:.1f}%;background:{colour}"></b></div></td>'

@@ -266,7 +266,9 @@ class ThingEpisode:
 
     def outlook(self, views: Sequence[int]) -> Outlook | None:
         """Return the prediction of further views for the choice of the next view."""
-        return self.things.outlook([self.observation(view) for view in self.seen(views)])
+        return self.things.outlook(
+            [self.observation(view) for view in self.seen(views)]
+        )
 
 
 @dataclass(frozen=True, eq=False)
