@@ -24,7 +24,7 @@ from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.teaching import learn as learn_module
-from nextview.teaching import verification_fit
+from nextview.teaching import shown_views
 from nextview.teaching.learn import learn
 from nextview.things import view_templates
 from nextview.things.memory import open_memory
@@ -36,9 +36,7 @@ LONG = (
     "test_poses.py",
     "test_several_cameras.py",
     "test_learn.py",
-    "test_verification_fit.py",
     "test_pages.py",
-    "test_verification.py",
     "test_kills.py",
     "test_workflow.py",
 )
@@ -84,9 +82,9 @@ def few_episodes():
     """Let ``learn`` test its things in fewer episodes, which take most of its time; what it
     otherwise tests at least is the value.
     """
-    usual = verification_fit.ENOUGH_EPISODES
+    usual = shown_views.ENOUGH_TESTS
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(verification_fit, "ENOUGH_EPISODES", 6)
+        patched.setattr(shown_views, "ENOUGH_TESTS", 6)
         yield usual
 
 

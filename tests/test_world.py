@@ -1,0 +1,127 @@
+"""The set of things that explains some views: names, numbers, strangers, changes, cameras."""
+
+import numpy as np
+import pytest
+from drawn_views import camera, drawn, library, standing
+
+from nextview.scene.changes import changes
+from nextview.things.naming import CONFIDENT, named
+from nextview.things.world import World, corrected
+
+
+@pytest.fixture(scope="module")
+def things():
+    return library()
+
+
+def after(world, view, camera_stands=False):
+    """A world after a view, and what has changed."""
+    told = changes(world, view, camera_stands)
+    everything = np.ones(len(world.library), bool)
+    return told.world.with_view(told.view).searched(everything).numbered(), told
+
+
+def names(world):
+    """Names of the things, by their numbers; None for a stranger."""
+    return {
+        one.number: None
+        if one.row < 0
+        else world.library.names[int(world.hypotheses.things[one.row])]
+        for one in world.things
+    }
+
+
+@pytest.fixture(scope="module")
+def table(things):
+    """A box and a can beside each other, and the world after one view."""
+    box, _, can, _ = things.caster.surfaces
+    placed = [(box, standing(box, -0.08, 0, 25)), (can, standing(can, 0.08, 0.02))]
+    world, _ = after(World(things), drawn(placed, camera(20)))
+    return placed, world
+
+
+def test_things_are_named_and_posed_after_one_view(table, things):
+    placed, world = table
+    assert sorted(names(world).values()) == ["box", "can"]
+    for one in world.things:
+        pose = world.hypotheses.pose(one.row, things)
+        name = names(world)[one.number]
+        true = next(pose for surface, pose in placed if surface.name == name)
+        assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.15
+        middle = world.hypotheses.centres[one.row]
+        centre = things.centres[world.hypotheses.things[one.row]]
+        assert np.linalg.norm(middle - true[:3, :3] @ centre - true[:3, 3]) < 0.005
+
+
+def test_a_second_view_keeps_the_numbers(table):
+    placed, world = table
+    later, told = after(world, drawn(placed, camera(70)))
+    assert names(later) == names(world)
+    assert set(told.stand) == set(names(world))
+    assert not told.moved
+    assert not told.gone
+
+
+def test_a_thing_that_was_taken_away_is_gone(table):
+    placed, world = table
+    number = next(key for key, name in names(world).items() if name == "can")
+    later, told = after(world, drawn(placed[:1], camera(70)))
+    assert [one.number for one in told.gone] == [number]
+    assert list(names(later).values()) == ["box"]
+
+
+@pytest.mark.parametrize("metres", [0.03, 0.1])
+def test_a_thing_that_was_moved_keeps_its_number(table, things, metres):
+    (first, can), world = table
+    there = (can[0], can[1] + [[0, 0, 0, metres], *np.zeros((3, 4))])
+    number = next(key for key, name in names(world).items() if name == "can")
+    later, told = after(world, drawn([first, there], camera(70)), camera_stands=True)
+    assert number in told.moved or number in [one.number for one in told.gone]
+    middles = {
+        names(later)[one.number]: later.hypotheses.centres[one.row]
+        for one in later.things
+    }
+    assert abs(middles["can"][0] - 0.08 - metres) < 0.005
+    assert np.linalg.norm(middles["box"][:2] - first[1][:2, 3]) < 0.005
+
+
+def test_the_error_of_a_camera_is_told_from_the_things(table):
+    placed, world = table
+    true = camera(70)
+    told = true.copy()
+    told[:3, 3] += [0.004, -0.003, 0.002]
+    view = corrected(world, drawn(placed, true, told))
+    before = np.linalg.norm(told[:3, 3] - true[:3, 3])
+    assert np.linalg.norm(view.camera[:3, 3] - true[:3, 3]) < before / 2
+
+
+def test_a_thing_that_nobody_taught_has_no_confident_name(things):
+    box = things.caster.surfaces[0]
+    slab = things.caster.surfaces[1]
+    few = library_without(things, "box")
+    placed = [(box, standing(box, -0.08, 0, 25)), (slab, standing(slab, 0.1, 0))]
+    world, _ = after(World(few), drawn(placed, camera(20)))
+    sure = [
+        one
+        for one in world.things
+        if one.row >= 0 and named(world, one, ()).right >= CONFIDENT
+    ]
+    assert [names(world)[one.number] for one in sure] == ["slab"]
+    assert abs(world.hypotheses.centres[sure[0].row][0] - 0.1) < 0.005
+
+
+def library_without(things, name):
+    """The library without a thing, and without those that look like it."""
+    from nextview.things.library import Library
+
+    kept = [one for one in things.caster.surfaces if name not in one.name]
+    return Library(kept)
+
+
+def test_a_pixel_counts_once(table):
+    placed, world = table
+    owners = world.owners[0]
+    for one in world.things:
+        found = one.scores[0]
+        own = found.cells[found.gain > 0.5]
+        assert np.mean(owners[own] == one.number) > 0.95
