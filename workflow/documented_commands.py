@@ -112,6 +112,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"look_alikes|benchmark things (YCB|HALF_SCANS)|verified_things": (
         "needs the YCB scans, and minutes"
     ),
+    r"thesis\.train_grid": "trains for hours",
     r"SceneLayout\.load": (
         "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
     ),
@@ -126,6 +127,7 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
+    r"thesis\.(measure_study|example_maps)": "nextview-lab[benchmark]",
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
     r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
     r"explorer_pictures": "nextview[browser]",
@@ -149,6 +151,7 @@ SMALL = {  # options that make a command quick
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
     "python examples/bin_picking.py": "--parts 1",
+    "python -m nextview_lab.thesis.measure": "--workers 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--scenes \d+": "--scenes 4",
@@ -477,8 +480,12 @@ def make_rig(folder: Path) -> None:
 FILES = {
     "mine.py": (
         """
+from nextview_lab.data.measures import Measure
+
 def clutter(view):
     return float(view.seen.mean())
+
+uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
 """
     ),
     "spread.py": (
@@ -782,6 +789,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
+    "measures.png": "needs hours: nextview_lab.thesis.measure_study",
     "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 

@@ -41,7 +41,7 @@ from nextview_lab.thesis.surfaces import FaceCamera, Surface, view_of
 SPHERE = ViewSphere.named("40")
 TWELVE = ViewSphere.named("12")
 DEPTH = [name for name, found in MEASURES.items() if found.needs == "depth"]
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "samples"
 SEEN_FROM_3 = (1 - 1 / 3) / 2
 """Share of a sphere that is seen from three radii."""

@@ -270,13 +270,9 @@ def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=head)
 
 
-def markdown(readable: pd.DataFrame) -> str:
+def markdown(wide: pd.DataFrame) -> str:
     """The table as text."""
-    lines: list[list[str]] = [
-        list(readable),
-        ["---"] * readable.shape[1],
-        *readable.to_numpy().tolist(),
-    ]
+    lines = [map(str, wide.columns), ["---"] * wide.shape[1], *wide.to_numpy().tolist()]
     said = ["| " + " | ".join(cells) + " |" for cells in lines]
     return "\n".join([*said, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
 

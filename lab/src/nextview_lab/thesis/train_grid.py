@@ -22,12 +22,10 @@ if __name__ == "__main__":
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from nextview.cli.exit_status import orderly_end
-from nextview.cli.progress import track as progress
-from nextview.data.progress import TrackProgress, silently
-from nextview.errors import ResultsError, UsageError
+from nextview.cli.progress import track
+from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.session.style import (
     ACCENT,
@@ -41,112 +39,16 @@ from nextview_lab.benchmark.published import published_recognisers, read_rows
 from nextview_lab.data.store import ViewStore
 from nextview_lab.thesis.training_curves import draw_curves
 from nextview_lab.training.export import run_network
-from nextview_lab.training.inputs import PackedViews, load_inputs
+from nextview_lab.training.inputs import load_inputs
 from nextview_lab.training.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
 from nextview_lab.training.recogniser_training import train_recogniser
 from nextview_lab.training.runs import is_first
 
 with extras():
     import torch
-    from torch import nn
 
 TABLE = "grid.csv"
 FIGURE = "grid.png"
-
-
-def train_grid(
-    store: Path,
-    out: Path,
-    recipe: RecogniserRecipe = THESIS_RECOGNISER,
-    *,
-    depths: Sequence[int] = (),
-    batches: Sequence[int] = (),
-    hardware: Hardware = Hardware(),
-    track: TrackProgress = silently,
-) -> Path:
-    """Train the networks of table 6, each in a folder of its own. A second call resumes what was
-    cut off.
-
-    The best epoch of each is chosen on validation; the test split is used once they all are
-    trained.
-
-    Args:
-        store: the view store.
-        out: folder for the runs, resnet18-batch4 and so on, and for grid.csv.
-        recipe: how to train; network, layers and batch are those of the table.
-        depths: train only networks of so many layers.
-        batches: train only networks with these batch sizes.
-        hardware: on what.
-        track: follows the preparation of the inputs and the tests.
-
-    Returns:
-        The table, ``out / "grid.csv"``: depth, batch_size, accuracy (from one view of the test
-        split), class_accuracy, validation_class_accuracy and published, with a row for each
-        published accuracy or one without.
-
-    Raises:
-        UsageError: the table holds no network of these depths and batch sizes.
-        DatasetError: see ``train_recogniser``.
-        ModelError: see ``train_recogniser``.
-    """
-    views = ViewStore.open(store)
-    cells = {
-        (depth, batch): published
-        for (depth, batch), published in published_cells(
-            tuple(views.classes),
-            len(views.sphere),
-        ).items()
-        if depth in (depths or (depth,)) and batch in (batches or (batch,))
-    }
-    if not cells:
-        raise UsageError("table 6 holds no network of these depths and batch sizes")
-    recipes = {}
-    for depth, batch in cells:
-        changes: dict[str, Any] = {"network": "resnet", "layers": depth, "batch": batch}
-        recipes[out / f"resnet{depth}-batch{batch}"] = replace(recipe, **changes)
-    for run, own in recipes.items():
-        train_recogniser(store, run, recipe=own, hardware=hardware, track=track)
-    if is_first():
-        rows: list[dict[str, Any]] = []
-        for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
-            cell = {"depth": own.layers, "batch_size": own.batch} | _scores(
-                run,
-                store,
-                views,
-                own,
-                track,
-            )
-            rows += [
-                cell | {"published": accuracy} for accuracy in (published or (None,))
-            ]
-        with new_file(out / TABLE, True) as part, part.open("w", newline="") as file:
-            table = csv.DictWriter(file, list(rows[0]))
-            table.writeheader()
-            table.writerows(rows)
-    return out / TABLE
-
-
-def read_grid(table: Path) -> list[dict[str, Any]]:
-    """The rows of a table that ``train_grid`` made; what is not published is None.
-
-    Raises:
-        ResultsError: it is another file.
-    """
-    whole = ("depth", "batch_size")
-    try:
-        with table.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        return [
-            {
-                name: int(x) if name in whole else float(x) if x else None
-                for name, x in row.items()
-            }
-            for row in rows
-        ]
-    except (ValueError, TypeError, csv.Error):
-        raise ResultsError(
-            f"{table}: is no table that nextview_lab.thesis.train_grid has written"
-        ) from None
 
 
 def published_cells(
@@ -173,37 +75,11 @@ def published_cells(
     return dict(sorted(cells.items()))
 
 
-def count_right(
-    network: nn.Module,
-    inputs: PackedViews,
-    objects: NDArray[np.int64],
-    labels: NDArray[np.int64],
-) -> Iterator[int]:
-    """How many single views of each object are named right, on a GPU where there is one.
-
-    Args:
-        network: gives logits first.
-        inputs: of all views, (N, V, C, S, S).
-        objects: indices, (M,).
-        labels: of all objects, (N,).
-
-    Yields:
-        A count for each of ``objects``.
-    """
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    network = network.eval().to(device)
-    for i in objects:
-        with torch.inference_mode():
-            x = torch.from_numpy(inputs[i]).to(device).float() / 255
-            yield int((network(x)[0].argmax(1) == int(labels[i])).sum())
-
-
 def _scores(
     run: Path,
     store: Path,
     views: ViewStore,
     recipe: RecogniserRecipe,
-    track: TrackProgress,
 ) -> dict[str, float]:
     """Accuracy from one view of the test split, over objects and over classes, kept in the run's
     folder.
@@ -211,32 +87,28 @@ def _scores(
     kept = run / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    network = run_network(run, recipe, views)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    network = run_network(run, recipe, views).eval().to(device)
+    inputs = load_inputs(store, recipe.size, recipe.input)
     objects = np.flatnonzero(views.done & (views.splits == "test"))
-    labels = views.labels
+    labels = views.labels[objects]
     right: list[int] = []
 
     def judged() -> Iterator[int]:
-        for count in count_right(
-            network,
-            load_inputs(store, recipe.size, recipe.input),
-            objects,
-            labels,
-        ):
-            right.append(count)
+        for i, label in zip(objects, labels, strict=True):
+            with torch.inference_mode():
+                x = torch.from_numpy(inputs[int(i)]).to(device).float() / 255
+                right.append(int((network(x)[0].argmax(1) == int(label)).sum()))
             yield len(right)
 
     track(judged(), len(objects), f"test of {run.name}")
     share = np.array(right) / len(views.sphere)
-    own = labels[objects]
+    by_class = [share[labels == label].mean() for label in np.unique(labels)]
     with (run / "log/metrics.csv").open(newline="") as file:
         validated = max(float(row["class_accuracy"]) for row in csv.DictReader(file))
     scores = {
         "accuracy": round(float(share.mean()), 4),
-        "class_accuracy": round(
-            float(np.mean([share[own == label].mean() for label in np.unique(own)])),
-            4,
-        ),
+        "class_accuracy": round(float(np.mean(by_class)), 4),
         "validation_class_accuracy": round(validated, 4),
     }
     with new_file(kept, True) as part:
@@ -314,20 +186,41 @@ def main(
         batches: train only networks with these batch sizes.
         recipe: how to train; network, layers and batch are those of the table.
         hardware: on what.
+
+    Raises:
+        UsageError: the table holds no network of these depths and batch sizes.
     """
-    table = train_grid(
-        store,
-        out,
-        recipe,
-        depths=depths,
-        batches=batches,
-        hardware=hardware,
-        track=progress,
-    )
-    if is_first():
-        draw_curves(sorted(out.glob("resnet*-batch*")))
-        with new_file(out / FIGURE, True) as part:
-            to_png(grid_figure(read_grid(table)), part)
+    views = ViewStore.open(store)
+    cells = {
+        (depth, batch): published
+        for (depth, batch), published in published_cells(
+            tuple(views.classes),
+            len(views.sphere),
+        ).items()
+        if depth in (depths or (depth,)) and batch in (batches or (batch,))
+    }
+    if not cells:
+        raise UsageError("table 6 holds no network of these depths and batch sizes")
+    recipes = {}
+    for depth, batch in cells:
+        changes: dict[str, Any] = {"network": "resnet", "layers": depth, "batch": batch}
+        recipes[out / f"resnet{depth}-batch{batch}"] = replace(recipe, **changes)
+    for run, own in recipes.items():
+        train_recogniser(store, run, recipe=own, hardware=hardware, track=track)
+    if not is_first():
+        return
+    rows: list[dict[str, Any]] = []
+    for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
+        cell: dict[str, Any] = {"depth": own.layers, "batch_size": own.batch}
+        cell |= _scores(run, store, views, own)
+        rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
+    with new_file(out / TABLE, True) as part, part.open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    draw_curves(list(recipes))
+    with new_file(out / FIGURE, True) as part:
+        to_png(grid_figure(rows), part)
 
 
 if __name__ == "__main__":
