@@ -53,7 +53,7 @@ def of_features(lying, name, sensor, seed, threads=1) -> bytes:
 
 
 def of_show(card, sensor, seed, item) -> bytes:
-    """Of ``verification_fit.show``; the card holds the hash of the memory."""
+    """Of ``shown_views.show``; the card holds the hash of the memory."""
     return repr((sensor, seed, item)).encode() + card.read_bytes()
 
 

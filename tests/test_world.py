@@ -125,3 +125,20 @@ def test_a_pixel_counts_once(table):
         found = one.scores[0]
         own = found.cells[found.gain > 0.5]
         assert np.mean(owners[own] == one.number) > 0.95
+
+
+def test_the_mean_error_of_the_cameras_is_zero(things):
+    box, _, can, _ = things.caster.surfaces
+    placed = [(box, standing(box, -0.08, 0, 25)), (can, standing(can, 0.08, 0.02))]
+    world = World(things)
+    for azimuth, off in ((20, 0.004), (70, -0.004)):
+        true = camera(azimuth)
+        told = true.copy()
+        told[:3, 3] += [off, 0, off]
+        world, _ = after(world, drawn(placed, true, told))
+    middles = {
+        names(world)[one.number]: world.hypotheses.centres[one.row]
+        for one in world.things
+    }
+    assert np.linalg.norm(middles["box"] - [-0.08, 0, 0.07]) < 0.002
+    assert np.linalg.norm(middles["can"] - [0.08, 0.02, 0.05]) < 0.002

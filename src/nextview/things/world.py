@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from nextview.segmentation.view import View
 from nextview.things.library import Hypotheses, Library
@@ -120,7 +121,7 @@ class World:
             strangers=_seen_again(self, view),
             owners=(*self.owners, np.zeros(view.grid().depth.size, np.int32)),
         )
-        return world.chosen()
+        return _balanced(world).chosen()
 
     def searched(self, among: Mask) -> World:
         """Return the world with names for what the last view shows unexplained.
@@ -350,6 +351,36 @@ def corrected(world: World, view: View) -> View:
                 value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
         values.append(value)
     return tried[int(np.argmax(values))]
+
+
+def _balanced(world: World) -> World:
+    """Return the world, moved as a whole, so that the mean error of its cameras is zero.
+
+    Each camera errs as much as the first one. All that was compared stays as it is.
+    """
+    some = world.hypotheses
+    if len(world.views) < 2 or not len(some):
+        return world
+    middle = some.centres.mean(0)
+    turns, shifts = [], []
+    for view in world.views:
+        given = view.frame.camera_to_world
+        turn = view.camera[:3, :3] @ given[:3, :3].T
+        turns.append(Rotation.from_matrix(turn).as_rotvec())
+        shifts.append(turn @ (middle - given[:3, 3]) + view.camera[:3, 3] - middle)
+    back = np.eye(4)
+    back[:3, :3] = Rotation.from_rotvec(-np.mean(turns, axis=0)).as_matrix()
+    back[:3, 3] = middle - back[:3, :3] @ (middle + np.mean(shifts, axis=0))
+    return replace(
+        world,
+        views=tuple(view.seen_from(back @ view.camera) for view in world.views),
+        hypotheses=Hypotheses(
+            some.things,
+            back[:3, :3] @ some.rotations,
+            some.centres @ back[:3, :3].T + back[:3, 3],
+            some.sizes,
+        ),
+    )
 
 
 def _usual(row: Sequence[Score | None]) -> float:
