@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from nextview.errors import MeshError, option
 from nextview.types import Float
@@ -121,6 +120,8 @@ def _size(points: Float) -> float:
     """Half the largest distance between two points, however they are turned; 0 for none."""
     if len(points) < 2:
         return 0.0
+    from scipy.spatial.distance import cdist
+
     corners = hull_corners(points)
     farthest = max(
         float(cdist(corners[at : at + FARTHEST_AT_ONCE], corners[at:]).max())

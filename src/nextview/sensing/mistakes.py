@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from nextview.sensing.agreement import (
@@ -274,6 +273,8 @@ def find_fitted(posed: PosedViews, kind: FittedMistake) -> Mistake | None:
     Returns:
         The mistake; None if the frames agree, or it does not explain the contradictions.
     """
+    from scipy.optimize import minimize  # importing it takes time
+
     as_read = compare(posed.views, posed.poses)
     if 1 - as_read.share < LEAST_CONTRADICTED:
         return None
