@@ -4,19 +4,17 @@ import re
 import subprocess
 import sys
 from functools import wraps
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from factories import run_python
-from programs import COMMANDS, called, main
+from programs import COMMANDS, called, check_help, example_of, main
 
 from nextview import errors
 from nextview.checks import extras
 from nextview.cli import progress
-from nextview.cli.call_with_arguments import call, entry, find
+from nextview.cli.call_with_arguments import call, find
 from nextview.cli.commands import NEXTVIEW
-from nextview.cli.option_names import option_names
 from nextview.data import pool
 from nextview.errors import MissingExtraError, NextviewError, shell_words
 from nextview.files import check_new
@@ -37,24 +35,7 @@ def test_every_command_explains_itself(name, capsys):
         called(f"{name} --help")
     assert end.value.code == 0
     shown = capsys.readouterr().out
-    assert shown.startswith(f"usage: {name} ")
-    without = ("nextview demo", "nextview demo-episode", "nextview explore")
-    assert "(required)" in shown or name in without
-    rows = [row.replace("│", " ").rstrip() for row in shown.splitlines()]
-    for row, following in pairwise(rows):  # each option has a help, beside it or below
-        beside = re.search(r"\S {2,}(\S)", row) or re.match(r" +(\S)", following)
-        if re.match(r"  --[a-z]", row):
-            assert beside, row
-            assert beside[1] not in "-(", row
-    assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
-    explained = {row.split()[0] for row in rows if re.match(r"  --[a-z]", row)}
-    assert explained == option_names(entry(COMMANDS[name])[0])
-    assert shown.splitlines()[-1] == f"example: {example_of(name)}"
-
-
-def example_of(name):
-    """The command line in the help of a command, with its program."""
-    return f"{name.partition(' ')[0]} {COMMANDS[name].example}"
+    check_help(name, COMMANDS[name], shown)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -68,7 +49,7 @@ def test_the_example_of_a_help_is_a_command_line(name, monkeypatch):
         called.append((arguments, options))
 
     monkeypatch.setattr(f"{module}.{function}", run)
-    words = example_of(name).split()
+    words = example_of(name, COMMANDS[name]).split()
     assert " ".join(words[: len(name.split())]) == name
     call(name, command, words[len(name.split()) :], None)
     assert len(called) == 1

@@ -10,15 +10,14 @@ import sys
 import time
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 from factories import run_python
 from lab_programs import COMMANDS, called, main
+from programs import check_help
 
 from nextview.checks import EXTRAS
-from nextview.cli.call_with_arguments import entry, find
-from nextview.cli.option_names import option_names
+from nextview.cli.call_with_arguments import find
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 
@@ -33,24 +32,7 @@ def test_every_command_explains_itself(name, capsys):
         called(f"{name} --help")
     assert end.value.code == 0
     shown = capsys.readouterr().out
-    assert shown.startswith(f"usage: {name} ")
-    without = ("nextview demo", "nextview demo-episode", "nextview explore")
-    assert "(required)" in shown or name in without
-    rows = [row.replace("│", " ").rstrip() for row in shown.splitlines()]
-    for row, following in pairwise(rows):  # each option has a help, beside it or below
-        beside = re.search(r"\S {2,}(\S)", row) or re.match(r" +(\S)", following)
-        if re.match(r"  --[a-z]", row):
-            assert beside, row
-            assert beside[1] not in "-(", row
-    assert not re.search(r"\{|\bNone\b|FLOAT|\bSTR\b|\(default: \)", shown)
-    explained = {row.split()[0] for row in rows if re.match(r"  --[a-z]", row)}
-    assert explained == option_names(entry(COMMANDS[name])[0])
-    assert shown.splitlines()[-1] == f"example: {example_of(name)}"
-
-
-def example_of(name):
-    """The command line in the help of a command, with its program."""
-    return f"{name.partition(' ')[0]} {COMMANDS[name].example}"
+    check_help(name, COMMANDS[name], shown)
 
 
 @pytest.mark.parametrize("name", OF_LAB)

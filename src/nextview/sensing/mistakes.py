@@ -273,11 +273,11 @@ def find_fitted(posed: PosedViews, kind: FittedMistake) -> Mistake | None:
     Returns:
         The mistake; None if the frames agree, or it does not explain the contradictions.
     """
-    from scipy.optimize import minimize  # importing it takes time
-
     as_read = compare(posed.views, posed.poses)
     if 1 - as_read.share < LEAST_CONTRADICTED:
         return None
+    from scipy.optimize import minimize  # importing it takes time
+
     few = posed.some(_spread(len(posed.views)))
 
     def contradicted(size: Float) -> float:
