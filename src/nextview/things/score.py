@@ -33,6 +33,7 @@ LEAST_MARGIN = 0.005  # metres, the same at least
 OWN_SHARE = 0.3  # of a piece, from which on all of it should be explained
 FEWEST_OWN = 8  # pixels of a piece, from which on it should end where the thing ends
 STEEPEST = 0.15  # cosine of the steepest surface that is measured
+BLOCK = 5  # pixels of the grid whose errors are alike, along each side
 BATCH = 100_000  # rays that are cast at once
 
 
@@ -198,14 +199,32 @@ def _scored(
         if not shown[row].any():
             yield None
             continue
+        cells = at[row][held[row]]
         yield Score(
-            at[row][held[row]].astype(np.int32),
-            gain[row][held[row]].astype(np.float32),
+            cells.astype(np.int32),
+            evened(gain[row][held[row]], cells, on[row][held[row]], image[1]),
             float(paid[row]),
             float(seen[row]),
             float(through[row]),
             float(hidden[row]),
         )
+
+
+def evened(gain: Float32, cells: Index, on: Mask, columns: int) -> Float32:
+    """Return the gain of pixels with its mean over blocks of the grid: noise chooses no pixel.
+
+    Args:
+        gain: of each pixel, (N,) float32.
+        cells: the pixels, (N,).
+        on: those whose gain counts, (N,) bool.
+        columns: of the grid.
+    """
+    line, column = np.divmod(cells, columns)
+    block = line // BLOCK * columns + column // BLOCK
+    sums = np.bincount(block[on], gain[on], minlength=int(block.max(initial=0)) + 1)
+    counts = np.bincount(block[on], minlength=len(sums))
+    mean = sums / np.maximum(counts, 1)
+    return np.where(on, mean[block], 0).astype(np.float32)
 
 
 _CROSS = np.zeros((3, 3, 3), bool)

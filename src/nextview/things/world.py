@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nextview.segmentation.view import View
+from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
 from nextview.things.propose import propose
 from nextview.things.register import camera_error, register
@@ -73,6 +74,7 @@ class World:
         hypotheses: that are kept.
         scores: of each hypothesis in each view.
         strangers: of each of them the score in each view: it explains its pixels a little.
+        flat: of each plane the score in each view; it is of one view.
         things: that explain the views best together.
         owners: number of the thing that explains each pixel of the grid of each view, 0 for none.
         next_number: number of the next new thing.
@@ -86,6 +88,7 @@ class World:
     hypotheses: Hypotheses = field(default_factory=Hypotheses.none)
     scores: tuple[tuple[Score | None, ...], ...] = ()
     strangers: tuple[tuple[Score | None, ...], ...] = ()
+    flat: tuple[tuple[Score | None, ...], ...] = ()
     things: tuple[Thing, ...] = ()
     owners: tuple[NDArray[np.int32], ...] = ()
     next_number: int = 1
@@ -119,6 +122,10 @@ class World:
             hypotheses=some,
             scores=tuple((*row, new) for row, new in zip(scores, column, strict=True)),
             strangers=_seen_again(self, view),
+            flat=(
+                *((*row, None) for row in self.flat),
+                *((*(None,) * len(self.views), one) for one in planes(view)),
+            ),
             owners=(*self.owners, np.zeros(view.grid().depth.size, np.int32)),
         )
         return _balanced(world).chosen()
@@ -176,21 +183,13 @@ class World:
             for row, scores in enumerate(self.scores)
             if row not in ruled_out
         }
-        # strangers have negative rows
-        rows |= {-1 - k: scores for k, scores in enumerate(self.strangers)}
         sizes = [view.grid().depth.size for view in self.views]
-        kept = _greedy(rows, sizes)
-        while kept:
-            gains = _alone(kept, rows, sizes)
-            gains |= {
-                row: 0.0
-                for row in kept
-                if row < 0 and gains[row] < LEAST_OWN * total(rows[row])
-            }
-            worst = min(kept, key=lambda row: gains[row])
-            if gains[worst] > NEW_OBJECT:
-                break
-            kept = [row for row in kept if row != worst]
+        # what is no thing has negative rows: planes first, then strangers beside the things
+        flat = {-1 - k: scores for k, scores in enumerate(self.flat)}
+        kept, _ = _explaining(rows | flat, sizes, 0.0)
+        rows = {row: rows[row] for row in kept if row >= 0}
+        rows |= {-1 - k: scores for k, scores in enumerate(self.strangers)}
+        kept, gains = _explaining(rows, sizes, LEAST_OWN)
         things = [Thing(0, max(row, -1), rows[row], gains[row]) for row in kept]
         return replace(self, things=tuple(things))
 
@@ -411,13 +410,39 @@ def _since_it_stands(row: Sequence[Score | None]) -> tuple[Score | None, ...]:
     return tuple(row)
 
 
-def _greedy(rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]) -> list[int]:
-    """Choose rows, the one that adds most to what is explained first.
+def _explaining(
+    rows: dict[int, Sequence[Score | None]], sizes: Sequence[int], own: float
+) -> tuple[list[int], dict[int, float]]:
+    """Choose rows that explain most together; each has to add to what the others explain.
 
     Args:
         rows: scores in each view.
         sizes: pixels of the grid of each view.
+        own: share of what a negative row explains that the others do not, at least.
+
+    Returns:
+        The rows, and what each adds, nats.
     """
+    kept = _greedy(rows, sizes, own)
+    gains: dict[int, float] = {}
+    while kept:
+        gains = _alone(kept, rows, sizes)
+        gains |= {
+            row: 0.0
+            for row in kept
+            if row < 0 and gains[row] < own * total(rows[row])
+        }
+        worst = min(kept, key=lambda row: gains[row])
+        if gains[worst] > NEW_OBJECT:
+            break
+        kept.remove(worst)
+    return kept, gains
+
+
+def _greedy(
+    rows: dict[int, Sequence[Score | None]], sizes: Sequence[int], own: float
+) -> list[int]:
+    """Choose rows, the one that adds most to what is explained first."""
     have = [np.zeros(size, np.float32) for size in sizes]
     bounds = {row: total(scores) for row, scores in rows.items()}
     bounds = {row: bound for row, bound in bounds.items() if bound > NEW_OBJECT}
@@ -429,7 +454,7 @@ def _greedy(rows: dict[int, Sequence[Score | None]], sizes: Sequence[int]) -> li
             for number, one in enumerate(rows[row])
             if one is not None
         )
-        if gain <= NEW_OBJECT or (row < 0 and gain < LEAST_OWN * total(rows[row])):
+        if gain <= NEW_OBJECT or (row < 0 and gain < own * total(rows[row])):
             del bounds[row]
             continue
         if gain < max((bounds[one] for one in bounds if one != row), default=0.0):
