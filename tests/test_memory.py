@@ -5,7 +5,6 @@ one sentence.
 import json
 import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,8 +20,6 @@ from nextview.things.memory import open_memory
 from nextview.things.recogniser import open_recogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
-from nextview.things.taught import TaughtThings
-from nextview.things.weighing import EvidenceWeights
 
 FLOATS = (
     "views",
@@ -299,12 +296,10 @@ class Missing(dict):
 def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
     knobs_memory, knobs
 ):
-    things = TaughtThings.of(open_recogniser(knobs_memory / "memory.json"))
+    library = open_recogniser(knobs_memory / "memory.json").library
     meshes = {path.stem: load_mesh(path, unit="m") for path in sorted(knobs.iterdir())}
-    assert things.names == tuple(meshes)
-    for surface, mesh in zip(
-        things.verifier.caster.surfaces, meshes.values(), strict=True
-    ):
+    assert library.names == tuple(meshes)
+    for surface, mesh in zip(library.caster.surfaces, meshes.values(), strict=True):
         in_file = mesh.vertices * mesh.radius + mesh.centre
         step = np.ptp(in_file, axis=0).max() / 65535
         np.testing.assert_allclose(surface.vertices, in_file, atol=step)
@@ -340,14 +335,6 @@ def test_things_get_features_when_one_is_added_that_needs_them(
     # of the thing itself, as learned from its file
     (knob,) = (row for row, name in enumerate(learned) if name == "knob")
     assert memory.surfaces.counts[1].tolist() == before.surfaces.counts[knob].tolist()
-
-
-def test_weights_and_residuals_are_those_on_the_card(models):
-    card = changed_card(models, set_at("memory/verification", VERIFIED))
-    things = TaughtThings.of(open_recogniser(card))
-    assert things.verifier.weights == replace(EvidenceWeights(), geometry=20.0)
-    np.testing.assert_array_equal(things.residuals.usual, VERIFIED["usual"][1:])
-    assert things.residuals.p_value(0.1, 0, 1) == pytest.approx(2 / 3)
 
 
 def square(size, origin, name="square"):

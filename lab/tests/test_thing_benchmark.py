@@ -19,6 +19,7 @@ from nextview.recognition.evidence import Evidence
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview_lab.benchmark import things as stage
 from nextview_lab.benchmark.confusable import Alikeness
+from nextview_lab.benchmark.known_things import things_of
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     VISIBLE_SHARES,
@@ -27,7 +28,7 @@ from nextview_lab.benchmark.thing_episodes import (
     hiding_boxes,
 )
 from nextview_lab.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
-from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun, opened
+from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun
 from nextview_lab.benchmark.thing_tables import summarise_things
 from nextview_lab.benchmark.things import ThingSettings, benchmark_things
 
@@ -75,7 +76,7 @@ def results(made, tmp_path):
 
 
 def episode_of(knobs_memory, knobs, thing, folder=None, occlusion="none"):
-    things = opened(str(knobs_memory))
+    things = things_of(str(knobs_memory), None)
     mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
     return ThingEpisode(
         things, lambda: mesh, thing, 0, Setting("wrist", occlusion), folder

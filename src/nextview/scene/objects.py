@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,6 @@ from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import CONFIDENT, named, pose_candidates, why_in_doubt
 from nextview.things.world import Thing, World
 from nextview.types import Float, Mask
-
-if TYPE_CHECKING:
-    from nextview.scene.state import SceneState
 
 UNKNOWN_NAME = "unknown"
 SETTLED_VIEWS = 2  # views after which an unknown object is settled
@@ -107,33 +104,33 @@ class SceneObject:
 SEEN_POINTS = 400
 
 
-def objects_of(state: SceneState) -> tuple[SceneObject, ...]:
+def objects_of(
+    world: World, up: Float, ruled_out: Mapping[int, Mapping[str, str]]
+) -> tuple[SceneObject, ...]:
     """Return the objects of a scene, in the order in which they were found.
 
     Args:
-        state: of the scene, with the objects before the last frame.
+        world: what explains the frames.
+        up: direction in it, (3,).
+        ruled_out: names that objects cannot have, with the reasons, by their numbers.
     """
-    world = state.world
     pairs = touching(world)
-    known = {one.number: one for one in state.objects}
-    found = []
-    for thing in sorted(world.things, key=lambda one: one.number):
-        ruled_out = state.ruled_out.get(thing.number, {})
-        found.append(_object(state, thing, pairs, ruled_out, known.get(thing.number)))
-    return tuple(found)
+    return tuple(
+        _object(world, thing, up, pairs, ruled_out.get(thing.number, {}))
+        for thing in sorted(world.things, key=lambda one: one.number)
+    )
 
 
 def _object(
-    state: SceneState,
+    world: World,
     thing: Thing,
+    up: Float,
     pairs: set[tuple[int, int]],
     ruled_out: Mapping[str, str],
-    before: SceneObject | None,
 ) -> SceneObject:
     """Return the public view of one thing."""
-    world = state.world
     points = seen_points(world, thing.number)
-    axes = upright_axes(state.tops[0].up)
+    axes = upright_axes(up)
     flat = points @ axes.T
     middle = axes.T @ ((flat.min(0) + flat.max(0)) / 2)
     beside = [pair for pair in pairs if thing.number in pair]

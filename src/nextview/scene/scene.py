@@ -26,7 +26,7 @@ from nextview.scene.grasps import (
     within_reach,
 )
 from nextview.scene.next_view import Candidates, candidates
-from nextview.scene.objects import SceneObject, objects_of
+from nextview.scene.objects import SceneObject
 from nextview.scene.open_points import OpenPoint, open_points
 from nextview.scene.rule import SceneRule, ruled_out_by
 from nextview.scene.state import SceneState
@@ -609,7 +609,7 @@ class Scene:
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, before.world, gone)
         state = replace(before, world=world, tops=(*before.tops, top))
-        state = self._ruled(replace(state, objects=objects_of(state)))
+        state = self._ruled(state.named({}))
         look = _look(before, state, (*told.moved, *moved), gone)
         if look.moved and not (told.stand or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
@@ -628,8 +628,6 @@ class Scene:
         """Return a scene without the names that the rule rules out."""
         if self.rule is None:
             return state
-        state = replace(state, ruled_out={})
-        state = replace(state, objects=objects_of(state))
         while True:
             new = ruled_out_by(self.rule, state.objects)
             if not new:
@@ -643,8 +641,7 @@ class Scene:
                 number: {**state.ruled_out.get(number, {}), **new.get(number, {})}
                 for number in {*state.ruled_out, *new}
             }
-            state = replace(state, ruled_out=ruled_out)
-            state = replace(state, objects=objects_of(state))
+            state = state.named(ruled_out)
 
 
 def _library_of(system: System) -> Library:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from nextview.checks import number_of
 from nextview.geometry.axes import upright_axes
 from nextview.scene.next_view import TableGround
-from nextview.scene.objects import SceneObject
+from nextview.scene.objects import SceneObject, objects_of
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
@@ -46,6 +46,15 @@ class SceneState:
     def thing(self, number: int) -> Thing:
         """Return the thing of the world that an object is."""
         return self.world.thing(number)
+
+    def named(self, ruled_out: Mapping[int, Mapping[str, str]]) -> SceneState:
+        """Return the scene after a frame with its objects.
+
+        Args:
+            ruled_out: names that objects cannot have, with the reasons, by their numbers.
+        """
+        objects = objects_of(self.world, self.tops[0].up, ruled_out)
+        return replace(self, objects=objects, ruled_out=ruled_out)
 
     @cached_property
     def ground(self) -> TableGround | None:

@@ -120,9 +120,10 @@ class Learned:
         out: folder of the memory.
         things: number of things.
         classes: number of their classes.
-        accuracy: share of correct answers. With geometry: after 1, 2 and 3 simulated views. Otherwise: after 1, 2, 3 and 5 held-out views, by features
-            and size. A thing of a class of several is recognised by the others of that class. () if
-            nothing was tested, as after a removal.
+        accuracy: share of correct answers. With geometry: after 1, 2 and 3 simulated views.
+            Otherwise: after 1, 2, 3 and 5 held-out views, by features and size. A thing of a class
+            of several is recognised by the others of that class. () if nothing was tested, as after
+            a removal.
         confused: pairs of things that are most often confused, with the share of the cases.
         notes: notes for the user, a sentence each.
         left_out: what could not be learned and why, a phrase each.

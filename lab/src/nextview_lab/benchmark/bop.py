@@ -440,9 +440,9 @@ def _look(
     poses = []
     others = []
     for thing in scene.objects:
-        name = thing.candidates[0].thing
+        name = thing.name
         pose = thing.pose
-        if name is None or pose is None:
+        if pose is None:
             continue
         if name not in numbers:
             others.append(name)

@@ -18,7 +18,6 @@ from nextview.recognition.protocol import (
     log_evidence_of_views,
 )
 from nextview.things.expected_views import Outlook
-from nextview.things.library import Library
 from nextview.things.recogniser import VerifiedRecogniser, open_recogniser
 from nextview.things.surface import Surface
 from nextview.types import Float, Index
@@ -50,7 +49,7 @@ class KnownThings:
         recogniser: the recogniser.
         names: its classes in alphabetical order, so that things with the same names have the same
             episodes.
-        library: the taught things; None for a recogniser of your own.
+        memory: the same recogniser, of taught things; None for one of your own.
     """
 
     def __init__(self, recogniser: Recogniser) -> None:
@@ -62,15 +61,14 @@ class KnownThings:
         self.recogniser = recogniser
         self._order = np.argsort(recogniser.classes, kind="stable")
         self.names = tuple(recogniser.classes[k] for k in self._order)
-        taught = isinstance(recogniser, VerifiedRecogniser)
-        self.library: Library | None = recogniser.library if taught else None
+        self.memory = recogniser if isinstance(recogniser, VerifiedRecogniser) else None
 
     def surface(self, thing: int) -> Surface | None:
         """Return the taught surface of a thing; None for a recogniser of your own."""
-        if self.library is None:
+        if self.memory is None:
             return None
-        row = self.library.names.index(self.names[thing])
-        return self.library.caster.surfaces[row]
+        library = self.memory.library
+        return library.caster.surfaces[library.names.index(self.names[thing])]
 
     def __call__(self, observations: Sequence[Observation]) -> Answer:
         """What it says of views of one thing: together if it can, else by the sum of all.

@@ -158,20 +158,23 @@ class RecogniseThingsEnv(ViewsEnv):
         return self._observed(belief), value, None if over else reached, info
 
     def _observed(self, believed: Float) -> dict[str, Any]:
-        outlook = self._episode.outlook(self.views)
-        leading = outlook.hypotheses
-        count = len(leading.things)
-        order = np.argsort(-leading.belief, kind="stable")
         reached = cells_from(EPISODE_SPHERE)[self.views[-1]]
-        cameras = outlook.cameras(EPISODE_SPHERE.directions[[*reached, self.views[-1]]])
-
         belief = np.zeros(MOST_LEADING, np.float32)
-        belief[:count] = leading.belief[order]
         things = np.full(MOST_LEADING, len(self.things.names))
-        things[:count] = leading.things[order]
         poses = np.zeros((MOST_LEADING, 3, 4), np.float32)
-        poses[:count] = (np.linalg.inv(cameras[-1]) @ leading.poses[order])[:, :3]
-        information = outlook.expect(cameras[:-1]).information()
+        information = np.zeros(len(reached))
+        outlook = self._episode.outlook(self.views)
+        if outlook is not None:
+            leading = outlook.hypotheses
+            count = len(leading.things)
+            order = np.argsort(-leading.belief, kind="stable")
+            towards = EPISODE_SPHERE.directions[[*reached, self.views[-1]]]
+            cameras = outlook.cameras(towards)
+            belief[:count] = leading.belief[order]
+            names = [outlook.caster.surfaces[k].name for k in leading.things[order]]
+            things[:count] = [self.things.names.index(name) for name in names]
+            poses[:count] = (np.linalg.inv(cameras[-1]) @ leading.poses[order])[:, :3]
+            information = outlook.expect(cameras[:-1]).information()
         return {
             "belief": believed.astype(np.float32),
             "hypotheses": belief,

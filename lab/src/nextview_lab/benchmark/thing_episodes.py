@@ -104,7 +104,7 @@ class ThingEpisode:
         self._seed = (setting.seed, thing, draw)
         self._setting = setting
         self._kept = KeptArrays(folder)
-        own = things.library is None
+        own = things.memory is None
         self._answers = KeptArrays(None) if own else self._kept
         self._stage: _Stage | None = None
         self._views: dict[int, Observation] = {}

@@ -179,7 +179,7 @@ def _refuse_needs(
 ) -> None:
     """Reject a policy that needs the hypotheses of a memory if there is none; UsageError."""
     lacking = sorted({"joint", "outlook"} & set(needs))
-    if lacking and things.library is None:
+    if lacking and things.memory is None:
         raise UsageError(
             f"the policy {name} goes by the hypotheses of a memory of taught things, which"
             f" recogniser {things.recogniser.name} does not have; leave it out"

@@ -123,7 +123,7 @@ def _allowed(
     things: KnownThings,
 ) -> tuple[str, ...]:
     """Return the included policies: the reference, and the requested ones."""
-    own = things.library is None
+    own = things.memory is None
     all_of_them = [name for name in THING_POLICIES if not (own and name in OF_MEMORIES)]
     first = [] if settings.reference == BEST_BLIND else [settings.reference]
     return tuple(dict.fromkeys([*first, *(settings.policies or all_of_them)]))
@@ -139,8 +139,8 @@ def _replayed(
     """Return the runs of all episodes; missing ones are computed."""
     made = {
         "memory_sha256": ""
-        if things.library is None
-        else things.recogniser.card.sha256,
+        if things.memory is None
+        else things.memory.card.sha256,
         "recogniser": settings.recogniser or "",
         "sensor": settings.sensor,
         "occlusion": settings.occlusion,
@@ -188,8 +188,8 @@ def _surfaces(
     settings: ThingSettings,
 ) -> list[Surface]:
     """Return the surfaces of all taught things, or else of the scans."""
-    if things.library is not None:
-        return list(things.library.caster.surfaces)
+    if things.memory is not None:
+        return list(things.memory.library.caster.surfaces)
     return [
         Surface.from_mesh(load_mesh(scans[name], unit=settings.unit), name)
         for name in things.names

@@ -4,14 +4,14 @@
         [--poses thrown] [--any-orientation] [--known even]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
-is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
-with an azimuth, views and errors of the sensor of its own. The camera stands five object radii
-away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned
-(``--poses scanned``), as they fall (``thrown``: on any face of the convex hull, as often as throws
-end on it) or as people stand them up (``stood``: the pose with the highest centre in which at least
-a thousandth of the throws end). With ``--any-orientation`` they hang in the middle of a round
-room, turned at random about all axes, and are recognised as such; the error of the rotation, modulo
-the symmetries of the thing, stands in the place of those of azimuth and resting pose.
+is looked at. Each draw shows every thing once, with an azimuth, views and errors of the sensor of
+its own. The camera stands five object radii away, between 25 cm from the surface and 45 cm from the
+centre. Things stand as they were scanned (``--poses scanned``), as they fall (``thrown``: on any
+face of the convex hull, as often as throws end on it) or as people stand them up (``stood``: the
+pose with the highest centre in which at least a thousandth of the throws end). With
+``--any-orientation`` they hang in the middle of a round room, turned at random about all axes; the
+error of the rotation, modulo the symmetries of the thing, stands in the place of those of azimuth
+and resting pose.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by outline and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -36,10 +36,6 @@ from typing import Literal
 import numpy as np
 import trimesh
 import tyro
-from nextview.things.taught import TaughtThings
-from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import Verified
-from nextview.things.weighing import EvidenceWeights
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -49,10 +45,17 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
-from nextview.geometry.viewsphere import ViewSphere, rotation_z
+from nextview.geometry.viewsphere import (
+    ViewSphere,
+    azimuth_of,
+    direction_of,
+    rotation_z,
+)
+from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.model_card import Symmetry
+from nextview.recognition.protocol import JointBelief
 from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
-from nextview.things.memory import TaughtRecogniser
+from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.surface import Surface
 from nextview.types import Float
 from nextview_lab.studies.shared import markdown, progress, scans_of
@@ -136,7 +139,7 @@ class Outcome:
         answer: the thing believed most.
         confidence: belief in it.
         seconds: of CPU from the last frame to the decision.
-        p_value: share of known things that are explained as badly; None if the memory does not say.
+        p_value: by which it is called unknown.
         azimuth: error, degrees; None for a thing with every symmetry, and in another resting pose
             that looks the same, too.
         rotation: error about any axis, degrees, modulo the thing's symmetries; None for a ball.
@@ -152,7 +155,7 @@ class Outcome:
     answer: int
     confidence: float
     seconds: float
-    p_value: float | None
+    p_value: float
     azimuth: float | None
     rotation: float | None
     place: float | None
@@ -168,33 +171,28 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """The things of a memory with its geometry of them, and their scans, which are looked at.
+    """The things of a memory, and their scans, which are looked at.
 
     Attributes:
         orders: of the symmetry about the vertical; 0 for any azimuth.
-        weights: that the memory was fitted to.
-        residuals: how badly its things are usually explained; None if that was not fitted.
     """
 
-    recogniser: TaughtRecogniser
-    names: list[str]
+    recogniser: VerifiedRecogniser
+    names: tuple[str, ...]
     meshes: list[Mesh]
     surfaces: list[Surface]
     points: list[Float]
     orders: list[int]
-    weights: EvidenceWeights
-    residuals: KnownResiduals | None
 
     @classmethod
     def load(cls, models: str, scans: Path) -> Taught:
         """Read a memory, and the scans of what it knows."""
-        recogniser = TaughtRecogniser(models, threads=1)
-        known = TaughtThings.of(recogniser)
-        if known is None or len(known.names) < len(recogniser.memory.radii):
+        recogniser = VerifiedRecogniser(models, threads=1)
+        names = recogniser.library.names
+        if len(names) < len(recogniser.classes):
             raise UsageError(
                 f"{models}: does not know the geometry of all its things; teach it with --unit"
             )
-        names = list(known.names)
         meshes = [load_mesh(path, unit="m") for path in scans_of(scans, names)]
         whole = [
             Surface.from_mesh(mesh, name)
@@ -202,25 +200,14 @@ class Taught:
         ]
         points = [surface.sample(POINTS, np.random.default_rng(0)) for surface in whole]
         orders = [symmetry_order(*both) for both in zip(whole, points, strict=True)]
-        surfaces = list(known.verifier.caster.surfaces)
-        return cls(
-            recogniser,
-            names,
-            meshes,
-            surfaces,
-            points,
-            orders,
-            known.verifier.weights,
-            known.residuals,
-        )
+        surfaces = list(recogniser.library.caster.surfaces)
+        return cls(recogniser, names, meshes, surfaces, points, orders)
 
-    def things(self, some: NDArray[np.int64]) -> TaughtThings:
+    def things(self, some: NDArray[np.int64]) -> VerifiedRecogniser:
         """A recogniser of some of the things, as if the others had been removed."""
-        residuals = self.residuals
-        if residuals is not None:
-            residuals = replace(residuals, usual=residuals.usual[some])
-        surfaces = [self.surfaces[k] for k in some]
-        return TaughtThings(self.recogniser, surfaces, self.weights, residuals)
+        own = self.recogniser
+        left = np.setdiff1d(np.arange(len(own.classes)), own.labels[some])
+        return own.without([own.classes[label] for label in left])
 
 
 def symmetry_order(surface: Surface, points: Float) -> int:
@@ -318,68 +305,69 @@ def room_around(mesh: Mesh) -> Mesh:
 
 
 def judged(
-    things: TaughtThings,
+    things: VerifiedRecogniser,
     taught: Taught,
-    some: NDArray[np.int64],
     episode: Episode,
     views: int,
 ) -> Outcome:
-    """Recognise the thing of an episode after some views, among some things."""
+    """Recognise the thing of an episode after some views.
+
+    Args:
+        things: recogniser of some of the things.
+        taught: all things.
+        episode: what was seen.
+        views: number of views.
+    """
+    observations = episode.observations[:views]
+    said = things(observations)
+    directions = np.stack([direction_of(one.pose) for one in observations])
+    total = log_evidence_of(said.logits, said.azimuth_bins, azimuth_of(directions)).sum(
+        0
+    )
+    by_outline = things.calibration.belief(total, views, len(things.classes))
+    by_outline[things.ruled_out] = 0
+
     begun = time.process_time()
-    found = things(episode.observations[:views])
+    found = things.together(observations, total, views)
     seconds = time.process_time() - begun
 
-    answer = int(some[found.belief.argmax()])
-    truth = int(np.searchsorted(some, episode.thing)) if episode.thing in some else -1
+    truth = things.labels[episode.thing]
+    label = int(found.belief.argmax())
+    answer = int(np.flatnonzero(things.labels == label)[0])
     errors: dict = dict.fromkeys(POSE_ERRORS)
-    if answer == episode.thing:
-        symmetries = things.symmetries[truth]
-        errors = pose_errors(taught, found, truth, episode, views, symmetries)
+    if answer == episode.thing and found.poses:
+        errors = pose_errors(taught, found, episode, views)
     return Outcome(
         thing=episode.thing,
         views=views,
-        by_outline=int(some[found.by_outline.argmax()]) == episode.thing,
+        by_outline=int(by_outline.argmax()) == truth,
         answer=answer,
         confidence=float(found.belief.max()),
         seconds=seconds,
-        p_value=things.p_value(episode.observations[:views], found),
+        p_value=1.0 if found.p_value is None else found.p_value,
         **errors,
     )
 
 
 def pose_errors(
-    taught: Taught,
-    found: Verified,
-    truth: int,
-    episode: Episode,
-    views: int,
-    symmetries: Sequence[Symmetry],
+    taught: Taught, found: JointBelief, episode: Episode, views: int
 ) -> dict[str, float | bool | None]:
     """Errors of the pose of the thing that was named right, by the names of an outcome's fields.
 
     Args:
         taught: the things.
         found: what was found.
-        truth: number of the thing among those that were asked for.
         episode: what was seen.
         views: how many of the views were taken.
-        symmetries: of the thing.
     """
-    best = int(np.flatnonzero(found.things == truth)[0])
-    pose = found.poses[best]
+    name = taught.names[episode.thing]
+    pose = next(one.pose for one in found.poses if one.thing == name)
     surface = taught.surfaces[episode.thing]
     points = taught.points[episode.thing]
 
     # As the last camera sees it: what the view is displaced by belongs to the place of the camera.
-    scene = episode.observations[views - 1].scene
-    metres = episode.observations[views - 1].radius
-    assert scene is not None
-    assert metres is not None
-    camera = scene.pose.copy()
-    camera[:3, 3] *= metres
-    as_seen = pose.copy()
-    as_seen[:3, 3] += found.cameras[best, views - 1]
-    in_camera = np.linalg.inv(camera) @ as_seen
+    world = found.found[0]
+    in_camera = np.linalg.inv(world.views[views - 1].camera) @ pose
     true_in_camera = episode.in_cameras[views - 1]
 
     centre = np.append(surface.centre, 1)
@@ -391,6 +379,7 @@ def pose_errors(
     step = 360 / order if order else 0
     up = pose[2, :3] @ episode.true_pose[2, :3]
     same_pose = up > np.cos(np.radians(UPRIGHT))
+    symmetries = taught.recogniser.library.symmetries[name]
     return {
         "azimuth": abs((azimuth + step / 2) % step - step / 2)
         if order and same_pose
@@ -474,8 +463,9 @@ def table(
 def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
     """The results after so many views, by ``COLUMNS``."""
     right = [outcome for outcome in some if outcome.right]
-    places = 1000 * np.array([o.place for o in right], float)
-    in_world = 1000 * np.array([o.place_in_world for o in right], float)
+    placed = [outcome for outcome in right if outcome.place is not None]
+    places = 1000 * np.array([o.place for o in placed], float)
+    in_world = 1000 * np.array([o.place_in_world for o in placed], float)
     milliseconds = 1000 * np.array([o.seconds for o in some])
     wrong = np.mean([not o.right and o.confidence >= CONFIDENT for o in some])
     return (
@@ -510,7 +500,7 @@ def unknown_table(
     """How many of the things that were not taught, and of those that were, are called unknown."""
     rows = []
     for k in views:
-        some = [o for o in outcomes if o.views == k and o.p_value is not None]
+        some = [o for o in outcomes if o.views == k]
         strangers = [o for o in some if o.thing not in known]
         taught = [o for o in some if o.thing in known]
         refused = np.mean([unknown(o) for o in strangers])
@@ -530,7 +520,7 @@ def unknown_table(
 
 def unknown(outcome: Outcome) -> bool:
     """Whether a thing is called unknown."""
-    return outcome.p_value is not None and outcome.p_value < REJECTED
+    return outcome.p_value < REJECTED
 
 
 def main(
@@ -562,15 +552,13 @@ def main(
     everything = np.arange(len(taught.names))
     some = {"all": everything, "even": everything[::2], "odd": everything[1::2]}[known]
     things = taught.things(some)
-    if any_orientation:
-        things = things.in_any_orientation()
 
     outcomes: list[Outcome] = []
     for draw in draws:
         for thing in progress(everything[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
-            outcomes += [judged(things, taught, some, episode, k) for k in counts]
+            outcomes += [judged(things, taught, episode, k) for k in counts]
     if known == "all":
         print(table(outcomes, views, any_orientation))
     else:
