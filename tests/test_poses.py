@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from factories import INTRINSICS, TABLE, box, cast, pose_at
 from matplotlib.contour import ContourSet
+from nextview.things.unknown import KnownResiduals
 from programs import main
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
@@ -32,7 +33,6 @@ from nextview.teaching import verification_fit
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
-from nextview.things.unknown import KnownResiduals
 
 ORIGIN = np.array([0.3, -0.1, 0.2])  # of the scans, far from the things
 SPOT = np.array([0.4, -0.25, 0.0])  # on the table

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from factories import box
+from nextview.things.unknown import KnownResiduals
 from test_poses import known, meshes, metric_scans  # noqa: F401  (fixtures)
 
 import nextview
@@ -17,7 +18,6 @@ from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.several import SeveralRecognisers
-from nextview.things.unknown import KnownResiduals
 
 
 def memory_of(folder) -> VerifiedRecogniser:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
 from scipy.spatial.transform import Rotation
 from test_verification import (
     VIEWS,
@@ -21,7 +22,6 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things import view_templates
-from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
     RENDERING_PIXELS,

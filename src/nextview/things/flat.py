@@ -23,7 +23,7 @@ from nextview.things.score import (
     Score,
     evened,
 )
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Mask
 
 TRIPLES = 48  # planes through three pixels that are tried in each segment
 LEAST_FLAT = 0.25  # share of a segment that a plane explains, at least
@@ -63,8 +63,12 @@ def _of_segment(
         cells = np.flatnonzero(left)
         if len(cells) < 12 or len(cells) < LEAST_FLAT * np.count_nonzero(own):
             return
-        normal = _fitted(slopes.reshape(-1, 3)[cells], depth.ravel()[cells],
-                         sigma.ravel()[cells], rng)
+        normal = _fitted(
+            slopes.reshape(-1, 3)[cells],
+            depth.ravel()[cells],
+            sigma.ravel()[cells],
+            rng,
+        )
         away = slopes @ normal
         z = 1 / np.maximum(away, 1e-3)
         margin = np.maximum(FARTHEST * sigma, LEAST_MARGIN)
@@ -75,20 +79,25 @@ def _of_segment(
         parts = ndimage.label(near)[0]
         region = parts == np.bincount(parts[near & left]).argmax()
         # of neighbouring pixels, as for a thing: a steep surface is less certain
-        steep = np.abs(np.stack([np.gradient(z, axis=0), np.gradient(z, axis=1)])).max(0)
+        steep = np.abs(np.stack([np.gradient(z, axis=0), np.gradient(z, axis=1)])).max(
+            0
+        )
         variance = (sigma**2 + SCAN_ERROR**2 + (steep / 2) ** 2)[region]
         gain = np.log(np.exp(-(off[region] ** 2) / 2 / variance) + np.exp(OUTLIER))
         count = float(np.count_nonzero(region))
         cells = np.flatnonzero(region)
         every = np.ones(len(cells), bool)
-        yield Score(
-            cells.astype(np.int32),
-            evened(gain + PIXEL_GAIN, cells, every, depth.shape[1]),
-            LEFT_OVER * _drops(region, off, depth, margin),
-            count,
-            0.0,
-            0.0,
-        ), region
+        yield (
+            Score(
+                cells.astype(np.int32),
+                evened(gain + PIXEL_GAIN, cells, every, depth.shape[1]),
+                LEFT_OVER * _drops(region, off, depth, margin),
+                count,
+                0.0,
+                0.0,
+            ),
+            region,
+        )
         left = left & ~near
 
 
@@ -105,14 +114,18 @@ def _drops(region: Mask, off: Float, depth: Float, margin: Float) -> int:
     return int(np.count_nonzero(ring & (distance < SHADOW) & drop[tuple(nearest)]))
 
 
-def _fitted(slopes: Float, depth: Float, sigma: Float, rng: np.random.Generator) -> Float:
+def _fitted(
+    slopes: Float, depth: Float, sigma: Float, rng: np.random.Generator
+) -> Float:
     """Return the plane n of most pixels, n . (x, y, 1) = 1 / depth, (3,) float64."""
     few = rng.permutation(len(depth))[:400]
     rays, z, error = slopes[few], depth[few].astype(np.float64), sigma[few]
     triples = rng.integers(0, len(few), (TRIPLES, 3))
     corners = rays[triples]
     usable = np.abs(np.linalg.det(corners)) > 1e-9
-    normals = np.linalg.solve(corners[usable], (1 / z[triples[usable]])[..., None])[..., 0]
+    normals = np.linalg.solve(corners[usable], (1 / z[triples[usable]])[..., None])[
+        ..., 0
+    ]
     normals = np.concatenate([normals, [[0.0, 0.0, 1 / np.median(z)]]])
     off = np.abs(1 / np.maximum(normals @ rays.T, 1e-3) - z)
     normal = normals[np.count_nonzero(off < 2 * error, axis=1).argmax()]

@@ -428,9 +428,7 @@ def _explaining(
     while kept:
         gains = _alone(kept, rows, sizes)
         gains |= {
-            row: 0.0
-            for row in kept
-            if row < 0 and gains[row] < own * total(rows[row])
+            row: 0.0 for row in kept if row < 0 and gains[row] < own * total(rows[row])
         }
         worst = min(kept, key=lambda row: gains[row])
         if gains[worst] > NEW_OBJECT:

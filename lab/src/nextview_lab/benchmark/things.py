@@ -138,9 +138,7 @@ def _replayed(
 ) -> list[EpisodeRuns]:
     """Return the runs of all episodes; missing ones are computed."""
     made = {
-        "memory_sha256": ""
-        if things.memory is None
-        else things.memory.card.sha256,
+        "memory_sha256": "" if things.memory is None else things.memory.card.sha256,
         "recogniser": settings.recogniser or "",
         "sensor": settings.sensor,
         "occlusion": settings.occlusion,
