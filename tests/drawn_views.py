@@ -7,8 +7,8 @@ from nextview.geometry.pinhole import pinhole_matrix
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.segmentation.instances import Instances
-from nextview.segmentation.view import View
 from nextview.sensing.frame import Frame
+from nextview.sensing.view import View
 from nextview.things.library import Library
 from nextview.things.surface import Surface
 

@@ -34,9 +34,7 @@ def test_another_thing_explains_less(things, number):
     box = things.caster.surfaces[0]
     view = drawn([(box, standing(box, 0, 0, 20))], camera(30))
     other = things.caster.surfaces[number]
-    some = at(
-        things, (0, standing(box, 0, 0, 20)), (number, standing(other, 0, 0, 20))
-    )
+    some = at(things, (0, standing(box, 0, 0, 20)), (number, standing(other, 0, 0, 20)))
     right, wrong = score(things, view, some)
     assert wrong.total < 0.5 * right.total
 
@@ -56,7 +54,10 @@ def test_what_is_hidden_says_nothing(things):
     view = drawn([(box, behind), (can, standing(can, 0.1, 0))], camera(0, 20))
     alone = drawn([(box, behind)], camera(0, 20))
     hypothesis = at(things, (0, behind))
-    (partly,), (whole,) = score(things, view, hypothesis), score(things, alone, hypothesis)
+    (partly,), (whole,) = (
+        score(things, view, hypothesis),
+        score(things, alone, hypothesis),
+    )
     assert partly.hidden > 20
     assert partly.seen < whole.seen
     assert partly.total > 0.7 * PIXEL_GAIN * partly.seen

@@ -119,7 +119,7 @@ def library_without(things, name):
 
 
 def test_a_pixel_counts_once(table):
-    placed, world = table
+    _, world = table
     owners = world.owners[0]
     for one in world.things:
         found = one.scores[0]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.segmentation.view import View
+from nextview.sensing.view import View
 from nextview.things.library import Hypotheses
 from nextview.things.register import register
 from nextview.things.score import score, total

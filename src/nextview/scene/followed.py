@@ -8,10 +8,10 @@ import numpy as np
 
 from nextview.scene.body import Body
 from nextview.scene.motion import BodyState
-from nextview.segmentation.view import LEVEL, View
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
+from nextview.sensing.view import LEVEL, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import normal_equations

@@ -37,7 +37,6 @@ from nextview.scene.view_policies import (
     ScenePolicy,
 )
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
-from nextview.segmentation.view import View
 from nextview.sensing.frame import Frame
 from nextview.sensing.frame_mistakes import check_mistakes
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
@@ -47,6 +46,7 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.plausibility import check_sizes
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
+from nextview.sensing.view import View
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.reach import (

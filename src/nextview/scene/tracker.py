@@ -17,10 +17,10 @@ from nextview.scene.body import Body, Tracked
 from nextview.scene.followed import SURPRISE, followed, view_to_follow
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
-from nextview.segmentation.view import View
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
+from nextview.sensing.view import View
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
 LATEST_TIME = 1e11  # seconds: since 1970, the year 5138

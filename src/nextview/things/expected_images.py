@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
-from nextview.segmentation.view import View
+from nextview.sensing.view import View
 from nextview.things.expected_model import Leading
 from nextview.things.surface import SurfaceCaster
 from nextview.things.unseen_space import MeasuredDepth, chance_of_sight

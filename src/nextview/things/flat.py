@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import ndimage
 
-from nextview.segmentation.view import View
 from nextview.sensing.frame import within
+from nextview.sensing.view import View
 from nextview.things.score import (
     FARTHEST,
     LEAST_MARGIN,

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from nextview.geometry.pinhole import PinholeCamera
-from nextview.segmentation.view import Segment, View
+from nextview.sensing.view import Segment, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
 from nextview.things.score import score

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.segmentation.view import Grid, View
+from nextview.sensing.view import Grid, View
 from nextview.things.library import Hypotheses, Library
 from nextview.types import Float, Float32, Index, Mask
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances
-from nextview.segmentation.view import View
 from nextview.sensing.frame import Frame
+from nextview.sensing.view import View
 
 NOT_LEVEL = np.inf  # height of pixels of which no plane is known
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from nextview.segmentation.view import View
+from nextview.sensing.view import View
 from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
 from nextview.things.propose import propose
