@@ -128,7 +128,6 @@ def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):
     scene = nextview.Scene(ycb)
     frame = camera.frame(view(20))
     scene.update(replace(frame, pose=None))
-    assert by_name(scene)["mug"].result.pose_frame == "camera"
     with pytest.raises(ObservationError, match="needs a pose"):
         scene.update(frame)
 

@@ -23,7 +23,7 @@ from nextview.things.world import Thing, World
 from nextview.types import Float, Mask
 
 UNKNOWN_NAME = "unknown"
-SETTLED_VIEWS = 2  # views after which an unknown object is settled
+SETTLED_OBJECT_VIEWS = 2  # views after which an unknown object is settled
 TOUCHING = 0.015  # metres of depth between two objects that touch
 
 
@@ -141,7 +141,7 @@ def _object(
         UNKNOWN_NAME,
         0.0,
         False,
-        len(pixels) >= SETTLED_VIEWS,
+        len(pixels) >= SETTLED_OBJECT_VIEWS,
         middle,
         np.ptp(flat, axis=0),
         pixels,
