@@ -120,7 +120,7 @@ def _size(points: Float) -> float:
     """Half the largest distance between two points, however they are turned; 0 for none."""
     if len(points) < 2:
         return 0.0
-    from scipy.spatial.distance import cdist
+    from scipy.spatial.distance import cdist  # importing it takes time
 
     corners = hull_corners(points)
     farthest = max(
