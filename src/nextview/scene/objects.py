@@ -18,7 +18,13 @@ from nextview.recognition.poses import (
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.things.library import CAMERA_ERROR
-from nextview.things.naming import CONFIDENT, named, pose_candidates, why_in_doubt
+from nextview.things.naming import (
+    CONFIDENT,
+    LIKELY,
+    named,
+    pose_candidates,
+    why_in_doubt,
+)
 from nextview.things.world import Thing, World
 from nextview.types import Float, Mask
 
@@ -33,7 +39,7 @@ class SceneObject:
 
     Attributes:
         number: identifies the object in all frames.
-        name: of the known thing; "unknown" if it matches none.
+        name: of the known thing; "unknown" if that is likelier than each name.
         confidence: belief in the name, 0 to 1; 0 for an unknown object.
         confident: whether the belief is high enough to act on.
         settled: whether another view would hardly change its name: it is confident, or was unknown
@@ -71,7 +77,7 @@ class SceneObject:
     @property
     def pose(self) -> Float | None:
         """Pose of the scan in the world, (4, 4), metres; None for an unknown object."""
-        return self.candidates[0].pose if self.candidates else None
+        return self._posed.pose if self._posed else None
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
@@ -82,7 +88,12 @@ class SceneObject:
     @property
     def symmetry(self) -> Any:
         """Rotations after which the thing looks the same; None if they are not known."""
-        return self.candidates[0].symmetry if self.candidates else None
+        return self._posed.symmetry if self._posed else None
+
+    @property
+    def _posed(self) -> PoseCandidate | None:
+        """The likeliest pose of its name; None for an unknown object."""
+        return None if self.name == UNKNOWN_NAME else self.candidates[0]
 
     @property
     def most_like(self) -> str | None:
@@ -157,6 +168,8 @@ def _object(
     if found is None:
         return one
     candidates = pose_candidates(world, found)
+    if found.right < LIKELY:
+        return replace(one, beliefs=found.beliefs(world), candidates=candidates)
     sure = found.right >= CONFIDENT
     return replace(
         one,

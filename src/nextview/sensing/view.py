@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from nextview.segmentation.instances import Instances
 from nextview.sensing.facets import Noise, noise_of
@@ -23,6 +25,7 @@ LARGER = 1.2  # times the largest thing, above which an instance is none
 OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
 NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of one thing
+STEEPEST_SLOPE = 6.0  # depth over width of the steepest surface that is measured
 FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
 MOST_PARTED = 0.9  # share of an instance above which a piece is the instance
 
@@ -116,21 +119,24 @@ class View:
         surface = instances.surface | level
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
-        large = np.zeros(frame.shape, bool)
         for number, mask in enumerate(instances.masks, 1):
-            if _extent(frame, mask & inside) > LARGER * widest:
-                large |= mask  # a table, a wall, a room: no thing is as large
-            else:
-                labels[mask & inside] = number
+            labels[mask & inside] = number
+        # a table, a wall, a room: no thing is as large
+        alone = _not_large(frame, labels, LARGER * widest)
+        given = labels if instances.pieces is None else instances.pieces
+        given = np.where(inside & (frame.depth > 0), given, 0)
+        pieces = _not_large(
+            frame, _connected(given, frame, sigma), LARGER * widest
+        )
+        large = (labels > 0) & (alone == 0)
         surface |= large
         inside &= ~large
-        given = labels if instances.pieces is None else instances.pieces
-        pieces = np.where(inside, given, 0).astype(np.int32)
+        pieces[large] = 0
         return cls(
             frame,
             frame.camera_to_world,
             noise,
-            labels,
+            alone,
             pieces,
             surface,
             instances.background,
@@ -293,6 +299,41 @@ class View:
                 key = first[beside] * count + second[beside]
                 found += np.bincount(key, minlength=count**2).reshape(count, count)
         return found + found.T
+
+
+def _connected(pieces: Index, frame: Frame, sigma: Float32) -> NDArray[np.int32]:
+    """Return pieces, (H, W) int, that are parted where the depth jumps, (H, W) int32.
+
+    Args:
+        pieces: 0 for none.
+        frame: its frame.
+        sigma: standard deviation of the depth, (H, W), metres.
+    """
+    depth = frame.depth
+    steepest = STEEPEST_SLOPE / float(frame.intrinsics[0, 0]) * depth
+    most = np.maximum(np.maximum(NEIGHBOURS_APART, 4 * sigma), steepest)
+    at = np.cumsum(pieces.ravel() > 0).reshape(pieces.shape) - 1
+    count = int(at[-1, -1]) + 1
+    pairs = []
+    for one, two in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        joined = (pieces[one] == pieces[two]) & (pieces[one] > 0)
+        joined &= np.abs(depth[one] - depth[two]) < most[one]
+        pairs.append(np.stack([at[one][joined], at[two][joined]]))
+    ends = np.concatenate(pairs, 1)
+    graph = coo_array((np.ones(ends.shape[1], bool), ends), shape=(count, count))
+    found = np.zeros(pieces.shape, np.int32)
+    found[pieces > 0] = connected_components(graph, directed=False)[1] + 1
+    return found
+
+
+def _not_large(
+    frame: Frame, labels: NDArray[np.int32], most: float
+) -> NDArray[np.int32]:
+    """Return labels, (H, W) int32, without those of what is larger, metres."""
+    large = np.zeros(int(labels.max(initial=0)) + 1, bool)
+    for number in np.flatnonzero(np.bincount(labels.ravel())[1:]) + 1:
+        large[number] = _extent(frame, labels == number) > most
+    return np.where(large[labels], 0, labels).astype(np.int32)
 
 
 def _extent(frame: Frame, mask: Mask) -> float:

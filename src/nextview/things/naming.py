@@ -20,6 +20,7 @@ PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats cou
 CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
 LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
+LIKELY = 0.5  # belief below which an object is unknown
 LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
 
@@ -42,12 +43,18 @@ class Named:
     share: float
 
     def beliefs(self, world: World) -> dict[str, float]:
-        """Return the belief in each name, the likeliest first."""
+        """Return the belief in each name, the likeliest first; their sum is 1 at most."""
         found: dict[str, float] = {}
         for row, probability in zip(self.rows, self.probabilities, strict=True):
             name = world.library.names[int(world.hypotheses.things[row])]
             found[name] = found.get(name, 0.0) + float(probability)
-        return found
+        first = next(iter(found))
+        others = sum(found.values()) - found[first]
+        part = min(1.0, (1 - self.right) / max(others, 1e-9))
+        return {
+            name: self.right if name == first else part * belief
+            for name, belief in found.items()
+        }
 
 
 def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | None:

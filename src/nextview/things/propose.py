@@ -63,9 +63,8 @@ def _of_segment(
 ) -> Hypotheses | None:
     """Propose what one segment may show."""
     mask = segment.mask
-    none = np.zeros(mask.shape, bool)
-    unclear = none if segment.unclear is None else segment.unclear
-    hiding = view.hiding(mask, HIDING_MARGIN) & ~unclear
+    hiding = view.hiding(mask, HIDING_MARGIN)
+    unclear = hiding & False if segment.unclear is None else segment.unclear & ~hiding
     camera = PinholeCamera.of(view.frame.intrinsics, mask.shape)
     seen = SeenOutline.of(view.depth, mask, unclear, hiding, camera, view.camera)
     if seen is None:
