@@ -48,7 +48,7 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 # range of the template's log-size relative to the visible outline
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
-SHIFTS = (0.75, 1.5)  # step and range of the shifts of an occluded outline, sizes
+SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
