@@ -43,13 +43,15 @@ def cup(handle: bool) -> Mesh:
     return mesh_of(body, grip) if handle else mesh_of(body)
 
 
-def turned_views(mesh: Mesh, turn: np.ndarray) -> tuple[list[Observation], np.ndarray]:
+def turned_views(
+    mesh: Mesh, turn: np.ndarray, directions=VIEWS
+) -> tuple[list[Observation], np.ndarray]:
     """Exact views of a turned mesh, and the pose of its scan in the object frame, metres."""
     shown = rotated(mesh, turn)
     camera = SimulatedCamera(shown)
     views = [
         camera.observe(look_at_origin(np.radians(up), np.radians(around)))
-        for up, around in VIEWS
+        for up, around in directions
     ]
     pose = np.eye(4)
     pose[:3, :3] = turn
