@@ -13,7 +13,6 @@ import pytest
 import trimesh
 from factories import INTRINSICS, TABLE, box, cast, pose_at
 from matplotlib.contour import ContourSet
-from nextview.things.unknown import KnownResiduals
 from programs import main
 from scipy.spatial.transform import Rotation
 from test_household import bottle, mug
@@ -29,7 +28,7 @@ from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncertainty_of
 from nextview.sensing import Frame, ObservedObject
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.teaching import verification_fit
+from nextview.teaching import shown_views
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
@@ -68,7 +67,7 @@ def known(shared, metric_scans, few_episodes):
 
     def make(folder):
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(verification_fit, "ENOUGH_EPISODES", few_episodes)
+            patched.setattr(shown_views, "ENOUGH_TESTS", few_episodes)
             learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
 
     return shared("known", make) / "mine"
@@ -287,9 +286,7 @@ def test_a_thing_in_a_gripper_is_named_and_placed(system, turned):
 
 
 def test_an_object_that_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
-    usual = KnownResiduals(np.full(len(meshes), 0.3), (np.linspace(-0.3, 0.3, 99),))
     recogniser = recogniser_of(known)
-    recogniser.things.residuals = usual
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
     stranger = trimesh.util.concatenate(
         [box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))]

@@ -1,20 +1,10 @@
-"""When a scene is empty, when it is done, and how much of a frame full of litter is verified."""
+"""When a scene is empty, and when it is done."""
 
 import numpy as np
 import pytest
-import trimesh
-from factories import (
-    PlacedThing,
-    SimulatedTable,
-    TableCamera,
-    camera_over,
-    meshes_of,
-    view,
-)
+from factories import camera_over, meshes_of, view
 
 import nextview
-from nextview.cli.look import print_scene
-from nextview.scene.state import MOST_VERIFIED
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.simulation.sensor import SENSORS
@@ -128,56 +118,3 @@ def test_a_region_is_empty_where_its_ground_is_seen(ycb, low, high, said):
     assert names(look) == [said]
     assert scene.done == (said == "empty")
     assert scene.target is not None
-
-
-def test_an_object_that_lost_its_name_is_not_settled(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["mug"]])
-    scene = nextview.Scene(ycb)
-    scene.update(camera.frame(view(20)))
-    assert [thing.name for thing in scene.objects] == ["mug"]
-
-    scene._judge.unknown = 0.999999  # nearly nothing is explained so well
-    done = []
-    for degrees in (60, 100):
-        scene.update(camera.frame(view(degrees)))
-        assert [thing.name for thing in scene.objects] == ["unknown"]
-        done.append(scene.done)
-    assert done == [False, True]
-
-
-def litter(count: int) -> TableCamera:
-    """A camera over a table full of flat stones."""
-    rng = np.random.default_rng(3)
-    side = int(np.ceil(np.sqrt(count)))
-    ball = trimesh.creation.icosphere(2)
-    things = []
-    for k in range(count):
-        low = (0.012, 0.010, 0.007)
-        size = rng.uniform(low, (0.019, 0.016, 0.010))
-        pose = np.eye(4)
-        place = np.array([k % side, k // side]) - (side - 1) / 2
-        pose[:3, 3] = [*(0.05 * place + rng.uniform(-0.005, 0.005, 2)), size[2]]
-        stone = PlacedThing(f"{k}", ball.vertices * size, np.int32(ball.faces), pose)
-        things.append(stone)
-    return TableCamera(SimulatedTable(tuple(things)), SENSORS["stereo"], rng)
-
-
-@pytest.mark.long
-def test_a_limited_number_of_objects_is_verified_per_frame(ycb, capsys):
-    scene = nextview.Scene(ycb)
-    look = scene.update(litter(100).frame(view(20)))
-    segments = scene.tops[0].seen.segments()
-    assert len(segments) > MOST_VERIFIED + 10
-
-    verified = [mask for thing in scene.objects for mask in thing.pixels.values()]
-    assert MOST_VERIFIED / 2 < len(verified) <= 1.5 * MOST_VERIFIED
-    shown = np.any(verified, axis=0)
-    largest, others = segments[:MOST_VERIFIED], segments[MOST_VERIFIED:]
-    assert np.mean([(mask & shown).any() for mask in largest]) > 0.9
-    assert np.mean([(mask & shown).any() for mask in others]) < 0.1
-
-    left = f"{len(others)} small objects left unknown"
-    (told,) = [each for each in look.warnings if each.name == "left unknown"]
-    assert told.message.startswith(left)
-    print_scene(scene, "stones")
-    assert left in " ".join(capsys.readouterr().out.split())

@@ -105,8 +105,10 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     evidence -= 0.5 * float(motion @ information @ motion) + 0.5 * float(volume)
     anywhere = np.diag(np.repeat([1.0, 1 / radius**2], 3))
     return Followed(
-        expected.measured(motion, np.linalg.inv(told + information)),
-        np.linalg.inv(told + anywhere),
+        expected.measured(
+            motion, np.asarray(np.linalg.inv(told + information), np.float64)
+        ),
+        np.asarray(np.linalg.inv(told + anywhere), np.float64),
         evidence,
         visible,
     )

@@ -194,7 +194,7 @@ class View:
             stride / float(self.frame.intrinsics[0, 0]),
         )
 
-    def points(self, cells: Index) -> Float:
+    def points(self, cells: NDArray[np.integer]) -> Float:
         """Return the measured points of pixels of the grid, (N,), in the world, (N, 3), metres."""
         grid = self.grid()
         line, column = np.divmod(cells, grid.depth.shape[1])

@@ -23,7 +23,7 @@ from nextview.things.score import (
     Score,
     evened,
 )
-from nextview.types import Float, Mask
+from nextview.types import Float, Float32, Floats, Mask
 
 TRIPLES = 48  # planes through three pixels that are tried in each segment
 LEAST_FLAT = 0.25  # share of a segment that a plane explains, at least
@@ -54,7 +54,7 @@ def planes(view: View) -> tuple[Score, ...]:
 
 
 def _of_segment(
-    depth: Float, sigma: Float, slopes: Float, own: Mask
+    depth: Float32, sigma: Float32, slopes: Float, own: Mask
 ) -> Iterator[tuple[Score, Mask]]:
     """Return the planes of a segment, and the pixels that they continue in."""
     rng = np.random.default_rng(0)
@@ -101,7 +101,7 @@ def _of_segment(
         left = left & ~near
 
 
-def _drops(region: Mask, off: Float, depth: Float, margin: Float) -> int:
+def _drops(region: Mask, off: Floats, depth: Float32, margin: Floats) -> int:
     """Count the pixels around a plane behind which something is measured, or beyond a shadow."""
     rows, columns = within(region, SHADOW)
     region = region[rows, columns]
@@ -115,7 +115,7 @@ def _drops(region: Mask, off: Float, depth: Float, margin: Float) -> int:
 
 
 def _fitted(
-    slopes: Float, depth: Float, sigma: Float, rng: np.random.Generator
+    slopes: Float, depth: Float32, sigma: Float32, rng: np.random.Generator
 ) -> Float:
     """Return the plane n of most pixels, n . (x, y, 1) = 1 / depth, (3,) float64."""
     few = rng.permutation(len(depth))[:400]

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
-from nextview.types import Float, Float32, Index, Mask
+from nextview.types import Float, Float32, Floats, Mask
 
 LARGEST_TURN = 0.3  # radians in one step
 LARGEST_SHIFT = 0.25  # radii of the thing in one step
@@ -49,7 +49,7 @@ class Outline:
         height, width = mask.shape
         blocks = np.pad(mask, ((0, -height % OUTLINE_STEP), (0, -width % OUTLINE_STEP)))
         rows, columns = (side // OUTLINE_STEP for side in blocks.shape)
-        small = blocks.reshape(rows, OUTLINE_STEP, columns, OUTLINE_STEP).any((1, 3))
+        small = blocks.reshape(rows, OUTLINE_STEP, columns, OUTLINE_STEP).max((1, 3))
         distance, (row, column) = ndimage.distance_transform_edt(
             ~small, return_indices=True
         )
@@ -60,7 +60,9 @@ class Outline:
             (distance * OUTLINE_STEP).astype(np.float32),
         )
 
-    def at(self, row: Index, column: Index) -> tuple[Index, Index, Float32]:
+    def at(
+        self, row: NDArray[np.int32], column: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], Float32]:
         """Return the way down and aside to the segment, and its length, pixels, of pixels."""
         at = row // OUTLINE_STEP, column // OUTLINE_STEP
         return self.row[at] - row, self.column[at] - column, self.distance[at]
@@ -294,7 +296,7 @@ def cross(one: Float32, other: Float32) -> Float32:
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
-def skew(vectors: Float) -> Float:
+def skew(vectors: Floats) -> Float:
     """Return the matrices of the cross products with vectors, (..., 3) to (..., 3, 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
@@ -302,7 +304,7 @@ def skew(vectors: Float) -> Float:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def turned(vectors: Float) -> Float:
+def turned(vectors: Floats) -> Float:
     """Return the rotations by rotation vectors, (M, 3) to (M, 3, 3), radians."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     cross = skew(vectors)

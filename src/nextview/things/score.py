@@ -284,7 +284,7 @@ def _rendered(
         and normal, (M, h, w) float32.
     """
     count, height, width = len(some), y.shape[1], x.shape[1]
-    rays = np.ones((count, height, width, 3), np.float32)
+    rays: Float32 = np.ones((count, height, width, 3), np.float32)
     rays[..., 0] = x[:, None]
     rays[..., 1] = y[:, :, None]
     rays = rays.reshape(count, -1, 3)

@@ -48,7 +48,7 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 # range of the template's log-size relative to the visible outline
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
-SHIFTS = (0.75, 1.5)  # step and range of the shifts of an occluded outline, sizes
+SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
@@ -346,16 +346,17 @@ def _rendered(caster: SurfaceCaster, thing: int, looks: Float) -> _Rendered:
     picked = _picked(shown)
     each = np.arange(len(looks))[:, None]
     points = origins[:, None] + towards[each, picked] * depth[each, picked][..., None]
-    points = np.where(shown.any(1)[:, None, None], points - caster.centres[thing], 0)
+    count = shown.sum(1)
+    points = np.where(count[:, None, None] > 0, points - caster.centres[thing], 0)
     normals = across[each, picked]
-    fill = shown.mean(1).astype(np.float32)
-    kept = shown.sum(1) >= FEWEST_OUTLINE_PIXELS
+    fill = (count / shown.shape[1]).astype(np.float32)
+    kept = count >= FEWEST_OUTLINE_PIXELS
     looks = looks[kept]
     depth = depth[kept]
     shown = shown[kept]
+    count = count[kept]
 
     # centre and spread of each outline, and its median depth
-    count = shown.sum(1)
     pixels = np.stack([column, row], -1).astype(np.float64)
     centre = shown @ pixels / count[:, None]
     squares = shown @ pixels**2 / count[:, None]
@@ -619,16 +620,18 @@ def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
         template, sizes, (A, N) float32.
     """
     some = len(seen.outline)
-    of_view = np.concatenate([seen.outline, seen.known, seen.depth, seen.depth**2])
+    of_view = np.concatenate(
+        [seen.outline, seen.known, seen.depth, np.square(seen.depth)]
+    )
     both, told, depths, squares = np.split(of_view @ known.outline.T, 4)
     across = np.concatenate([seen.outline, seen.depth]) @ known.depth.T
     one = max(seen.area, 1.0) + told - both
     overlap = both / np.maximum(one, both + 1e-6)
 
     # Variance of the depth difference in the intersection.
-    count = np.maximum(both, 1)
+    count: Float32 = np.maximum(both, np.float32(1))
     mean = (depths - across[:some]) / count
-    squares = squares + seen.outline @ (known.depth**2).T - 2 * across[some:]
-    squares = squares / count - mean**2
+    squares = squares + seen.outline @ np.square(known.depth).T - 2 * across[some:]
+    squares = squares / count - np.square(mean)
     costs = OUTLINE_WEIGHT * (1 - overlap) + DEPTH_WEIGHT * np.sqrt(squares.clip(0))
     return costs, mean

@@ -267,7 +267,7 @@ class World:
         count = 0
         for old, new in zip(before.owners, self.owners, strict=False):
             mine = old == number
-            count += np.count_nonzero(mine)
+            count += int(np.count_nonzero(mine))
             shared += np.bincount(new[mine], minlength=self.next_number)
         shared[0] = 0
         return int(shared.argmax()) if 2 * shared.max() > count else 0
@@ -531,9 +531,9 @@ def _seen_again(world: World, view: View) -> tuple[tuple[Score | None, ...], ...
     column: list[Score | None] = [None] * len(expected)
     new = set(range(len(masks)))
     while alike.max(initial=0) > SAME_SEGMENT:
-        k, n = np.unravel_index(alike.argmax(), alike.shape)
+        k, n = divmod(int(alike.argmax()), len(masks))
         column[k] = _weak(masks[n])
-        new.discard(int(n))
+        new.discard(n)
         alike[k] = 0
         alike[:, n] = 0
     found = [(*row, last) for row, last in zip(world.strangers, column, strict=True)]

@@ -1,0 +1,285 @@
+"""Surfaces of scans and frames: rays cast at them, what is simplified, and their symmetries."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from exact_views import cup, explained, l_block, library_of, mesh_of, turned_views
+from recordings import write_captured
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.folders import read_capture
+from nextview.errors import MeshError
+from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.ray_caster import embree_scene
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.fusion import fuse
+from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.symmetry import find_symmetries
+
+
+def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
+    rng = np.random.default_rng(0)
+    meshes = [
+        l_block(),
+        cup(True),
+        mesh_of(((0.5, 0.3, 0.2), (1.0, 2.0, 3.0))),
+        cup(False),
+    ]
+    surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
+    things = rng.integers(len(surfaces), size=12)
+    directions = rng.normal(size=(12, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    centres = np.stack([surfaces[k].centre for k in things])
+    origins = (centres + 0.8 * directions).astype(np.float32)
+    rays = (
+        (centres + rng.normal(0, 0.04, (200, 12, 3)) - origins)
+        .swapaxes(0, 1)
+        .astype(np.float32)
+    )
+
+    depth, normals = SurfaceCaster(surfaces).cast(things, origins, rays)
+    for row, thing in enumerate(things):
+        alone = embree_scene([(surfaces[thing].vertices, surfaces[thing].faces)])
+        hits = alone.run(
+            np.tile(origins[row], (200, 1)),
+            np.ascontiguousarray(rays[row]),
+            output=1,
+        )
+        met = hits["primID"] >= 0
+        # rays along an edge may go either way
+        assert np.mean(met != np.isfinite(depth[row])) < 0.02
+        both = met & np.isfinite(depth[row])
+        assert both.sum() > 20
+        np.testing.assert_allclose(depth[row, both], hits["tfar"][both], atol=1e-4)
+        assert (np.einsum("pi,pi->p", normals[row, both], rays[row, both]) < 0).all()
+        np.testing.assert_allclose(
+            np.linalg.norm(normals[row, both], axis=1),
+            1,
+            atol=1e-4,
+        )
+
+
+def test_a_surface_keeps_the_scan_frame_and_drops_invisible_parts():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    ball.apply_translation((2.0, -1.0, 0.5))
+    in_millimetres = make_mesh(1000 * ball.vertices, ball.faces, unit="mm")
+    surface = Surface.from_mesh(in_millimetres, "ball")
+    np.testing.assert_allclose(surface.centre, (2.0, -1.0, 0.5), atol=1e-5)
+    assert surface.diameter == pytest.approx(0.1, rel=1e-3)
+    few = surface.simplified()
+    assert len(few.faces) < len(surface.faces) / 4
+    off = (
+        np.linalg.norm(
+            few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5),
+            axis=1,
+        )
+        - 0.05
+    )
+    assert np.abs(off).max() < 0.001
+    block = Surface.from_mesh(l_block(), "block")
+    assert block.simplified() is block  # it has no triangle too many
+    with pytest.raises(MeshError, match="unit of length is not known"):
+        Surface.from_mesh(make_mesh(ball.vertices, ball.faces), "ball")
+
+
+@pytest.mark.parametrize(
+    ("body", "part"),
+    [
+        (
+            trimesh.creation.icosphere(subdivisions=5, radius=0.04),
+            trimesh.creation.box((0.02, 0.012, 0.012)),
+        ),
+        (
+            trimesh.creation.box((0.1, 0.07, 0.08)),
+            trimesh.creation.icosphere(subdivisions=5, radius=0.01),
+        ),
+    ],
+    ids=["few triangles on a fine body", "a fine knob on a body of few triangles"],
+)
+def test_a_small_part_is_not_simplified_away_and_does_not_spoil_the_rest(body, part):
+    part = part.copy()
+    part.apply_translation((0.5 * body.extents[0], 0.0, 0.0))
+    whole = trimesh.util.concatenate([body, part])
+    mesh = make_mesh(whole.vertices, whole.faces, unit="m")
+    few = Surface.from_mesh(mesh, "thing").simplified()
+    assert len(few.faces) < len(mesh.faces)
+
+    camera = SimulatedCamera(mesh)
+    simple = SimulatedCamera(make_mesh(few.vertices, few.faces, unit="m"))
+    for around in (0.0, 60.0, 180.0):
+        pose = look_at_origin(np.radians(20.0), np.radians(around))
+        exact = camera.observe(pose).depth
+        off = np.abs(simple.observe(pose).depth - exact) * mesh.metres
+        assert np.mean(off[exact > 0] > 0.003) < 0.01
+
+
+# Symmetries
+
+
+def turned_about(mesh_vertices, faces, seed, name="thing"):
+    """A surface with its axes and its origin anywhere."""
+    rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return rotation, Surface(
+        name,
+        (mesh_vertices @ rotation.T + (0.4, -0.2, 0.1)).astype(np.float32),
+        faces.astype(np.int32),
+    )
+
+
+def prism(sides, radius=0.04, height=0.1):
+    return trimesh.creation.cylinder(radius, height, sections=sides)
+
+
+SYMMETRIC = {
+    "can": (trimesh.creation.cylinder(0.03, 0.12, sections=64), [0, 2]),
+    "cone": (trimesh.creation.cone(0.04, 0.1, sections=64), [0]),
+    "ball": (trimesh.creation.icosphere(4, 0.04), [0, 0, 0]),
+    "box": (trimesh.creation.box((0.05, 0.09, 0.16)), [2, 2, 2]),
+    "square block": (trimesh.creation.box((0.08, 0.08, 0.2)), [4, 2, 2]),
+    "cube": (trimesh.creation.box((0.06, 0.06, 0.06)), [4, 4, 4]),
+    "prism of three": (prism(3), [3, 2]),
+    "prism of five": (prism(5, 0.08), [5, 2]),
+    "two arms": (
+        trimesh.util.concatenate(
+            [trimesh.creation.box((0.16, 0.03, 0.03)), prism(48, 0.03, 0.06)]
+        ),
+        [2, 2, 2],
+    ),
+}
+
+
+@pytest.mark.parametrize(("seed", "name"), enumerate(SYMMETRIC))
+def test_symmetries_are_found_about_any_axis(seed, name):
+    mesh, expected = SYMMETRIC[name]
+    rotation, surface = turned_about(mesh.vertices, mesh.faces, seed)
+    found = find_symmetries(surface)
+    orders = [one.order for one in found]
+    if (
+        expected[0] % 2
+    ):  # several axes across an odd one are alike: one of them is enough
+        orders = orders[:1] + sorted(set(orders[1:]))
+    assert orders == expected
+    if len(set(expected)) > 1 or expected == [0]:
+        assert (
+            abs(rotation[:, 2] @ found[0].axis) > 0.998
+        )  # the axis of what is made here is z
+
+
+def with_handle(size):
+    """A can with a handle so many metres wide."""
+    body = trimesh.creation.cylinder(0.04, 0.1, sections=64)
+    handle = trimesh.creation.box((size, 0.01, 0.06))
+    handle.apply_translation((0.04 + size / 2, 0, 0))
+    return trimesh.util.concatenate([body, handle])
+
+
+@pytest.mark.parametrize(("handle", "symmetric"), [(0.0003, True), (0.03, False)])
+def test_indistinguishable_rotations_are_symmetries_unless_a_handle_breaks_them(
+    handle, symmetric
+):
+    mesh = with_handle(handle)
+    found = find_symmetries(turned_about(mesh.vertices, mesh.faces, 3)[1])
+    assert any(one.order == 0 for one in found) == symmetric
+
+
+@pytest.mark.parametrize("thickness", [0.0, 0.004])
+def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
+    sheet = trimesh.creation.box((0.1, 0.2, thickness or 1e-9))
+    found = find_symmetries(turned_about(sheet.vertices, sheet.faces, 4)[1])
+    assert {one.order for one in found} == {2}
+    irregular = trimesh.Trimesh(
+        [[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]],
+        [[0, 1, 2]],
+        process=False,
+    )
+    assert (
+        find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()
+    )
+
+
+# Surfaces from frames
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """A block with a thin wall, 12 cm long, captured from 12 viewpoints on a table; metres."""
+    mesh = mesh_of(
+        ((0.12, 0.06, 0.03), (0.0, 0.0, 0.0)),
+        ((0.004, 0.06, 0.05), (0.03, 0.0, 0.04)),
+    )
+    folder = tmp_path_factory.mktemp("captured") / "block"
+    write_captured(mesh, folder, ViewSphere((15.0, 50.0), 6), mesh.metres, table=True)
+    return mesh, folder
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+def test_a_surface_from_frames_covers_the_visible_part_of_the_thing(
+    captured,
+    noise,
+):
+    mesh, folder = captured
+    camera = CapturedCamera(read_capture(folder))
+    rng = np.random.default_rng(4)
+    clean = camera.observe
+
+    def observe(pose):
+        frame = clean(pose)
+        depth = frame.depth + (noise * rng.normal(size=frame.shape)).astype(np.float32)
+        return replace(
+            frame,
+            depth=np.where(frame.depth > 0, depth, 0).astype(np.float32),
+            pixel_centre=0.5,
+        )
+
+    camera.observe = observe
+    camera.take_all(look_at_origin(0.3, 0.0))
+    surface = fuse(camera.object.sightings, camera.object.object_frame.radius, "block")
+
+    # the world's origin is below the middle of the mesh
+    height = -mesh.metres * mesh.vertices[:, 2].min()
+    true = Surface.from_mesh(mesh, "block")
+    truth = true.sample(100_000, rng) - true.centre + (0, 0, height)
+    off = cKDTree(truth).query(surface.sample(2000, rng))[0]
+    assert (
+        off.mean() < 0.0006 + noise / 4
+    )  # samples of the truth lie half a millimetre apart
+    assert np.quantile(off, 0.95) < 0.0015 + noise
+
+    seen = truth[truth[:, 2] > 0.004]  # not the side that it stands on
+    gaps = cKDTree(surface.sample(20_000, rng)).query(seen[:2000])[0]
+    assert np.quantile(gaps, 0.95) < 0.003
+
+
+def test_frames_with_almost_no_visible_points_give_no_surface(captured):
+    camera = CapturedCamera(read_capture(captured[1]))
+    camera.take_all(look_at_origin(0.3, 0.0))
+    one = camera.object.sightings[0]
+    few = replace(one, facets=one.facets.some(slice(0, 20)))
+    assert fuse([few], 0.07, "block") is None
+    assert (
+        fuse([replace(one, facets=one.facets.some(slice(0, 0)))], 0.07, "block") is None
+    )
+
+
+def can(knob: bool) -> Mesh:
+    """A round tin, with a knob on its side or without."""
+    body = trimesh.creation.cylinder(radius=0.05, height=0.1, sections=96)
+    part = trimesh.creation.box((0.04, 0.024, 0.03))
+    part.apply_translation((0.05, 0.0, 0.0))
+    whole = trimesh.util.concatenate([body, part]) if knob else body
+    return make_mesh(whole.vertices, whole.faces, unit="m")
+
+
+@pytest.mark.parametrize("yaw", [40, 55])
+def test_a_knob_of_a_round_thing_is_found(yaw):
+    library = library_of(can(True), can(False))
+    views, _ = turned_views(can(True), rotation_z(np.radians(yaw)), [(25.0, 30.0)])
+    found = explained(library, views)
+    assert found.thing == 0
+    turned = np.degrees(np.arctan2(found.pose[1, 0], found.pose[0, 0]))
+    assert turned == pytest.approx(yaw, abs=3)
