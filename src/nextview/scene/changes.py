@@ -2,29 +2,31 @@
 
 Each is a ratio of two totals of the score: of the thing where it was, where it is now, and nowhere.
 So is the question whether the camera stands where it is said to: one error of its pose, or several
-things that have moved.
+things that have moved. Of a thing without a clear name, the surface that was measured is compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from nextview.sensing.view import View
-from nextview.things.library import Hypotheses
+from nextview.scene.followed import SURPRISE
+from nextview.sensing.view import LEAST_ERROR, View
+from nextview.things.library import Hypotheses, Library
+from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
-from nextview.things.score import score, total
+from nextview.things.score import OUTLIER, STEEPEST, Score, score, total
+from nextview.things.surface import Surface
 from nextview.things.world import (
     CLEAR_SHARE,
-    MOVED,
-    MOVED_SHARE,
     NEW_OBJECT,
     Thing,
     World,
     corrected,
-    world_points,
 )
 from nextview.types import Float, Index
 
@@ -36,8 +38,6 @@ ALONE = (
     0.06,
     0.03,
 )  # reaches of the registration in one view, radii
-MOST_GONE = 0.7  # share of a stranger that is seen through when it is gone
-BEHIND = 0.015  # metres behind a stranger, from which on it is seen through
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +47,7 @@ class Changes:
     Attributes:
         world: the things that still stand, and those that have moved.
         view: with the pose of its camera corrected.
+        held: number of the moved thing that each pixel of the grid of the view shows, 0 for none.
         moved: numbers of things that stand elsewhere.
         gone: things that are no longer where they were.
         stand: numbers of things that the view shows where they were.
@@ -56,10 +57,28 @@ class Changes:
 
     world: World
     view: View
+    held: NDArray[np.int32]
     moved: tuple[int, ...] = ()
     gone: tuple[Thing, ...] = ()
     stand: tuple[int, ...] = ()
     wrong_pose: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A known thing in a view.
+
+    Attributes:
+        thing: in the world.
+        now: what the view shows of it: "hidden" where it is not in the view.
+        pose: that explains the view best.
+        cells: pixels of the grid that it explains in this pose, (N,).
+    """
+
+    thing: Thing
+    now: Literal["stands", "moved", "gone", "hidden"]
+    pose: Hypotheses
+    cells: Index
 
 
 def changes(world: World, view: View, camera_stands: bool) -> Changes:
@@ -70,91 +89,180 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         view: the view.
         camera_stands: whether the camera has not moved since a frame that fits.
     """
-    named = [one for one in world.things if one.row >= 0]
-    if named:
-        rows = np.array([one.row for one in named])
-        if not camera_stands:
-            view = corrected(world, view)
-        return _compared(world, view, named, rows, camera_stands)
-    return _without_gone_strangers(Changes(world, view))
+    if not camera_stands:
+        view = corrected(world, view)
+    found = [*_named(world, view), *_unnamed(world, view)]
+    moved = [one for one in found if one.now == "moved"]
+    gone = tuple(one.thing for one in found if one.now == "gone")
+    stand = tuple(one.thing.number for one in found if one.now == "stands")
+    held = np.zeros(view.grid().depth.size, np.int32)
+    for one in moved:
+        held[one.cells] = one.thing.number
+    changed = len(moved) + len(gone)
+    return Changes(
+        _after(world, moved, gone) if changed else world,
+        view,
+        held,
+        tuple(one.thing.number for one in moved),
+        gone,
+        stand,
+        not camera_stands and changed > 1 and changed > len(stand),
+    )
+
+
+def _clear(one: Thing) -> bool:
+    """Whether a thing is explained so well that its name and pose tell where it stands."""
+    return one.row >= 0 and one.share >= CLEAR_SHARE
+
+
+def _named(world: World, view: View) -> Iterator[_Compared]:
+    """Compare the things with clear names."""
+    things = [one for one in world.things if _clear(one)]
+    rows = np.array([one.row for one in things], np.int64)
+    return _compared(world, view, things, world.library, world.hypotheses[rows])
+
+
+def _unnamed(world: World, view: View) -> Iterator[_Compared]:
+    """Compare the surfaces that were measured of all other things."""
+    things, surfaces = [], []
+    for one in world.things:
+        surface = None if _clear(one) else _measured(world, one.number)
+        if surface is not None:
+            things.append(one)
+            surfaces.append(surface)
+    if not things:
+        return iter(())
+    library = Library(surfaces)
+    turns = np.tile(np.eye(3), (len(things), 1, 1))
+    there = Hypotheses.of(np.arange(len(things)), turns, library.centres)
+    return _compared(world, view, things, library, there)
 
 
 def _compared(
     world: World,
     view: View,
-    named: Sequence[Thing],
-    rows: Index,
-    camera_stands: bool,
-) -> Changes:
-    """Compare the view with each named thing."""
-    library = world.library
-    there = world.hypotheses[rows]
-    before = np.array([total(world.scores[row]) for row in rows])
-    # one pose in all views, or another one in the new view
-    joint = register(library, [*world.views, view], there, (0.06, 0.03, 0.02), 96)
-    columns = [score(library, one, joint) for one in world.views]
-    after = np.array([total(row) for row in zip(*columns, strict=True)])
-    now = score(library, view, joint)
+    things: Sequence[Thing],
+    library: Library,
+    there: Hypotheses,
+) -> Iterator[_Compared]:
+    """Compare the view with things where they were: one pose in all views, or another one now."""
+    whole = library is world.library
+
+    def scores(one: View, some: Hypotheses) -> list[Score | None]:
+        found = score(library, one, some)
+        return found if whole else [each and _of_part(each) for each in found]
+
+    # a view from before a thing came to where it stands says nothing
+    stood = [[one is not None for one in thing.scores] for thing in things]
+
+    def totals(some: Hypotheses) -> list[float]:
+        columns = [scores(one, some) for one in world.views]
+        rows = zip(*columns, strict=True)
+        return [
+            total([each for each, was in zip(row, since, strict=True) if was])
+            for row, since in zip(rows, stood, strict=True)
+        ]
+
+    stays = totals(there), scores(view, there)
+    better = register(library, [*world.views, view], there, (0.06, 0.03, 0.02), 96)
+    refined = totals(better), scores(view, better)
     alone = register(library, [view], there, ALONE, 96)
-    elsewhere = score(library, view, alone)
-
-    moved, gone, stand = [], [], []
-    new_poses: dict[int, int] = {}
-    for k, one in enumerate(named):
-        found, other = now[k], elsewhere[k]
-        if found is None or found.seen == 0:
-            continue
-        if one.share < CLEAR_SHARE:
-            # a doubtful name or pose tells nothing about moves
-            stand += [one.number] * (found.total > NEW_OBJECT)
-            continue
-        if other is not None and other.total > NEW_OBJECT:
-            apart = before[k] + other.total
-            least = MOVED + MOVED_SHARE * min(before[k], other.total)
-            if apart - (after[k] + found.total) > least:
-                moved.append(one.number)
-                new_poses[one.row] = k
-                continue
-        if found.total < -NEW_OBJECT and found.through > found.seen / 2:
-            gone.append(one)
-        elif found.total > NEW_OBJECT:
-            stand.append(one.number)
-    changed = len(moved) + len(gone)
-    wrong = not camera_stands and changed > 1 and changed > len(stand)
-    told = Changes(world, view, tuple(moved), tuple(gone), tuple(stand), wrong)
-    if wrong or not changed:
-        return _without_gone_strangers(told)
-    return _without_gone_strangers(
-        replace(told, world=_after(world, told, alone, new_poses))
-    )
+    others = scores(view, alone)
+    apart = _displaced(library, view, there, alone)
+    for k, one in enumerate(things):
+        before, found = max(
+            ((each[0][k], each[1][k]) for each in (stays, refined)),
+            key=lambda each: each[0] + total(each[1:]),
+        )
+        now: Literal["stands", "moved", "gone", "hidden"] = "hidden"
+        other = others[k]
+        cells = np.zeros(0, np.int64)
+        if found is not None and found.seen > 0:
+            if found.total > NEW_OBJECT:
+                now = "stands"
+            elif found.total < -NEW_OBJECT and found.through > found.seen / 2:
+                now = "gone"
+            if other is not None and other.total > NEW_OBJECT:
+                gained = stays[0][k] + other.total - before - found.total
+                if min(gained / PIXELS_ALIKE, apart[k]) > SURPRISE:
+                    now = "moved"
+                    cells = other.cells[other.gain > 0]
+        yield _Compared(one, now, alone[k : k + 1], cells)
 
 
-def _after(
-    world: World, told: Changes, alone: Hypotheses, new_poses: dict[int, int]
-) -> World:
+def _displaced(
+    library: Library, view: View, there: Hypotheses, now: Hypotheses
+) -> Float:
+    """Return how unlikely errors of a view are to show things where they are not, nats, (M,).
+
+    Depth is bent, and edges lie within a pixel.
+    """
+    ray = there.centres - view.camera[:3, 3]
+    away = np.linalg.norm(ray, axis=1)
+    shift = now.centres - there.centres
+    along = (shift * ray).sum(1) / away
+    # of points on a surface about its centre: a third of their largest squared motion
+    turn = ((now.rotations - there.rotations) ** 2).sum((1, 2)) / 2
+    turned = library.radii[there.things] ** 2 * turn / 3
+    square = (shift**2).sum(1) - along**2 + turned
+    pixel = away / view.frame.pinhole.fx
+    return ((along / LEAST_ERROR / away) ** 2 + square / pixel**2) / 2
+
+
+def _of_part(one: Score) -> Score:
+    """Return the score of a part of a thing: what shows beside it may be more of the thing."""
+    return replace(one, paid=OUTLIER * one.through)
+
+
+def _measured(world: World, number: int) -> Surface | None:
+    """Return the surface that the views have measured of a thing, in the world; None for none."""
+    vertices, faces = [], []
+    count = 0
+    for view, owner in zip(world.views, world.owners, strict=True):
+        grid = view.grid()
+        own = (owner == number).reshape(grid.depth.shape)
+        at = np.where(own, count + np.cumsum(own).reshape(own.shape) - 1, -1)
+        for corners in (np.s_[:-1, :-1], np.s_[1:, 1:]):
+            across = at[:-1, 1:], at[corners], at[1:, :-1]
+            depth = np.stack(
+                [grid.depth[:-1, 1:], grid.depth[corners], grid.depth[1:, :-1]]
+            )
+            whole = np.min(across, axis=0) >= 0
+            whole &= np.ptp(depth, axis=0) < grid.pitch / STEEPEST * depth.min(0)
+            faces.append(np.stack(across, -1)[whole])
+        vertices.append(view.points(np.flatnonzero(own)))
+        count += len(vertices[-1])
+    every = np.concatenate(faces).astype(np.int32)
+    if not len(every):
+        return None
+    points = np.concatenate(vertices).astype(np.float32)
+    return Surface(str(number), points, every)
+
+
+def _after(world: World, moved: Sequence[_Compared], gone: Sequence[Thing]) -> World:
     """Return the world without what moved or is gone, and with the new poses."""
-    left = [one for one in world.things if one.number in told.moved or one in told.gone]
+    left = [*(one.thing for one in moved), *gone]
     dropped: set[int] = set()
     for one in left:
-        dropped |= set(world.rivals(one.row).tolist())
+        if one.row >= 0:
+            dropped |= set(world.rivals(one.row).tolist())
     dropped -= {one.row for one in world.things if one.row >= 0 and one not in left}
     world = _forgotten(world, [one.number for one in left])
     kept = np.array(
         [row for row in range(len(world.scores)) if row not in dropped], np.int64
     )
     world = world.with_rows(kept)
-    some = alone[np.array(list(new_poses.values()), np.int64)]
-    nothing = ((None,) * len(world.views),) * len(some)
-    moved = [one for one in left if one.number in told.moved]
+    named = [one for one in moved if _clear(one.thing)]
+    nothing = ((None,) * len(world.views),) * len(named)
     return replace(
         world,
-        hypotheses=Hypotheses.joined([world.hypotheses, some]),
+        hypotheses=Hypotheses.joined([world.hypotheses, *(one.pose for one in named)]),
         scores=(*world.scores, *nothing),
-        keys=np.append(world.keys, world.next_key + np.arange(len(some))),
-        next_key=world.next_key + len(some),
+        keys=np.append(world.keys, world.next_key + np.arange(len(named))),
+        next_key=world.next_key + len(named),
         given={
             **world.given,
-            **{world.next_key + k: one.number for k, one in enumerate(moved)},
+            **{world.next_key + k: one.thing.number for k, one in enumerate(named)},
         },
     )
 
@@ -181,40 +289,3 @@ def _forgotten(world: World, numbers: Sequence[int]) -> World:
         for cells, owner in zip(held, world.owners, strict=True)
     )
     return replace(world, views=tuple(views), strangers=tuple(kept), owners=owners)
-
-
-def _without_gone_strangers(told: Changes) -> Changes:
-    """Return the changes with the strangers that the view sees through."""
-    world, view = told.world, told.view
-    gone = [
-        one
-        for one in world.things
-        if one.row < 0
-        and _seen_through(world_points(world, one.scores), view) > MOST_GONE
-    ]
-    if not gone:
-        return told
-    kept = [
-        row for row in world.strangers if not any(row is one.scores for one in gone)
-    ]
-    world = _forgotten(world, [one.number for one in gone])
-    things = tuple(one for one in world.things if one not in gone)
-    world = replace(world, strangers=tuple(kept), things=things)
-    return replace(told, world=world, gone=(*told.gone, *gone))
-
-
-def _seen_through(points: Float, view: View) -> float:
-    """Return the share of points, (N, 3), world, behind which a view measures something."""
-    camera = view.camera
-    seen = (points - camera[:3, 3]) @ camera[:3, :3]
-    ahead = seen[:, 2] > 0.05
-    at = view.frame.pinhole.project(seen[ahead])
-    column, row = np.floor(at).astype(np.int64).T
-    height, width = view.frame.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    depth = view.depth[row[inside], column[inside]]
-    measured = depth > 0
-    if np.count_nonzero(measured) < 0.5 * len(points) or not len(points):
-        return 0.0
-    behind = depth[measured] > seen[ahead][inside, 2][measured] + BEHIND
-    return float(behind.mean())

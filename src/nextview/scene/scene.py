@@ -604,7 +604,7 @@ class Scene:
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
 
-        world = told.world.with_view(told.view)
+        world = told.world.with_view(told.view, told.held)
         world = world.searched(np.ones(len(world.library), bool)).numbered()
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, before.world, gone)

@@ -105,8 +105,15 @@ class World:
         """Return the thing with this number."""
         return next(one for one in self.things if one.number == number)
 
-    def with_view(self, view: View) -> World:
-        """Return the world after another view, before anything new is searched for."""
+    def with_view(self, view: View, held: NDArray[np.int32] | None = None) -> World:
+        """Return the world after another view, before anything new is searched for.
+
+        Args:
+            view: the view.
+            held: number of the thing that each pixel of its grid is known to show, 0 for none.
+        """
+        if held is None:
+            held = np.zeros(view.grid().depth.size, np.int32)
         some = self.hypotheses
         views = (*self.views, view)
         if len(self.views) < SETTLED_VIEWS and len(some):
@@ -126,7 +133,7 @@ class World:
                 *((*row, None) for row in self.flat),
                 *((*(None,) * len(self.views), one) for one in planes(view)),
             ),
-            owners=(*self.owners, np.zeros(view.grid().depth.size, np.int32)),
+            owners=(*self.owners, held),
         )
         return _balanced(world).chosen()
 
