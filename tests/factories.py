@@ -436,7 +436,7 @@ def poses_around(azimuths, elevation, distance, centre) -> np.ndarray:
 
 
 def camera_over(
-    meshes: Sequence[Mesh], seed: int = 5, sensor: str = "stereo", gap: float = 0.08
+    meshes: Sequence[Mesh], seed: int = 8, sensor: str = "stereo", gap: float = 0.08
 ) -> TableCamera:
     """A camera over a table on which some things are put down at random."""
     rng = np.random.default_rng(seed)

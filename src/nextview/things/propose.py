@@ -27,6 +27,7 @@ SCORED = 24  # hypotheses that are rendered, at most
 SCORED_OF_ONE = 3
 KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2
+SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
 COARSER = 2  # grid on which they are rendered to choose among them
 HIDING_MARGIN = (
     1.0  # sizes of the segment, within which something may hide a part of it
@@ -81,10 +82,10 @@ def _of_segment(
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
-    found = found[best(found.things, match, MATCHED, MATCHED_OF_ONE)]
+    found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
     found = register(library, [view], found, (0.1, 0.06, 0.04), 96, outline)
     match = matched(library, view, found, mask, 96)
-    found = found[best(found.things, match, SCORED, SCORED_OF_ONE)]
+    found = best(library, found, match, SCORED, SCORED_OF_ONE)
     found = register(library, [view], found, (0.03, 0.02), 128, outline)
     totals = np.array(
         [
@@ -92,20 +93,36 @@ def _of_segment(
             for one in score(library, view, found, COARSER)
         ]
     )
-    return found[best(found.things, totals, KEPT, KEPT_OF_ONE)]
+    return best(library, found, totals, KEPT, KEPT_OF_ONE)
 
 
-def best(things: Index, values: Float, most: int, of_one: int) -> Index:
-    """Return the rows with the highest values, at most some of one thing, (N,) int64.
+def best(
+    library: Library, some: Hypotheses, values: Float, most: int, of_one: int
+) -> Hypotheses:
+    """Return the hypotheses with the highest values, no pose twice and few of one thing.
 
     Args:
-        things: thing of each row, (M,).
-        values: of each row, (M,).
-        most: number of rows.
-        of_one: number of rows of one thing.
+        library: the things.
+        some: M hypotheses.
+        values: of each, (M,).
+        most: number that is returned, at most.
+        of_one: number of those of one thing, at most.
     """
-    order = np.argsort(-values, kind="stable")
-    return order[rank_within(things[order]) < of_one][:most]
+    turns = some.rotations.reshape(-1, 9)
+    angle = np.sqrt(np.maximum(3 - turns @ turns.T, 0))
+    apart = np.linalg.norm(some.centres[:, None] - some.centres, axis=2)
+    same = angle + apart / library.radii[some.things] < SAME_POSE
+    same &= some.things[:, None] == some.things
+    left = np.ones(len(some), bool)
+    counts = np.zeros(len(library), np.int64)
+    kept: list[int] = []
+    for row in np.argsort(-values, kind="stable"):
+        thing = some.things[row]
+        if left[row] and counts[thing] < of_one and len(kept) < most:
+            kept.append(int(row))
+            counts[thing] += 1
+            left &= ~same[row]
+    return some[np.array(kept, np.int64)]
 
 
 def matched(

@@ -32,6 +32,7 @@ EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
+SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
 MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
 LEAST_OWN = 0.5  # share of a stranger that nothing else explains, at least
 MOVED = 60.0  # nats that another pose has to explain better, for a thing to have moved
@@ -145,8 +146,12 @@ class World:
         """
         world = self
         view = self.views[-1]
-        for segments in (view.instances, view.unions, view.fragments):
-            shown = world.explained()
+        for segments, share in (
+            (view.instances, SURE_SHARE),
+            (view.unions, CLEAR_SHARE),
+            (view.fragments, CLEAR_SHARE),
+        ):
+            shown = world.explained(share)
             left = [one for one in segments() if shown[one.mask].mean() < EXPLAINED]
             new = propose(self.library, view, left, among)
             if new is not None:
@@ -167,13 +172,17 @@ class World:
             next_key=self.next_key + len(new),
         )
 
-    def explained(self) -> Mask:
-        """Return the pixels of the last view that named things explain, (H, W) bool."""
+    def explained(self, share: float) -> Mask:
+        """Return the pixels of the last view that named things explain, (H, W) bool.
+
+        Args:
+            share: of its possible gain that such a thing has at least.
+        """
         view = self.views[-1]
         shown = np.zeros(view.grid().depth.shape, bool)
         for one in self.things:
             found = one.scores[-1]
-            if one.row >= 0 and found is not None and one.share > CLEAR_SHARE:
+            if one.row >= 0 and found is not None and one.share > share:
                 shown.ravel()[found.cells[found.gain > EXPLAINS]] = True
         stride = view.stride
         large = np.repeat(np.repeat(shown, stride, 0), stride, 1)
