@@ -82,6 +82,7 @@ class View:
         surface: pixels of what carries things, (H, W) bool.
         background: pixels of walls and the like, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
+        largest: extent of the largest thing, metres.
     """
 
     frame: Frame
@@ -92,6 +93,7 @@ class View:
     surface: Mask
     background: Mask
     inside: Mask
+    largest: float
     _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -120,7 +122,7 @@ class View:
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
         for number, mask in enumerate(instances.masks, 1):
-            labels[mask & inside] = number
+            labels[mask & inside & (frame.depth > 0)] = number
         # a table, a wall, a room: no thing is as large
         alone = _not_large(frame, labels, LARGER * widest)
         given = labels if instances.pieces is None else instances.pieces
@@ -141,6 +143,7 @@ class View:
             surface,
             instances.background,
             inside,
+            LARGER * widest,
         )
 
     def seen_from(self, camera: Float) -> View:
@@ -250,7 +253,7 @@ class View:
 
     def fragments(self) -> Iterator[Segment]:
         """Return the pieces of instances: a thing that was joined to its neighbour is one."""
-        for mask in _parts(self.pieces, 2 * self.fewest):
+        for mask in _parts(self.pieces, 4 * self.fewest):
             owner = int(np.bincount(self.labels[mask]).argmax())
             whole = self.labels == owner if owner else mask
             if (
@@ -262,8 +265,8 @@ class View:
     def unions(self) -> Iterator[Segment]:
         """Return neighbouring instances as one: a thing that was cut in two or more is one.
 
-        Those that touch each other most for their size are joined first, and so on: as many unions
-        as there are joins.
+        Those that touch each other most for their size are joined first, and so on, unless both
+        together are larger than any thing.
         """
         touching = self._touching()
         sizes = np.bincount(self.labels.ravel()).astype(np.float64)
@@ -274,12 +277,15 @@ class View:
             low, high = np.unravel_index(close.argmax(), close.shape)
             if close[low, high] <= 0:
                 return
+            mask = np.isin(self.labels, np.flatnonzero((group == low) | (group == high)))
+            if _extent(self.frame, *np.nonzero(mask)) > self.largest:
+                touching[low, high] = touching[high, low] = 0
+                continue
             touching[low] += touching[high]
             touching[:, low] += touching[:, high]
             touching[high] = touching[:, high] = touching[low, low] = 0
             sizes[low] += sizes[high]
             group[group == high] = low
-            mask = np.isin(self.labels, np.flatnonzero(group == low))
             if np.count_nonzero(mask) >= self.fewest:
                 yield Segment(mask)
 
@@ -329,19 +335,21 @@ def _connected(pieces: Index, frame: Frame, sigma: Float32) -> NDArray[np.int32]
 def _not_large(
     frame: Frame, labels: NDArray[np.int32], most: float
 ) -> NDArray[np.int32]:
-    """Return labels, (H, W) int32, without those of what is larger, metres."""
+    """Return labels of measured pixels, (H, W) int32, without what is larger, metres."""
     large = np.zeros(int(labels.max(initial=0)) + 1, bool)
-    for number in np.flatnonzero(np.bincount(labels.ravel())[1:]) + 1:
-        large[number] = _extent(frame, labels == number) > most
+    for number, box in enumerate(ndimage.find_objects(labels), 1):
+        if box is not None:
+            rows, columns = np.nonzero(labels[box] == number)
+            place = rows + box[0].start, columns + box[1].start
+            large[number] = _extent(frame, *place) > most
     return np.where(large[labels], 0, labels).astype(np.int32)
 
 
-def _extent(frame: Frame, mask: Mask) -> float:
+def _extent(frame: Frame, rows: Index, columns: Index) -> float:
     """Return how far apart the measured points of some pixels lie, without outliers, metres."""
-    rows, columns = np.nonzero(mask & (frame.depth > 0))
-    few = slice(None, None, max(1, len(rows) // 500))
-    if len(rows) < 2:
+    if len(rows) < FEWEST_PIXELS:
         return 0.0
+    few = slice(None, None, max(1, len(rows) // 500))
     points = frame.positions_in_camera(rows[few], columns[few])
     low, high = np.quantile(points, OUTLIERS, axis=0)
     return float(np.linalg.norm(high - low))
