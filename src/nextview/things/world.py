@@ -119,7 +119,16 @@ class World:
         if len(self.views) < SETTLED_VIEWS and len(some):
             some = register(self.library, views, some, (0.03, 0.02), 96)
             columns = [score(self.library, one, some) for one in self.views]
-            scores = list(zip(*columns, strict=True))
+            scores = [
+                # what came later says nothing of an earlier view
+                tuple(
+                    None if was is None else one
+                    for was, one in zip(row, new, strict=True)
+                )
+                for row, new in zip(
+                    self.scores, zip(*columns, strict=True), strict=True
+                )
+            ]
         else:
             scores = list(self.scores)
         column = score(self.library, view, some)
