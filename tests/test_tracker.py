@@ -244,9 +244,11 @@ def test_a_name_that_changes_or_is_doubted_is_taken_from_the_scene(watched):
     )
     as_can = replace(can, number=bottle.number)
     doubted = replace(banana, confident=False)
-    tracker.follow(SimpleNamespace(
+    tracker.follow(
+        SimpleNamespace(
             tops=scene.tops, objects=(as_can, doubted), library=scene.library
-        ))
+        )
+    )
     (followed,) = tracker.things
     assert (followed.number, followed.name) == (bottle.number, can.name)
     assert np.array_equal(followed.pose, can.pose)

@@ -196,13 +196,13 @@ def _compared(
 
     # where they may be now: near where they were, or where the view shows something else
     taken = np.zeros(view.grid().depth.size, bool)
-    for one in others:
-        taken[one.cells] = True
+    for other_thing in others:
+        taken[other_thing.cells] = True
     for _, found in stand:
         if found is not None and found.total > NEW_OBJECT:
-            taken[found.cells[found.gain > 0]] = True
+            taken[_explained(found)] = True
     left = np.flatnonzero([total([found]) <= NEW_OBJECT for _, found in stand])
-    middles = [_middle(world, things[k].number) for k in left]
+    middles = [_middle(world, things[int(k)].number) for k in left]
     rows, centres = [np.arange(len(things))], [there.centres]
     for place in _free(view, taken):
         rows.append(left)
@@ -221,11 +221,11 @@ def _compared(
         now: Literal["stands", "moved", "gone", "hidden"] = "hidden"
         best = int(mine[values[mine].argmax()])
         other = shown[best]
-        cells = np.zeros(0, np.int64)
+        cells: Index = np.zeros(0, np.int64)
         if found is not None and found.seen > 0:
             if found.total > NEW_OBJECT:
                 now = "stands"
-                cells = found.cells[found.gain > 0]
+                cells = _explained(found)
             elif found.total < -NEW_OBJECT and found.through > found.seen / 2:
                 now = "gone"
             # or else it is gone, and something else has come
@@ -236,7 +236,7 @@ def _compared(
                 gained = stays[0][k] + other.total - before - found.total
                 if min(gained / PIXELS_ALIKE, apart[best]) > SURPRISE:
                     now = "moved"
-                    cells = other.cells[other.gain > 0]
+                    cells = _explained(other)
         compared.append(_Compared(one, now, tried[best : best + 1], cells))
     return compared
 
@@ -281,6 +281,11 @@ def _displaced(
     square = (shift**2).sum(1) - along**2 + turned
     pixel = away / view.frame.pinhole.fx
     return ((along / LEAST_ERROR / away) ** 2 + square / pixel**2) / 2
+
+
+def _explained(one: Score) -> Index:
+    """Return the pixels of the grid that something explains, (N,) int64."""
+    return one.cells[one.gain > 0].astype(np.int64)
 
 
 def _of_part(one: Score) -> Score:
