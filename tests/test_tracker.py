@@ -27,7 +27,7 @@ def meshes():
 def first_frame(meshes):
     """A camera over the things, and its first frame."""
     camera = camera_over(meshes, seed=8)
-    return camera, camera.frame(view(20))
+    return camera, camera.frame(view(155))
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_a_thing_that_moves_is_followed_and_the_others_stand(watched):
     tracker = nextview.Tracker(scene)
     for _ in range(10):
         camera.change(shifted(camera.table, "banana", STEP))
-        tracked = tracker.update(camera.frame(view(20)))
+        tracked = tracker.update(camera.frame(view(155)))
         assert not any(one.lost for one in tracked)
         assert max(off(camera, tracked).values()) < 0.004
     banana = next(one for one in tracked if one.name == "banana")
@@ -102,7 +102,7 @@ def test_a_thing_that_stands_is_expected_to_stay_while_it_is_hidden(watched):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
     for _ in range(8):
-        frame = camera.frame(view(20))
+        frame = camera.frame(view(155))
         tracked = tracker.update(hidden(camera, frame, "banana"))
         banana = next(one for one in tracked if one.name == "banana")
         assert banana.visible < 0.05
@@ -119,7 +119,7 @@ def test_what_passes_before_an_empty_place_does_not_bring_the_thing_back(
 ):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
-    camera.frame(view(20))
+    camera.frame(view(155))
     full, part = camera.table, place_of(camera, name)
     camera.change(without(full, name))
 
@@ -127,16 +127,16 @@ def test_what_passes_before_an_empty_place_does_not_bring_the_thing_back(
         return {one.name for one in tracker.things if one.lost}
 
     for _ in range(2):
-        tracker.update(camera.frame(view(20)))
+        tracker.update(camera.frame(view(155)))
     assert lost() == {name}
     for number in range(8):  # for four seconds, at the rate of a slow camera
-        frame = camera.frame(view(20))
+        frame = camera.frame(view(155))
         tracker.update(covered(frame, part, distance), 0.1 + 0.5 * number)
         assert lost() == {name}
 
     camera.change(full)
     for _ in range(2):
-        tracked = tracker.update(camera.frame(view(20)))
+        tracked = tracker.update(camera.frame(view(155)))
     assert not lost()
     assert off(camera, tracked)[name] < 0.004
 
@@ -145,10 +145,10 @@ def test_a_thing_that_stands_behind_something_is_there_when_it_shows_again(watch
     camera, scene = watched
     tracker = nextview.Tracker(scene)
     for number in range(6):
-        frame = camera.frame(view(20))
+        frame = camera.frame(view(155))
         tracked = tracker.update(hidden(camera, frame, "tuna_fish_can"), 2.0 * number)
         assert not any(one.lost for one in tracked)
-    tracked = tracker.update(camera.frame(view(20)))
+    tracked = tracker.update(camera.frame(view(155)))
     can = next(one for one in tracked if one.name == "tuna_fish_can")
     assert can.visible > 0.4  # there is no depth on the rest
     assert not can.lost
@@ -159,7 +159,7 @@ def test_a_thing_that_is_partly_hidden_keeps_its_pose(watched):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
     for share in (0.3, 0.5, 0.7, 0.5, 0.3):
-        frame = camera.frame(view(20))
+        frame = camera.frame(view(155))
         part = place_of(camera, "mustard_bottle", share)
         tracked = tracker.update(covered(frame, part))
         bottle = next(one for one in tracked if one.name == "mustard_bottle")
@@ -171,16 +171,16 @@ def test_a_thing_that_is_partly_hidden_keeps_its_pose(watched):
 def test_a_thing_that_moves_behind_something_is_lost_until_the_scene_finds_it(watched):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
-    for number in range(15):
+    for number in range(22):
         camera.change(shifted(camera.table, "banana", STEP))
-        frame = camera.frame(view(20))
+        frame = camera.frame(view(155))
         if number > 4:
             frame = hidden(camera, frame, "banana")
         tracked = tracker.update(frame)
         banana = next(one for one in tracked if one.name == "banana")
         assert banana.lost or off(camera, tracked)["banana"] < 0.05
     assert banana.lost
-    frame = camera.frame(view(20))
+    frame = camera.frame(view(155))
     scene.update(frame)
     tracker.follow(scene)
     tracked = tracker.update(frame)
@@ -196,14 +196,14 @@ def test_a_thing_that_was_taken_away_is_lost_and_followed_again_after_the_scene(
     full = camera.table
     camera.change(without(full, "banana"))
     for _ in range(3):
-        tracked = tracker.update(camera.frame(view(20)))
+        tracked = tracker.update(camera.frame(view(155)))
     assert {one.name for one in tracked if one.lost} == {"banana"}
-    scene.update(camera.frame(view(20)))
+    scene.update(camera.frame(view(155)))
     tracker.follow(scene)
     assert {one.name for one in tracker.things} == set(NAMES) - {"banana"}
 
     camera.change(full)
-    frame = camera.frame(view(20))
+    frame = camera.frame(view(155))
     scene.update(frame)
     tracker.follow(scene)
     assert off(camera, tracker.update(frame))["banana"] < 0.004
@@ -212,7 +212,7 @@ def test_a_thing_that_was_taken_away_is_lost_and_followed_again_after_the_scene(
 def test_a_thing_that_rests_takes_the_pose_of_the_scene_moved_as_it_was_since(watched):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
-    tracker.update(camera.frame(view(20)))
+    tracker.update(camera.frame(view(155)))
     scene.update(camera.frame(view(110)))
     since = tracker.things
     tracker.follow(scene)
@@ -244,7 +244,11 @@ def test_a_name_that_changes_or_is_doubted_is_taken_from_the_scene(watched):
     )
     as_can = replace(can, number=bottle.number)
     doubted = replace(banana, confident=False)
-    tracker.follow(SimpleNamespace(tops=scene.tops, objects=(as_can, doubted)))
+    tracker.follow(
+        SimpleNamespace(
+            tops=scene.tops, objects=(as_can, doubted), library=scene.library
+        )
+    )
     (followed,) = tracker.things
     assert (followed.number, followed.name) == (bottle.number, can.name)
     assert np.array_equal(followed.pose, can.pose)
@@ -253,7 +257,7 @@ def test_a_name_that_changes_or_is_doubted_is_taken_from_the_scene(watched):
 def test_what_is_out_of_view_keeps_its_place(watched):
     camera, scene = watched
     tracker = nextview.Tracker(scene)
-    frame = camera.frame(view(20))
+    frame = camera.frame(view(155))
     aside = frame.camera_to_world.copy()
     aside[:3, :3] = (
         aside[:3, :3] @ Rotation.from_euler("y", 120, degrees=True).as_matrix()
@@ -270,7 +274,7 @@ def test_wrong_use_is_refused(ycb, watched):
     with pytest.raises(SessionError, match="before the first frame"):
         nextview.Tracker(nextview.Scene(ycb))
     tracker = nextview.Tracker(scene)
-    frame = camera.frame(view(20))
+    frame = camera.frame(view(155))
     tracker.update(frame, 2.0)
     with pytest.raises(UsageError, match="the time"):
         tracker.update(frame, 1.0)

@@ -23,12 +23,14 @@ from nextview.things.score import OUTLIER, STEEPEST, Score, score, total
 from nextview.things.surface import Surface
 from nextview.things.world import (
     CLEAR_SHARE,
+    EXPLAINED,
     NEW_OBJECT,
+    STRANGER_GAIN,
     Thing,
     World,
     corrected,
 )
-from nextview.types import Float, Index
+from nextview.types import Float, Index, Mask
 
 ALONE = (
     0.5,
@@ -72,7 +74,7 @@ class _Compared:
         thing: in the world.
         now: what the view shows of it: "hidden" where it is not in the view.
         pose: that explains the view best.
-        cells: pixels of the grid that it explains in this pose, (N,).
+        cells: pixels of the grid that it explains where it is now, (N,).
     """
 
     thing: Thing
@@ -91,7 +93,8 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
     """
     if not camera_stands:
         view = corrected(world, view)
-    found = [*_named(world, view), *_unnamed(world, view)]
+    found = _named(world, view)
+    found += _unnamed(world, view, found)
     moved = [one for one in found if one.now == "moved"]
     gone = tuple(one.thing for one in found if one.now == "gone")
     stand = tuple(one.thing.number for one in found if one.now == "stands")
@@ -115,15 +118,22 @@ def _clear(one: Thing) -> bool:
     return one.row >= 0 and one.share >= CLEAR_SHARE
 
 
-def _named(world: World, view: View) -> Iterator[_Compared]:
+def _named(world: World, view: View) -> list[_Compared]:
     """Compare the things with clear names."""
     things = [one for one in world.things if _clear(one)]
     rows = np.array([one.row for one in things], np.int64)
-    return _compared(world, view, things, world.library, world.hypotheses[rows])
+    there = world.hypotheses[rows]
+    return _compared(world, view, things, world.library, there, ()) if things else []
 
 
-def _unnamed(world: World, view: View) -> Iterator[_Compared]:
-    """Compare the surfaces that were measured of all other things."""
+def _unnamed(world: World, view: View, others: Sequence[_Compared]) -> list[_Compared]:
+    """Compare the surfaces that were measured of all other things.
+
+    Args:
+        world: before the view.
+        view: the view.
+        others: things with clear names.
+    """
     things, surfaces = [], []
     for one in world.things:
         surface = None if _clear(one) else _measured(world, one.number)
@@ -131,11 +141,11 @@ def _unnamed(world: World, view: View) -> Iterator[_Compared]:
             things.append(one)
             surfaces.append(surface)
     if not things:
-        return iter(())
+        return []
     library = Library(surfaces)
     turns = np.tile(np.eye(3), (len(things), 1, 1))
     there = Hypotheses.of(np.arange(len(things)), turns, library.centres)
-    return _compared(world, view, things, library, there)
+    return _compared(world, view, things, library, there, others)
 
 
 def _compared(
@@ -144,8 +154,18 @@ def _compared(
     things: Sequence[Thing],
     library: Library,
     there: Hypotheses,
-) -> Iterator[_Compared]:
-    """Compare the view with things where they were: one pose in all views, or another one now."""
+    others: Sequence[_Compared],
+) -> list[_Compared]:
+    """Compare the view with things where they were: one pose in all views, or another one now.
+
+    Args:
+        world: before the view.
+        view: the view.
+        things: M things of the world.
+        library: with their surfaces.
+        there: where they were.
+        others: things that were compared before.
+    """
     whole = library is world.library
 
     def scores(one: View, some: Hypotheses) -> list[Score | None]:
@@ -166,28 +186,82 @@ def _compared(
     stays = totals(there), scores(view, there)
     better = register(library, [*world.views, view], there, (0.06, 0.03, 0.02), 96)
     refined = totals(better), scores(view, better)
-    alone = register(library, [view], there, ALONE, 96)
-    others = scores(view, alone)
-    apart = _displaced(library, view, there, alone)
-    for k, one in enumerate(things):
-        before, found = max(
+    stand = [
+        max(
             ((each[0][k], each[1][k]) for each in (stays, refined)),
             key=lambda each: each[0] + total(each[1:]),
         )
+        for k in range(len(things))
+    ]
+
+    # where they may be now: near where they were, or where the view shows something else
+    taken = np.zeros(view.grid().depth.size, bool)
+    for other_thing in others:
+        taken[other_thing.cells] = True
+    for _, found in stand:
+        if found is not None and found.total > NEW_OBJECT:
+            taken[_explained(found)] = True
+    left = np.flatnonzero([total([found]) <= NEW_OBJECT for _, found in stand])
+    middles = [_middle(world, things[int(k)].number) for k in left]
+    rows, centres = [np.arange(len(things))], [there.centres]
+    for place in _free(view, taken):
+        rows.append(left)
+        centres.append(there.centres[left] + place - np.reshape(middles, (-1, 3)))
+    every = np.concatenate(rows)
+    starts = replace(there[every], centres=np.concatenate(centres))
+    tried = register(library, [view], starts, ALONE, 96)
+    shown = scores(view, tried)
+    values = np.array([total([each]) for each in shown])
+    apart = _displaced(library, view, there[every], tried)
+
+    compared = []
+    for k, one in enumerate(things):
+        before, found = stand[k]
+        mine = np.flatnonzero(every == k)
         now: Literal["stands", "moved", "gone", "hidden"] = "hidden"
-        other = others[k]
-        cells = np.zeros(0, np.int64)
+        best = int(mine[values[mine].argmax()])
+        other = shown[best]
+        cells: Index = np.zeros(0, np.int64)
         if found is not None and found.seen > 0:
             if found.total > NEW_OBJECT:
                 now = "stands"
+                cells = _explained(found)
             elif found.total < -NEW_OBJECT and found.through > found.seen / 2:
                 now = "gone"
-            if other is not None and other.total > NEW_OBJECT:
+            # or else it is gone, and something else has come
+            if (
+                other is not None
+                and other.total > NEW_OBJECT + STRANGER_GAIN * other.seen
+            ):
                 gained = stays[0][k] + other.total - before - found.total
-                if min(gained / PIXELS_ALIKE, apart[k]) > SURPRISE:
+                if min(gained / PIXELS_ALIKE, apart[best]) > SURPRISE:
                     now = "moved"
-                    cells = other.cells[other.gain > 0]
-        yield _Compared(one, now, alone[k : k + 1], cells)
+                    cells = _explained(other)
+        compared.append(_Compared(one, now, tried[best : best + 1], cells))
+    return compared
+
+
+def _free(view: View, taken: Mask) -> Iterator[Float]:
+    """Yield the middle of each instance that things do not explain, (3,), metres.
+
+    Args:
+        view: the view.
+        taken: pixels of its grid that things explain, (P,) bool.
+    """
+    stride = view.stride
+    for one in view.instances():
+        cells = np.flatnonzero(one.mask[::stride, ::stride])
+        if len(cells) and taken[cells].mean() < EXPLAINED:
+            yield view.points(cells).mean(0)
+
+
+def _middle(world: World, number: int) -> Float:
+    """Return the middle of what was measured of a thing, (3,), metres."""
+    shown = [
+        view.points(np.flatnonzero(owner == number))
+        for view, owner in zip(world.views, world.owners, strict=True)
+    ]
+    return np.concatenate(shown).mean(0)
 
 
 def _displaced(
@@ -207,6 +281,11 @@ def _displaced(
     square = (shift**2).sum(1) - along**2 + turned
     pixel = away / view.frame.pinhole.fx
     return ((along / LEAST_ERROR / away) ** 2 + square / pixel**2) / 2
+
+
+def _explained(one: Score) -> Index:
+    """Return the pixels of the grid that something explains, (N,) int64."""
+    return one.cells[one.gain > 0].astype(np.int64)
 
 
 def _of_part(one: Score) -> Score:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.scene.body import Body
+from nextview.scene.body import WIDEST, Body
 from nextview.scene.motion import BodyState
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
@@ -83,6 +83,7 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     told = np.zeros((6, 6))
     for share in ERRORS_LEFT:
         reach = float(np.hypot(share * body.displaced, 2 * error)) / radius
+        reach = min(reach, WIDEST)
         left, right = normal_equations(library, view, _pose(body, state), reach, POINTS)
         told = weight * left[0]
         change = np.linalg.solve(

@@ -285,8 +285,9 @@ def object_value(
 ) -> Float:
     """Return the expected information of each view about one object, nats, (V,).
 
-    Where no hypothesis can be rendered, and for a settled object, the value of a view is its
-    distance from the views of the object, times the share of the object that it shows.
+    A view from another side tells a name from a stranger: by its distance from the views of the
+    object, times the share of the object that it shows. Where names or poses are in doubt, it tells
+    them apart, too.
 
     Args:
         world: what explains the frames.
@@ -295,12 +296,12 @@ def object_value(
         ground: with everything that may occlude the object.
         views: the candidates; values of views that are not free have no meaning.
     """
-    if not one.settled and one.candidates:
-        return _information(world, one, tops, views)
     told = _from_another_side(one, tops, views)
     points = outline_of(one)
     for row in np.flatnonzero(views.free):
         told[row] *= ground.past_others(views.poses[row, :3, 3], points).mean()
+    if not one.settled and one.candidates:
+        told = told + _information(world, one, tops, views)
     return told
 
 
@@ -379,7 +380,7 @@ def _from_another_side(
     places = [tops[number].frame.camera_to_world[:3, 3] for number in one.pixels]
     earlier = [_towards(place - one.place) for place in places]
     towards = _towards(views.poses[:, :3, 3] - one.place)
-    worth = SURE_WORTH if one.candidates else UNKNOWN_WORTH
+    worth = one.confidence * SURE_WORTH + (1 - one.confidence) * UNKNOWN_WORTH
     return worth * _turned(towards, earlier) / np.pi
 
 

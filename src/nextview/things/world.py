@@ -120,7 +120,16 @@ class World:
         if len(self.views) < SETTLED_VIEWS and len(some):
             some = register(self.library, views, some, (0.03, 0.02), 96)
             columns = [score(self.library, one, some) for one in self.views]
-            scores = list(zip(*columns, strict=True))
+            scores = [
+                # what came later says nothing of an earlier view
+                tuple(
+                    None if was is None else one
+                    for was, one in zip(row, new, strict=True)
+                )
+                for row, new in zip(
+                    self.scores, zip(*columns, strict=True), strict=True
+                )
+            ]
         else:
             scores = list(self.scores)
         column = score(self.library, view, some)
@@ -416,14 +425,16 @@ SETTLED_VIEWS = 3  # views after which poses are not refined
 
 
 def _since_it_stands(row: Sequence[Score | None]) -> tuple[Score | None, ...]:
-    """Leave out earlier views in which a new hypothesis was not there yet.
+    """Leave out earlier views in which a new hypothesis was not there yet: they see through it."""
 
-    It was not there if every earlier view sees through it.
-    """
-    earlier = [one for one in row[:-1] if one is not None and one.seen > 0]
-    if earlier and all(one.through > MOST_THROUGH * one.seen for one in earlier):
-        return (*[None] * (len(row) - 1), row[-1])
-    return tuple(row)
+    def seen_through(views: Sequence[Score | None]) -> bool:
+        shown = [one for one in views if one is not None]
+        through = sum(one.through for one in shown)
+        return through > MOST_THROUGH * sum(one.seen for one in shown)
+
+    starts = [k for k in range(len(row)) if k == 0 or seen_through(row[:k])]
+    start = max(starts, key=lambda k: total(row[k:]))
+    return (*[None] * start, *row[start:])
 
 
 def _explaining(
