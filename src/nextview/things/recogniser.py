@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from copy import copy
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -88,11 +87,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         other._last = None
         return other
 
-    @property
-    def in_any_orientation(self) -> VerifiedRecogniser:
-        """The same recogniser: things need not rest on anything to be recognised."""
-        return self
-
     def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
         """The same recogniser for cameras with another pose accuracy.
 
@@ -107,11 +101,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         other.library = self.library.for_cameras(place, aim)
         other._last = None
         return other
-
-    @cached_property
-    def least_p_value(self) -> float:
-        """Smallest value of the test for unknown objects: it has no bound."""
-        return 0.0
 
     def together(
         self,
