@@ -25,6 +25,9 @@ from nextview.types import Floats, Index, Mask
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"
 NOTHING_FITS = "no taught thing explains the views"
+MUCH_SMALLER = (
+    5.0  # times smaller than the smallest thing, below which an object is none
+)
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -128,6 +131,15 @@ class VerifiedRecogniser(TaughtRecogniser):
         alone = alone / alone.sum()
         if any(observation.radius is None for observation in observations):
             return JointBelief(alone, why_no_pose=NO_SCALE, doubt=NO_SCALE)
+        likeliest = int(alone.argmax())
+        if likeliest not in self.labels:
+            name = self.classes[likeliest]
+            return JointBelief(
+                alone, why_no_pose=f"the geometry of {name} is not known"
+            )
+        radius = min(observation.radius or 0.0 for observation in observations)
+        if MUCH_SMALLER * radius < self.library.radii.min():
+            return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
 
         world = self.explained(observations)
         thing = max(
