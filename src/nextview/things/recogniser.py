@@ -25,9 +25,7 @@ from nextview.types import Floats, Index, Mask
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"
 NOTHING_FITS = "no taught thing explains the views"
-MUCH_SMALLER = (
-    5.0  # times smaller than the smallest thing, below which an object is none
-)
+OTHER_SIZE = 5.0  # times smaller or larger than all things are: it is none of them
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -137,8 +135,8 @@ class VerifiedRecogniser(TaughtRecogniser):
             return JointBelief(
                 alone, why_no_pose=f"the geometry of {name} is not known"
             )
-        radius = min(observation.radius or 0.0 for observation in observations)
-        if MUCH_SMALLER * radius < self.library.radii.min():
+        radius, radii = float(observations[-1].radius or 0.0), self.library.radii
+        if not radii.min() / OTHER_SIZE < radius < radii.max() * OTHER_SIZE:
             return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
 
         world = self.explained(observations)
