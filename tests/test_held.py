@@ -1,7 +1,5 @@
 """Things that do not rest: in a gripper, where no plane is under them, or leaning on a table."""
 
-import pickle
-
 import numpy as np
 import pytest
 from factories import (
@@ -16,7 +14,7 @@ from factories import (
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.errors import ModelError, ObservationError
+from nextview.errors import ObservationError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.sensing import Frame, ObservedObject
@@ -71,11 +69,7 @@ def seen(caster, azimuth, elevation, rng) -> Frame:
 def test_a_held_thing_is_named_by_a_point_on_it(name):
     caster, pose = in_a_gripper(name, 3)
     held = ObservedObject(support=False, point=PLACE)
-    session = nextview.load("ycb").session(
-        object=held,
-        distance=0.55,
-        any_orientation=True,
-    )
+    session = nextview.load("ycb").session(object=held, distance=0.55)
     rng = np.random.default_rng(3)
     for azimuth, elevation in WRIST:
         view = session.update(seen(caster, azimuth, elevation, rng))
@@ -131,28 +125,12 @@ def named(scene, name):
 
 
 @pytest.mark.long
-def test_a_thing_that_leans_is_confident_in_a_scene_of_any_orientation(leans, ycb):
+def test_a_thing_that_leans_is_confident(leans, ycb):
     frames, truth = leans
-    resting = nextview.Scene(ycb)
-    scene = nextview.Scene(ycb, any_orientation=True)
+    scene = nextview.Scene(ycb)
     for frame in frames:
-        resting.update(frame)
         scene.update(frame)
-    doubtful = named(resting, "cracker_box")
-    assert not doubtful.confident
-    assert doubtful.doubt
     thing = named(scene, "cracker_box")
     assert thing.confident
     np.testing.assert_allclose(thing.pose, truth["cracker_box"], atol=0.02)
     assert named(scene, "sugar_box").confident
-
-
-def test_a_system_of_any_orientation_is_pickled_as_one(ycb):
-    again = pickle.loads(pickle.dumps(ycb.in_any_orientation()))
-    assert again.any_orientation
-    assert not ycb.any_orientation
-
-
-def test_models_without_geometry_know_no_other_orientation():
-    with pytest.raises(ModelError, match="recognised by their geometry"):
-        nextview.Scene("modelnet10", any_orientation=True)

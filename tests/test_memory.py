@@ -219,12 +219,6 @@ def set_at(path, value):
     return change
 
 
-VERIFIED = {
-    "weights": {"geometry": 20.0},
-    "things": 2,
-    "usual": [0.0, 0.1],
-    "excess": [[-0.1, 0.2]],
-}
 REFUSED = {
     "one class more": set_at("classes", lambda names: [*names, "mug"]),
     "no azimuth bins": set_at("azimuth_bins", 0),
@@ -261,16 +255,6 @@ REFUSED = {
     ),
     "a symmetry about no axis": set_at(
         "memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]
-    ),
-    "negative weights": set_at(
-        "memory/verification", {"weights": {"geometry": -1}, "things": 3}
-    ),
-    "descending residuals": set_at(
-        "memory/verification", VERIFIED | {"excess": [[0.2, 0.1]]}
-    ),
-    "no residuals": set_at("memory/verification", VERIFIED | {"excess": [[]]}),
-    "residuals of one thing less": set_at(
-        "memory/verification", VERIFIED | {"usual": [0.1]}
     ),
     "an unknown field": set_at("memory/things/0/colour", "red"),
 }

@@ -196,13 +196,6 @@ def test_a_box_without_a_volume_is_refused(robot):
     assert "a box has a low and a high corner" in found.result.message
 
 
-def test_things_of_classes_have_no_geometry_for_any_orientation(robot):
-    _, result = robot.goal(any_orientation=True)
-    found = wait(result)
-    assert found.status == 6
-    assert "recognised by their geometry" in found.result.message
-
-
 def colour(image, info, transform):
     image.encoding = "rgb8"
     return image, info, transform

@@ -558,7 +558,6 @@ class NextviewNode(Node):
             region=box_of(asked.region[0]) if asked.region else None,
             distance=asked.distance or None,
             segmentation=self.segmentation,
-            any_orientation=asked.any_orientation,
         )
 
     def scene_result(self) -> LookUntilSettled.Result:
@@ -592,7 +591,6 @@ class NextviewNode(Node):
             min_height=self.limit("min_height"),
             max_height=self.limit("max_height"),
             clearance=self.limit("clearance"),
-            any_orientation=asked.any_orientation,
         )
         self.mask = asked.mask[0] if asked.mask else None
 

@@ -46,7 +46,6 @@ def recognise(
     output: Output = Output(),
     start: int | None = None,
     seed: int = 0,
-    any_orientation: bool = False,
 ) -> None:
     """Recognise an object from as few views as needed, and print the views and the beliefs.
 
@@ -64,7 +63,6 @@ def recognise(
         start: index of the first view, 0 to 39 for the 40 views (ring * 8 + azimuth step); by
             default random.
         seed: seed of the first view, the policy and the sensor errors.
-        any_orientation: allow any orientation of a taught thing, for example in a hand or leaning.
     """
     if more and (output.figure or output.record):
         raise UsageError(
@@ -82,7 +80,7 @@ def recognise(
         )
         try:
             camera = source.camera(one, seed)
-            session = system.session_with(camera, start, seed, any_orientation)
+            session = system.session_with(camera, start, seed)
             show(session, camera, name, system.policy_name, output, None if more else 1)
         except NextviewError as error:
             if not more:

@@ -78,36 +78,6 @@ class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ModelError("the axis of a symmetry is not a unit vector")
 
 
-class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What was fitted to known views of things, aligned with their surfaces.
-
-    Attributes:
-        weights: Of each kind of evidence, see ``things.weighing.EvidenceWeights``, by their names.
-        things: How many things there were when these were fitted.
-        usual: Usual residual of each thing, see ``things.unknown.KnownResiduals``.
-        excess: Logarithms of how many times known things exceed it, ascending, after 1, 2, ...
-            views.
-    """
-
-    weights: dict[str, Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)]]
-    things: Annotated[int, msgspec.Meta(ge=0)]
-    usual: tuple[Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)], ...] = ()
-    excess: tuple[
-        tuple[
-            Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)],
-            ...,
-        ],
-        ...,
-    ] = ()
-
-    def __post_init__(self) -> None:
-        for row in self.excess:
-            if not row or list(row) != sorted(row):
-                raise ModelError("the residuals of known things do not ascend")
-        if bool(self.usual) != bool(self.excess):
-            raise ModelError("the residuals of known things are incomplete")
-
-
 class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One taught thing.
 
@@ -143,7 +113,6 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             log-likelihood of known things, given the class that explains them best; () if that was
             not fitted.
         usual: See ``novelty.Quantiles``; () if that was not fitted.
-        verification: What was fitted to surfaces; None if nothing was.
         sensor: Camera that the fits are for, NAME or NAME:STRENGTH; "" in cards of earlier
             versions.
     """
@@ -154,7 +123,6 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     attribution: str = ""
     novelty: tuple[tuple[float, ...], ...] = ()
     usual: tuple[tuple[float, ...], ...] = ()
-    verification: Verification | None = None
     sensor: str = ""
 
     def __post_init__(self) -> None:
@@ -171,14 +139,6 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for row in self.novelty:
             if list(row) != sorted(row):
                 raise ModelError("the quantiles of the novelty do not ascend")
-
-        if self.verification is not None and len(self.verification.usual) not in (
-            0,
-            len(self.things),
-        ):
-            raise ModelError(
-                f"its usual residuals are not of its {len(self.things)} things"
-            )
 
     @property
     def poses(self) -> tuple[int, ...]:

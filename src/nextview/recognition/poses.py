@@ -14,9 +14,6 @@ from nextview.errors import ModelError
 from nextview.geometry.observation import RIGID
 from nextview.types import Float, Float32
 
-UNKNOWN_TURN = (
-    30.0  # degrees by which the orientation is off where the pose is not known
-)
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one
 SAME_AXIS = 0.1  # sine of the angle between axes that are one

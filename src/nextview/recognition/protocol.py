@@ -68,8 +68,9 @@ class JointBelief:
             known.
         camera_error: by how much errors of the cameras' places displace these poses, millimetres,
             one standard deviation.
-        p_value: share of known objects that are explained as badly as this one, 0 to 1; None if
-            that is not known.
+        p_value: below the rate of the test for unknown objects the object is unknown, 0 to 1: the
+            share of known objects that are explained as badly as this one, or the probability that
+            the likeliest name is right; None if it is not known.
         why_no_pose: why there is no pose, in words; "" if there is one, or none was to be expected.
         doubt: why no answer is confident however high the belief, in words; "" for no such reason.
         found: what the recogniser goes by if it is asked for more; None if that is nothing.
@@ -121,15 +122,6 @@ class LooksAhead(Protocol):
         Returns:
             A ``things.expected_views.Outlook``; None where nothing can be foreseen.
         """
-
-
-@runtime_checkable
-class KnowsAnyOrientation(Protocol):
-    """A recogniser of things that rest, which has one of things that need not rest beside it."""
-
-    @property
-    def in_any_orientation(self) -> Recogniser:
-        """The same for things that are held, lean or fly."""
 
 
 @runtime_checkable

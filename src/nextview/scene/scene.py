@@ -150,8 +150,6 @@ class Scene:
             quarter turn ahead, or your own: a function of a ``SceneChoice`` and a random generator,
             or MODULE:NAME of one; see ``scene.view_policies``.
         rng: source of the random numbers of the policy; seed 0 by default.
-        any_orientation: the objects are taught things that need not be in a resting pose: they may
-            lean against each other. They still have to touch a visible surface or another object.
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
@@ -159,7 +157,6 @@ class Scene:
 
     Raises:
         PolicyError: there is no such policy, or it cannot be made.
-        ModelError: ``any_orientation`` needs known geometry, and the models have none.
     """
 
     def __init__(
@@ -172,7 +169,6 @@ class Scene:
         segmentation: Segmenter | None = None,
         policy: str | ScenePolicy | type = INFORMATION_POLICY,
         rng: np.random.Generator | None = None,
-        any_orientation: bool = False,
         travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
         rule: SceneRule | None = None,
     ) -> None:
@@ -186,9 +182,8 @@ class Scene:
         self._limits = Limits()
         self._lock = RLock()
 
-        system = models if isinstance(models, System) else load(models)
-        self.system = system.in_any_orientation() if any_orientation else system
-        self._reach = Reach(np.zeros(len(system.sphere), bool))
+        self.system = models if isinstance(models, System) else load(models)
+        self._reach = Reach(np.zeros(len(self.system.sphere), bool))
         self.distance = distance
         self.reachable = reachable
         self.travel_cost = travel_cost
@@ -220,7 +215,7 @@ class Scene:
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
-        """Open issues: unverified small objects, unexplained points, no visible ground."""
+        """Open issues: parts of the frames left out, unexplained points, no visible ground."""
         return self._state.remarks
 
     @property

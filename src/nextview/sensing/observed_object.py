@@ -238,29 +238,6 @@ class ObservedObject:
         warnings += tuple(plausibility.check_place(displaced))
         return replace(after, warnings=warnings)
 
-    def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
-        """Replace the state of the object by some sightings.
-
-        Known sightings keep their observations as long as the object frame does not change.
-
-        Args:
-            sightings: at least one, see ``sighting_of``.
-            up: direction against gravity, (3,), world.
-
-        Raises:
-            ObservationError: the visible part of the object has no extent.
-        """
-        self.state = replace(self._known_by(sightings, up), warnings=())
-        self.state = replace(self.state, warnings=self.warnings_of_view(-1))
-
-    def warnings_of_view(self, number: int) -> tuple[ViewWarning, ...]:
-        """Return likely problems of a view, from its frame and its comparison with earlier views.
-
-        Args:
-            number: of the view, from 0, or backwards from -1.
-        """
-        return self._warnings_of_view(self.state, number)
-
     def _warnings_of_view(
         self, state: ObjectState, number: int, more: Sequence[ViewWarning] = ()
     ) -> tuple[ViewWarning, ...]:

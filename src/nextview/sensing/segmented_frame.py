@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from nextview.sensing.levels import (
 from nextview.sensing.masks import inside_mask
 from nextview.sensing.planes import LEAST_SUPPORT, TILT, Plane, Samples, sample
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,6 @@ class SegmentedFrame:
         masks: of each instance, (H, W) bool each.
         surface: pixels of all surfaces, (H, W) bool.
         background: pixels that are clearly neither an instance nor a surface, (H, W) bool.
-        pieces: of the segmentation, into which instances may be split, (H, W) int, 0 for none; None
-            if there are none.
         levels: planes of the surfaces, by decreasing number of carried pixels.
         carriers: the level that carries each instance, a surface or the top of another instance;
             None if there is no visible one.
@@ -46,7 +44,6 @@ class SegmentedFrame:
     masks: tuple[Mask, ...]
     surface: Mask
     background: Mask
-    pieces: Index | None
     levels: tuple[SurfaceLevel, ...]
     carriers: tuple[SurfaceLevel | None, ...]
 
@@ -64,15 +61,6 @@ class SegmentedFrame:
             for mask, carrier in pairs
             if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
         )
-
-    def parted(self, masks: Sequence[Mask]) -> SegmentedFrame:
-        """Return the frame with other instances.
-
-        Args:
-            masks: of each instance, (H, W) bool each.
-        """
-        carriers = tuple(self.under(mask) for mask in masks)
-        return replace(self, masks=tuple(masks), carriers=carriers)
 
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
         """Return the level that carries most pixels of candidate objects.
@@ -150,23 +138,6 @@ class SegmentedFrame:
                 found.append(own)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
 
-    def pieces_of(self, pixels: Mask) -> list[Mask]:
-        """Return the pieces into which a mask may be split, the largest first.
-
-        Args:
-            pixels: of objects, (H, W) bool.
-
-        Returns:
-            The mask of each piece, (H, W) bool.
-        """
-        if self.pieces is None:
-            return []
-        inside = np.where(pixels & (self.frame.depth > 0), self.pieces, 0)
-        sizes = np.bincount(inside.ravel())
-        sizes[0] = 0
-        numbers = np.flatnonzero(sizes >= FEWEST_OBJECT_PIXELS)
-        return [inside == number for number in numbers[np.argsort(-sizes[numbers])]]
-
     def _off_the_axis(self, level: SurfaceLevel) -> float:
         """Return the distance from the image centre to the nearest pixel of a level, pixels."""
         rows, columns = np.nonzero(level.pixels)
@@ -201,7 +172,6 @@ def segmented_frame(
         masks,
         instances.surface,
         instances.background,
-        instances.pieces,
         tuple(levels),
         tuple(carriers),
     )
@@ -217,5 +187,5 @@ def without_surfaces(frame: Frame, masks: Sequence[Mask] = ()) -> SegmentedFrame
     none = np.zeros(frame.shape, bool)
     carriers = (None,) * len(masks)
     return SegmentedFrame(
-        frame, noise_of(frame), tuple(masks), none, none, None, (), carriers
+        frame, noise_of(frame), tuple(masks), none, none, (), carriers
     )

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
 from nextview.errors import ObservationError
 from nextview.sensing.facets import Noise
@@ -15,7 +14,7 @@ from nextview.sensing.masks import TOUCHING_GAP, above_plane
 from nextview.sensing.mistakes import focal_that_levels
 from nextview.sensing.planes import Plane, find_plane, sample
 from nextview.sensing.segmented_frame import SegmentedFrame
-from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
+from nextview.sensing.sighting import Sighting, sighting_of
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Float32, Mask
 
@@ -27,10 +26,6 @@ NO_SUPPORT = (
 LOWEST_TOP = 0.008
 # the same relative to the distance, for noisy depth
 LOWEST_SHARE = 0.012
-# quantile of an object's pixel heights that defines its top, to exclude flying pixels
-TOP_SHARE = 0.9
-# square metres, least visible area of an object, slightly less than that of a die
-SMALLEST_AREA = 1.5e-4
 THINNEST = (
     0.006  # metres, least width of an object at its thickest part, to exclude edges
 )
@@ -137,26 +132,6 @@ class TableTop:
         """
         sighting = sighting_of(self.frame, mask, self.under(mask), self.noise)
         return replace(sighting, warnings=self.warnings)
-
-    def is_thing(self, mask: Mask) -> bool:
-        """Return True if a mask, (H, W) bool, is large and high enough to be an object."""
-        part = within(mask)
-        own = mask[part] & (self.frame.depth[part] > 0)
-        count = np.count_nonzero(own)
-        if count < FEWEST_OBJECT_PIXELS:
-            return False
-
-        away = float(np.median(self.frame.depth[part][own]))
-        top = float(np.quantile(self.height[part][own], TOP_SHARE))
-        focal = self.frame.intrinsics[0, 0] * self.frame.intrinsics[1, 1]
-        area = count * away**2 / focal
-        if top < max(LOWEST_TOP, LOWEST_SHARE * away) or area < SMALLEST_AREA:
-            return False
-        half = round(float(np.sqrt(focal)) * THINNEST / 2 / away)
-        filled = ndimage.binary_closing(np.pad(mask[part], 1))
-        return bool(
-            ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any()
-        )
 
     def neighbours(
         self,

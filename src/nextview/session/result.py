@@ -63,7 +63,6 @@ class Recognition:
         impossible: classes that never have the size of this object.
         poses_in: the coordinate frame of the poses.
         ruled_out: names that the object cannot have, with reasons, see ``scene.rule.SceneRule``.
-        of_all_names: the result without these names ruled out; None if none is.
 
     Example:
 
@@ -84,7 +83,6 @@ class Recognition:
     impossible: tuple[str, ...] = ()
     poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)
     ruled_out: tuple[tuple[str, str], ...] = ()
-    of_all_names: Recognition | None = field(default=None, repr=False)
 
     @classmethod
     def of(
@@ -137,8 +135,8 @@ class Recognition:
         """p-value: share of known objects that are at least as novel; None without a novelty score.
 
         It is valid for objects seen under the same conditions as the known ones; occlusion is taken
-        into account, see ``values_of``. For things with known geometry it measures how badly the
-        likeliest one explains the depth.
+        into account, see ``values_of``. For things with known geometry it is the probability that
+        the name of the likeliest one is right.
         """
         if self._explained is not None:
             return self._explained
@@ -197,10 +195,7 @@ class Recognition:
     def _novelty_in_words(self) -> str:
         """The p-value of the test for unknown objects."""
         if self._explained is not None and self._joint_poses:
-            return (
-                f"{100 * self._explained:.2g} % of taught things are explained as badly by their"
-                " scans"
-            )
+            return f"the name is right with a probability of {self._explained:.2g}"
         return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
 
     @property
@@ -424,7 +419,7 @@ class Recognition:
 
     @property
     def _explained(self) -> float | None:
-        """Share of known things that are explained as badly; None if it is not known."""
+        """See ``JointBelief.p_value``; None if it is not known."""
         joint = self._joint
         return None if joint is None else joint.p_value
 

@@ -38,7 +38,6 @@ from nextview.recognition.model_card import DISCRIMINATE, Collection, find_model
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.recognition.protocol import (
-    KnowsAnyOrientation,
     Recogniser,
     RulesOut,
     check_unknown,
@@ -79,7 +78,6 @@ class System:
         stopping: the stopping rule.
         unknown: significance level of the test for unknown objects; 0 disables it.
         loaded: the arguments of ``load``.
-        any_orientation: whether objects are taught things that need not be in a resting pose.
         ruled_out: names of things that the object is not, see ``without``.
 
     Example:
@@ -95,7 +93,6 @@ class System:
     stopping: Stopping
     unknown: float
     loaded: dict[str, Any] = field(repr=False)
-    any_orientation: bool = False
     ruled_out: tuple[str, ...] = ()
 
     @property
@@ -112,7 +109,6 @@ class System:
         min_height: float | None = None,
         max_height: float | None = None,
         clearance: float | None = None,
-        any_orientation: bool = False,
         goal: Goal = "thing",
         segmentation: "Segmenter | None" = None,
     ) -> Session:
@@ -125,7 +121,8 @@ class System:
             start: first view, an index of ``sphere``; random by default.
             seed: of the first view and of random policies.
             object: the object to find in the frames of a depth camera; by default the one at which
-                the first camera is aimed.
+                the first camera is aimed. One in the air must be selected by a mask or a box, with
+                ``ObservedObject(support=False)``.
             distance: desired distance of the camera from the object, metres; 3 object radii by
                 default. With an object or a distance, the session accepts frames; otherwise the
                 first input decides.
@@ -135,24 +132,17 @@ class System:
                 or the greatest height of the camera so far.
             clearance: least distance between the camera and surfaces in the frames, metres; 0.1 by
                 default, 0 for no limit.
-            any_orientation: the object is a taught thing that need not be in a resting pose: it may
-                lean or be in a hand. A frame takes about twice as long. An object in the air must
-                be selected by a mask or a box, with ``ObservedObject(support=False)``.
             goal: "thing" ends once the identity is confident, "pose" once the pose is confident
                 too, see ``Session.goal``.
             segmentation: segments the objects in frames, see ``Scene``; the object is one of the
                 segments.
-
-        Raises:
-            ModelError: ``any_orientation`` needs known geometry, and the models have none.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
         drawn = int(rng.integers(len(self.sphere)))
         start = drawn if start is None else start
         options = (self.stopping, rng, object, distance, self.unknown)
-        system = self.in_any_orientation() if any_orientation else self
         session = Session(
-            system.models, self.policy, self.sphere, start, *options, segmentation
+            self.models, self.policy, self.sphere, start, *options, segmentation
         )
         session.limits = Limits(min_height, max_height, clearance)
         session.goal = goal
@@ -163,7 +153,6 @@ class System:
         camera: Camera | FrameCamera,
         start: int | None = None,
         seed: int = 0,
-        any_orientation: bool = False,
     ) -> Session:
         """Create a session for a camera. A camera that delivers frames also provides the object.
 
@@ -171,19 +160,13 @@ class System:
             camera: the camera.
             start: index of the first view; None for a random one.
             seed: of the first view and of random policies.
-            any_orientation: whether the object is a taught thing in any orientation.
 
         Returns:
             The session.
         """
         if not isinstance(camera, FrameCamera):
-            return self.session(start, seed, any_orientation=any_orientation)
-        session = self.session(
-            start,
-            seed,
-            camera.object,
-            any_orientation=any_orientation,
-        )
+            return self.session(start, seed)
+        session = self.session(start, seed, camera.object)
         if getattr(camera, "knows_reach", False):
             session.limits = Limits.none()
         return session
@@ -197,7 +180,6 @@ class System:
         unit: str | None = None,
         sensor: "str | Sensor | None" = None,
         largest_part: bool = False,
-        any_orientation: bool = False,
     ) -> Recognition:
         """Recognise an object from as few views as needed.
 
@@ -215,7 +197,6 @@ class System:
                 renders.
             largest_part: keep only the largest connected part of a mesh file, see ``load_mesh``.
                 Likely problems of a mesh file are reported as Python warnings.
-            any_orientation: see ``session``.
 
         Raises:
             MeshError, DatasetError: the file or the folder cannot be used.
@@ -255,20 +236,7 @@ class System:
             raise UsageError(
                 f"what is looked at is {wanted}, not {one_line(repr(what))}"
             )
-        return self.session_with(what, start, seed, any_orientation).run(what)
-
-    def in_any_orientation(self) -> "System":
-        """Return the same system for taught things that may lean, or be held.
-
-        Raises:
-            ModelError: that needs known geometry, and the models have none.
-        """
-        recogniser = self.models.recogniser
-        if not isinstance(recogniser, KnowsAnyOrientation):
-            what = "things in any orientation are recognised by their geometry, and it knows none"
-            raise ModelError(f"{recogniser.name}: {what}")
-        models = replace(self.models, recogniser=recogniser.in_any_orientation)
-        return replace(self, models=models, any_orientation=True)
+        return self.session_with(what, start, seed).run(what)
 
     def without(self, *names: str) -> "System":
         """Return the same system for an object that is none of some taught things.
@@ -303,17 +271,12 @@ class System:
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
-        arguments = self.loaded, self.any_orientation, self.ruled_out
-        return partial(_reloaded, *arguments), ()
+        return partial(_reloaded, self.loaded, self.ruled_out), ()
 
 
-def _reloaded(
-    loaded: dict[str, Any], any_orientation: bool, ruled_out: Sequence[str]
-) -> System:
+def _reloaded(loaded: dict[str, Any], ruled_out: Sequence[str]) -> System:
     """Return a system that was pickled as the arguments of ``load``."""
     system = load(**loaded)
-    if any_orientation:
-        system = system.in_any_orientation()
     return system.without(*ruled_out) if ruled_out else system
 
 

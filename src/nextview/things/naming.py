@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit, softmax
@@ -21,6 +21,7 @@ CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
 LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
 LIKELY = 0.5  # belief below which an object is unknown
+SYMMETRIC = 1e9  # information about a turn that changes nothing, 1/radians^2
 LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
 
@@ -119,10 +120,15 @@ def pose_candidates(
     # a pose is known to its thing's own size, at least
     left[:, range(3), range(3)] += 1.0
     left[:, range(3, 6), range(3, 6)] += 1 / radius[:, None] ** 2
+    for k, thing in enumerate(some.things):
+        # a turn that changes nothing is no error
+        for one in world.library.symmetries.get(world.library.names[thing]) or ():
+            if one.order == 0:
+                axis = some.rotations[k] @ one.axis
+                left[k, :3, :3] += SYMMETRIC * np.outer(axis, axis)
     variances = np.diagonal(np.linalg.inv(left), axis1=1, axis2=2)
     degrees = np.degrees(np.sqrt(variances[:, :3].sum(1)))
     millimetres = 1000 * np.sqrt(variances[:, 3:].sum(1))
-    shares = found.probabilities / found.probabilities.sum()
     every = []
     for k, row in enumerate(rows):
         thing = int(some.things[k])
@@ -132,7 +138,7 @@ def pose_candidates(
                 thing=surface.name,
                 label=thing if labels is None else int(labels[thing]),
                 pose=world.hypotheses.pose(int(row), world.library),
-                probability=float(shares[k]),
+                probability=float(found.probabilities[k]),
                 degrees=float(degrees[k]),
                 millimetres=float(millimetres[k]),
                 centre=surface.centroid,
@@ -141,6 +147,11 @@ def pose_candidates(
                 symmetry=world.library.symmetries.get(surface.name),
             )
         )
-    return tuple(
-        every[k] for k in distinct(every) if k == 0 or shares[k] > LEAST_LISTED
-    )
+    # hypotheses that ended in one pose are one
+    kept = [every[k] for k in distinct(every)]
+    whole = sum(one.probability for one in kept)
+    listed = [
+        one for one in kept if one is kept[0] or one.probability > LEAST_LISTED * whole
+    ]
+    whole = sum(one.probability for one in listed)
+    return tuple(replace(one, probability=one.probability / whole) for one in listed)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from copy import copy
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from nextview.types import Floats, Index, Mask
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"
 NOTHING_FITS = "no taught thing explains the views"
+OTHER_SIZE = 5.0  # times smaller or larger than all things are: it is none of them
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -88,11 +88,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         other._last = None
         return other
 
-    @property
-    def in_any_orientation(self) -> VerifiedRecogniser:
-        """The same recogniser: things need not rest on anything to be recognised."""
-        return self
-
     def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
         """The same recogniser for cameras with another pose accuracy.
 
@@ -107,11 +102,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         other.library = self.library.for_cameras(place, aim)
         other._last = None
         return other
-
-    @cached_property
-    def least_p_value(self) -> float:
-        """Smallest value of the test for unknown objects: it has no bound."""
-        return 0.0
 
     def together(
         self,
@@ -139,6 +129,15 @@ class VerifiedRecogniser(TaughtRecogniser):
         alone = alone / alone.sum()
         if any(observation.radius is None for observation in observations):
             return JointBelief(alone, why_no_pose=NO_SCALE, doubt=NO_SCALE)
+        likeliest = int(alone.argmax())
+        if likeliest not in self.labels:
+            name = self.classes[likeliest]
+            return JointBelief(
+                alone, why_no_pose=f"the geometry of {name} is not known"
+            )
+        radius, radii = float(observations[-1].radius or 0.0), self.library.radii
+        if not radii.min() / OTHER_SIZE < radius < radii.max() * OTHER_SIZE:
+            return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
 
         world = self.explained(observations)
         thing = max(

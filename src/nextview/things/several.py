@@ -86,10 +86,8 @@ class SeveralRecognisers:
         self._novelties: WeakKeyDictionary[Observation, float] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes without the cached evidence of observations and without derived
-        recognisers.
-        """
-        left_out = ("_said", "_novelties", "in_any_orientation")
+        """The attributes without the cached evidence of observations."""
+        left_out = ("_said", "_novelties")
         return {
             name: value for name, value in vars(self).items() if name not in left_out
         }
@@ -121,17 +119,6 @@ class SeveralRecognisers:
                 surfaces.append(replace(surface, name=name))
             first += len(memory.classes)
         return Library(surfaces, symmetries)
-
-    @cached_property
-    def in_any_orientation(self) -> SeveralRecognisers:
-        """The same recogniser for things in a gripper, leaning or in the air."""
-        tilted: dict[str, NetworkRecogniser] = {}
-        for name, member in self._collections.items():
-            if isinstance(member, VerifiedRecogniser):
-                tilted[name] = member.in_any_orientation
-            else:
-                tilted[name] = member
-        return SeveralRecognisers(tilted)
 
     def without(self, names: Collection[str]) -> SeveralRecognisers:
         """The same recogniser for an object that is none of some taught things.

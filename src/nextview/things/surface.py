@@ -140,28 +140,11 @@ class Surface:
         return kept
 
     @cached_property
-    def nearby(self) -> cKDTree:
-        """Search tree of points on the surface, about ``spacing`` apart."""
-        return cKDTree(self.sample(SURFACE_SAMPLES, np.random.default_rng(0)))
-
-    @property
-    def spacing(self) -> float:
-        """Typical distance between points of ``nearby``, metres."""
-        return float(np.sqrt(self.area / SURFACE_SAMPLES))
-
-    @cached_property
     def _areas(self) -> Float:
         """Area of each triangle, (F,), square metres."""
         corners = self.vertices[self.faces].astype(np.float64)
         edges = corners[:, 1:] - corners[:, :1]
         return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
-
-    @cached_property
-    def vertex_shares(self) -> Float:
-        """Share of the surface that belongs to each vertex, (V,) float64: their sum is 1."""
-        corners = self.faces.ravel()
-        sums = np.bincount(corners, np.repeat(self._areas, 3), len(self.vertices))
-        return sums / sums.sum()
 
     @property
     def area(self) -> float:

@@ -94,15 +94,13 @@ class OrientedProposals:
         ranks: number of better orientations of the same thing, (M,) int64.
         rotations: from the axes of the scan files to the world, (M, 3, 3) float64.
         centres: centres of the surfaces in the world, (M, 3) float64, metres.
-        costs: of outline and relative depth, (M,) float32.
-        of_things: least cost of each thing, (T,) float64.
+        of_things: least cost of outline and relative depth of each thing, (T,) float64.
     """
 
     things: Index
     ranks: Index
     rotations: Float
     centres: Float
-    costs: Float32
     of_things: Float
 
 
@@ -170,7 +168,7 @@ class ViewTemplates:
         rank = rank[rank < MOST_ORIENTATIONS]
         rotations, centres = self._poses(fit, view, order)
         return OrientedProposals(
-            self.things[order], rank, rotations, centres, fit.cost[order], of_things
+            self.things[order], rank, rotations, centres, of_things
         )
 
     def _fit(self, view: "SeenOutline") -> "TemplateFit":

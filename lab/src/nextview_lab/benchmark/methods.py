@@ -216,7 +216,6 @@ class NextviewMethod:
             seed=int(self._rng.integers(2**62)),
             object=ObservedObject(WORLD_UP, support=not look.held),
             distance=float(np.median(np.linalg.norm(away, axis=1))),
-            any_orientation=look.held,
         )
         session.limits = Limits.none()
         return session

@@ -167,7 +167,7 @@ def looked_at(
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lying
     camera = SensedCamera(rotated(mesh, turn), sensor, rng)
     view = int(rng.integers(len(system.sphere)))
-    result = system.session_with(camera, view, draw, False).run(camera)
+    result = system.session_with(camera, view, draw).run(camera)
     return result, camera.object_frame.axes @ turn
 
 

@@ -78,14 +78,12 @@ class Terms:
         models: memory of the things.
         seed: of everything random.
         arm_error: standard deviations of the camera's pose along and about each axis, mm, degrees.
-        any_orientation: places in which things are recognised in any orientation.
     """
 
     scans: str
     models: str
     seed: int
     arm_error: tuple[float, float]
-    any_orientation: tuple[Place, ...]
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,6 @@ def recognised(
     session = system.session(
         object=ObservedObject(support=place != "held"),
         distance=distance,
-        any_orientation=place in terms.any_orientation,
     )
     scan = scan_of(terms.scans, name)
     found: list[AfterView | None] = []
@@ -268,7 +265,6 @@ def main(
     seed: int = 1,
     models: str = "ycb",
     arm_error: tuple[float, float] = (3.0, 0.3),
-    any_orientation: tuple[Place, ...] = ("held",),
     workers: int = 1,
 ) -> None:
     """Stage the things, recognise them, and print the table.
@@ -281,7 +277,6 @@ def main(
         seed: of everything random.
         models: memory that was taught with the scans.
         arm_error: standard deviations of the camera's poses along and about each axis, mm, degrees.
-        any_orientation: places in which the things are recognised in any orientation.
         workers: processes.
     """
     names = (
@@ -289,7 +284,7 @@ def main(
         .permutation(list(scans_in(scans, (".ply",))))
         .tolist()
     )
-    terms = Terms(str(scans), models, seed, arm_error, any_orientation)
+    terms = Terms(str(scans), models, seed, arm_error)
     asked = [
         (terms, place, name) for name in names[: things or None] for place in places
     ]
