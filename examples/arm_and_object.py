@@ -61,7 +61,7 @@ class Arm:
 def recognise(arm: Arm) -> nextview.Recognition:
     """What a user writes."""
     session = nextview.load(threshold=0.99).session(
-        object=ObservedObject(life_size=False),
+        object=ObservedObject(life_size=False, alone=True),
         distance=0.6,
     )
     session.reachable = arm.can_reach
