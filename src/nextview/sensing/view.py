@@ -127,9 +127,7 @@ class View:
         alone = _not_large(frame, labels, LARGER * widest)
         given = labels if instances.pieces is None else instances.pieces
         given = np.where(inside & (frame.depth > 0), given, 0)
-        pieces = _not_large(
-            frame, _connected(given, frame, sigma), LARGER * widest
-        )
+        pieces = _not_large(frame, _connected(given, frame, sigma), LARGER * widest)
         large = (labels > 0) & (alone == 0)
         surface |= large
         inside &= ~large
@@ -277,7 +275,9 @@ class View:
             low, high = np.unravel_index(close.argmax(), close.shape)
             if close[low, high] <= 0:
                 return
-            mask = np.isin(self.labels, np.flatnonzero((group == low) | (group == high)))
+            mask = np.isin(
+                self.labels, np.flatnonzero((group == low) | (group == high))
+            )
             if _extent(self.frame, *np.nonzero(mask)) > self.largest:
                 touching[low, high] = touching[high, low] = 0
                 continue
