@@ -15,8 +15,8 @@ from nextview.sensing.view import Segment, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
 from nextview.things.score import score
-from nextview.things.view_templates import SeenOutline, rank_within
-from nextview.types import Float, Index, Mask
+from nextview.things.view_templates import SeenOutline
+from nextview.types import Float, Mask
 
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
