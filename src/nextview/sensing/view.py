@@ -82,7 +82,6 @@ class View:
         surface: pixels of what carries things, (H, W) bool.
         background: pixels of walls and the like, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
-        largest: extent of the largest thing, metres.
     """
 
     frame: Frame
@@ -93,7 +92,6 @@ class View:
     surface: Mask
     background: Mask
     inside: Mask
-    largest: float
     _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -126,7 +124,7 @@ class View:
         # a table, a wall, a room: no thing is as large
         alone = _not_large(frame, labels, LARGER * widest)
         given = labels if instances.pieces is None else instances.pieces
-        given = np.where(inside & (frame.depth > 0), given, 0)
+        given = np.where(inside & (frame.depth > 0), given, 0).astype(np.int32)
         pieces = _not_large(frame, _connected(given, frame, sigma), LARGER * widest)
         large = (labels > 0) & (alone == 0)
         surface |= large
@@ -141,7 +139,6 @@ class View:
             surface,
             instances.background,
             inside,
-            LARGER * widest,
         )
 
     def seen_from(self, camera: Float) -> View:
@@ -263,8 +260,8 @@ class View:
     def unions(self) -> Iterator[Segment]:
         """Return neighbouring instances as one: a thing that was cut in two or more is one.
 
-        Those that touch each other most for their size are joined first, and so on, unless both
-        together are larger than any thing.
+        Those that touch each other most for their size are joined first, and so on: as many unions
+        as there are joins.
         """
         touching = self._touching()
         sizes = np.bincount(self.labels.ravel()).astype(np.float64)
@@ -275,17 +272,12 @@ class View:
             low, high = np.unravel_index(close.argmax(), close.shape)
             if close[low, high] <= 0:
                 return
-            mask = np.isin(
-                self.labels, np.flatnonzero((group == low) | (group == high))
-            )
-            if _extent(self.frame, *np.nonzero(mask)) > self.largest:
-                touching[low, high] = touching[high, low] = 0
-                continue
             touching[low] += touching[high]
             touching[:, low] += touching[:, high]
             touching[high] = touching[:, high] = touching[low, low] = 0
             sizes[low] += sizes[high]
             group[group == high] = low
+            mask = np.isin(self.labels, np.flatnonzero(group == low))
             if np.count_nonzero(mask) >= self.fewest:
                 yield Segment(mask)
 
@@ -307,7 +299,9 @@ class View:
         return found + found.T
 
 
-def _connected(pieces: Index, frame: Frame, sigma: Float32) -> NDArray[np.int32]:
+def _connected(
+    pieces: NDArray[np.int32], frame: Frame, sigma: Float
+) -> NDArray[np.int32]:
     """Return pieces, (H, W) int, that are parted where the depth jumps, (H, W) int32.
 
     Args:
