@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.view_templates import ViewTemplates, templates_of
 from nextview.types import Float, Float32, Index
@@ -17,6 +19,8 @@ from nextview.types import Float, Float32, Index
 # errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
 CAMERA_ERROR = 0.006, 0.004
 LEAST_CAMERA_ERROR = 1e-4  # metres: a more accurate camera counts as exact
+TURNS = 24  # rotations that are tried of what is nearly round
+PARALLEL = 0.99  # cosine of the angle between two axes that are one
 
 
 class Library:
@@ -25,6 +29,8 @@ class Library:
     Attributes:
         names: of the things, in their order.
         symmetries: of each thing, by its name.
+        near: rotations about the centroid after which each thing looks nearly the same, by its
+            name, (N, 3, 3) float64.
         caster: casts rays at their surfaces.
         templates: their depth images from all directions.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
@@ -36,6 +42,7 @@ class Library:
         self,
         surfaces: Sequence[Surface],
         symmetries: Mapping[str, Any] = MappingProxyType({}),
+        near: Mapping[str, Float] = MappingProxyType({}),
         threads: int = 1,
     ) -> None:
         """Render the templates.
@@ -43,10 +50,12 @@ class Library:
         Args:
             surfaces: of the things, with their names.
             symmetries: of each thing, by its name.
+            near: rotations of each thing, by its name.
             threads: number of threads; 0 for one on each core.
         """
         self.names = tuple(surface.name for surface in surfaces)
         self.symmetries = symmetries
+        self.near = near
         self.caster = SurfaceCaster(surfaces)
         self.camera = CAMERA_ERROR
         self.templates: ViewTemplates = templates_of(self.caster, threads)
@@ -91,6 +100,28 @@ class Library:
         points = self.templates.points[things, nearest, :count]
         normals = self.templates.normals[things, nearest, :count]
         return points, normals, self.templates.fill[things, nearest]
+
+
+def nearly_same(near: Sequence[Symmetry], exact: Sequence[Symmetry]) -> Float:
+    """Return rotations after which a thing looks nearly the same, but not quite, (N, 3, 3).
+
+    Args:
+        near: near symmetries, the exact ones among them.
+        exact: symmetries.
+    """
+    vectors = [
+        2 * np.pi * step / steps * np.array(one.axis)
+        for one in near
+        if not any(
+            abs(np.dot(one.axis, other.axis)) > PARALLEL and one.order == other.order
+            for other in exact
+        )
+        for steps in [one.order or TURNS]
+        for step in range(1, steps)
+    ]
+    if not vectors:
+        return np.zeros((0, 3, 3))
+    return np.asarray(Rotation.from_rotvec(np.array(vectors)).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +173,20 @@ class Hypotheses:
             self.centres[rows],
             self.sizes[rows],
         )
+
+    def nearly_same(self, library: Library) -> Hypotheses:
+        """Return the hypotheses that look nearly as these do, each turned about its centroid."""
+        turned = [self[:0]]
+        for row, thing in enumerate(self.things):
+            turns = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
+            some = self[np.full(len(turns), row)]
+            arm = library.caster.surfaces[thing].centroid - library.centres[thing]
+            rotations = some.rotations @ turns
+            moved = (some.rotations - rotations) @ arm
+            turned.append(
+                replace(some, rotations=rotations, centres=some.centres + moved)
+            )
+        return Hypotheses.joined(turned)
 
     def pose(self, row: int, library: Library) -> Float:
         """Return the pose of the scan of one, scan-to-world, (4, 4) float64, metres."""

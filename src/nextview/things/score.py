@@ -259,10 +259,13 @@ def _left_over(
     all_of_it = mine > OWN_SHARE * np.maximum(sizes, 1)
     left = np.where(all_of_it, sizes - held, 0).sum(1).astype(np.float64)
 
-    ring = ndimage.binary_dilation(shown, _CROSS, iterations=2) & ~shown & measured
-    beside = (mine >= FEWEST_OWN).ravel()[key]
-    before = all_of_it.ravel()[key]
+    measured = measured & ~shown
+    beside = (mine >= FEWEST_OWN).ravel()[key] & measured
+    outline = ndimage.binary_dilation(shown, _CROSS)
+    ring = ndimage.binary_dilation(outline, _CROSS) & ~outline
+    left += EDGE_WEIGHT * np.count_nonzero(outline & beside, axis=(1, 2))
     left += np.count_nonzero(ring & beside, axis=(1, 2))
+    before = all_of_it.ravel()[key]
     left += np.count_nonzero(front & before, axis=(1, 2))
     return left
 

@@ -22,7 +22,7 @@ from nextview.things.library import Library
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.surface import Surface
-from nextview.types import Floats
+from nextview.types import Float, Floats
 
 EXPLAINED = 0.02  # p-value from which a scan explains the views
 OTHERS = 1e-3  # share of the belief for all collections except the one that answers
@@ -109,6 +109,7 @@ class SeveralRecognisers:
         """The things of known geometry of all collections, by their names in ``classes``."""
         surfaces: list[Surface] = []
         symmetries: dict[str, Any] = {}
+        near: dict[str, Float] = {}
         first = 0
         for memory in self.memories:
             for surface, label in zip(
@@ -116,9 +117,10 @@ class SeveralRecognisers:
             ):
                 name = self.classes[first + int(label)]
                 symmetries[name] = memory.library.symmetries.get(surface.name)
+                near[name] = memory.library.near[surface.name]
                 surfaces.append(replace(surface, name=name))
             first += len(memory.classes)
-        return Library(surfaces, symmetries)
+        return Library(surfaces, symmetries, near)
 
     def without(self, names: Collection[str]) -> SeveralRecognisers:
         """The same recogniser for an object that is none of some taught things.

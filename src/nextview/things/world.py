@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from nextview.sensing.view import View
 from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
-from nextview.things.propose import propose
+from nextview.things.propose import COARSER, best, propose
 from nextview.things.register import camera_error, register
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
@@ -165,7 +165,24 @@ class World:
             new = propose(self.library, view, left, among)
             if new is not None:
                 world = world.with_hypotheses(new).chosen()
-        return world.pruned()
+        return world.turned().pruned()
+
+    def turned(self) -> World:
+        """Return the world with the poses in which new or doubtful things look nearly the same."""
+        rows = [
+            one.row
+            for one in self.things
+            if one.row >= 0
+            and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
+        ]
+        new = self.hypotheses[np.array(rows, np.int64)].nearly_same(self.library)
+        if not len(new):
+            return self
+        new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
+        columns = [score(self.library, one, new, COARSER) for one in self.views]
+        totals = np.array([total(row) for row in zip(*columns, strict=True)])
+        some = best(self.library, new, totals, len(rows), 1)
+        return self.with_hypotheses(some).chosen()
 
     def with_hypotheses(self, new: Hypotheses) -> World:
         """Return the world with more hypotheses, registered to all views."""
