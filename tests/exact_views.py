@@ -12,9 +12,10 @@ from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.library import Library
+from nextview.things.library import Library, nearly_same
 from nextview.things.naming import named
 from nextview.things.surface import Surface
+from nextview.things.symmetry import find_near_symmetries
 from nextview.things.target import view_of
 from nextview.things.world import World, corrected
 
@@ -103,7 +104,10 @@ def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, 
 
 
 def library_of(*meshes: Mesh) -> Library:
-    return Library([Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)])
+    """What is taught of meshes: their surfaces, and the turns after which they look alike."""
+    surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
+    near = {one.name: nearly_same(find_near_symmetries(one), ()) for one in surfaces}
+    return Library(surfaces, near=near)
 
 
 @dataclass(frozen=True, eq=False)

@@ -259,11 +259,11 @@ def scene_of(names, robot):
 
 @pytest.fixture(scope="module")
 def lonely(emptied, parts):
-    """A flange in the middle of the bin: the scene, all free grasps, and the robot."""
+    """A bearing block in the middle of the bin: the scene, all free grasps, and the robot."""
     names, _, _ = emptied
-    solid = parts["flange"]
+    solid = parts["bearing_block"]
     robot = StandIn(
-        {"flange": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))}
+        {"bearing_block": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))}
     )
     scene = scene_of(names, robot)
     found = scene.grasps(names["grasps"], names["GRIPPER"])
@@ -278,7 +278,7 @@ def test_free_grasps_come_best_first_and_reach_neither_bottom_nor_walls(lonely):
     )
     gripper = names["GRIPPER"]
     for one in found:
-        assert one.name == "flange"
+        assert one.name == "bearing_block"
         (thing,) = (each for each in scene.objects if each.number == one.number)
         assert thing.confident
         tips = [

@@ -57,7 +57,7 @@ def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
 
 
 def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
-    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=5)
+    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=1)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     assert scene.open == ()
@@ -78,7 +78,7 @@ def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
 
 
 def test_what_no_view_that_is_left_shows_does_not_keep_a_scene_open(ycb):
-    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=5)
+    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=1)
     camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     here = view(20, elevation=25)

@@ -88,7 +88,7 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
     # of two that explain the views alike, neither is sure
     most = 1 - probabilities[others].sum() / probabilities.sum()
-    return Named(rows, probabilities, min(float(expit(odds)), most), lead, share)
+    return Named(rows, probabilities, float(min(expit(odds), most)), lead, share)
 
 
 def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
