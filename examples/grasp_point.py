@@ -86,8 +86,8 @@ class Robot:
 
 
 def recognise(system: nextview.System, robot: Robot) -> nextview.Recognition:
-    """Look until it is clear what stands there."""
-    session = system.session(distance=0.5)
+    """Look until it is clear what stands there, and where."""
+    session = system.session(goal="pose", distance=0.5)
     session.update(robot.look(robot.first_pose()))
     while not session.done:
         session.update(robot.look(session.target))

@@ -161,9 +161,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         best = int(belief.argmax())
         others = np.where(np.arange(classes) == best, 0, belief)
         rest = others.sum() or 1.0
-        right = min(found.right, belief[best])
         belief = np.where(
-            np.arange(classes) == best, right, others * (1 - right) / rest
+            np.arange(classes) == best, found.right, others * (1 - found.right) / rest
         )
         moves = sum(
             view.frame.camera_to_world is not view.camera for view in world.views

@@ -63,6 +63,11 @@ class Score:
         """Gain of all pixels and what is paid for, nats."""
         return float(self.gain.sum()) + self.paid
 
+    @property
+    def share(self) -> float:
+        """Share of the gain that it could have at most in this view."""
+        return self.total / max(1.0, PIXEL_GAIN * self.seen)
+
 
 def score(
     library: Library, view: View, some: Hypotheses, coarser: int = 1

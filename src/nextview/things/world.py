@@ -208,7 +208,7 @@ class World:
         shown = np.zeros(view.grid().depth.shape, bool)
         for one in self.things:
             found = one.scores[-1]
-            if one.row >= 0 and found is not None and one.share > share:
+            if one.row >= 0 and found is not None and found.share > share:
                 shown.ravel()[found.cells[found.gain > EXPLAINS]] = True
         stride = view.stride
         large = np.repeat(np.repeat(shown, stride, 0), stride, 1)
