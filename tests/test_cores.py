@@ -45,7 +45,7 @@ def test_networks_and_templates_answer_alike_with_any_number(monkeypatch, ycb):
         np.testing.assert_array_equal(one.logits, said[0].logits)
         np.testing.assert_array_equal(one.azimuth_bins, said[0].azimuth_bins)
 
-    surfaces = ycb.models.recogniser.things.verifier.caster.surfaces
+    surfaces = ycb.models.recogniser.library.caster.surfaces
     few = SurfaceCaster(surfaces[5:8])
     drawn = with_each_count(monkeypatch, lambda: ViewTemplates(few, 0))
     for one in drawn[1:]:
@@ -67,7 +67,6 @@ def test_a_scene_answers_alike_with_any_number(monkeypatch, ycb):
     assert len(first) == 3
     for objects in others:
         for one, before in zip(objects, first, strict=True):
-            assert one.result.beliefs == before.result.beliefs
-            assert one.result.novelty == before.result.novelty
+            assert one.beliefs == before.beliefs
             assert one.confident == before.confident
             np.testing.assert_array_equal(one.pose, before.pose)

@@ -10,6 +10,7 @@ from factories import camera_over, view
 
 import nextview
 from nextview.errors import NextviewError
+from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
 
 
@@ -198,68 +199,44 @@ def test_an_object_tells_what_is_wrong_with_its_frames_and_is_not_confident(
 def test_a_frame_that_was_handed_in_before_counts_once(ycb, two_frames):
     scene = nextview.Scene(ycb)
     scene.update(two_frames[0])
-    (once,) = scene.objects
+    once = stands(scene)
     looks = [scene.update(two_frames[0]) for _ in range(3)]
-    (again,) = scene.objects
     assert not any(look.taken for look in looks)
-    assert len(again.result.views) == 1
-    assert again.confidence == once.confidence
-    masked = replace(two_frames[0], mask=again.pixels[0])
+    assert stands(scene) == once
+    assert {views for *_, views in once} == {1}
+    masked = replace(two_frames[0], mask=scene.objects[0].pixels[0])
     assert scene.update(masked).taken  # another part of the picture is asked for
 
 
-class FailsLater:
-    """A recogniser that fails after it has judged some objects."""
-
-    def __init__(self, recogniser) -> None:
-        self._recogniser = recogniser
-        self.left = 1000
-
-    def __getattr__(self, name):
-        return getattr(self._recogniser, name)
-
-    def __call__(self, observations):
-        return self._recogniser(observations)
-
-    def together(self, *views):
-        self.left -= 1
-        if self.left < 0:
-            raise RuntimeError("the recogniser fails")
-        return self._recogniser.together(*views)
-
-    def outlook(self, *views):
-        return self._recogniser.outlook(*views)
-
-
 def test_a_frame_that_raises_leaves_no_trace(ycb, ycb_meshes):
-    """Neither where it fails at once nor where it fails last, when two objects become one."""
+    """Neither where it fails at once nor where it fails last, when the names are ruled out."""
     camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
     first, second = camera.frame(view(20)), camera.frame(view(110))
-    recogniser = FailsLater(ycb.models.recogniser)
-    models = replace(ycb.models, recogniser=recogniser)
-    scene = nextview.Scene(replace(ycb, models=models))
+    failing = []
+
+    def segmented(frame):
+        if "segmentation" in failing:
+            raise RuntimeError("it fails")
+        return LearnedSegmenter()(frame)
+
+    def rule(objects):
+        if "rule" in failing:
+            raise RuntimeError("it fails")
+        return {}
+
+    scene = nextview.Scene(ycb, segmentation=segmented, rule=rule)
     scene.update(first)
-    state = scene._state
-    mug = next(track for track in state.tracks if track.result.answer == "mug")
-    scene._state = replace(state, tracks=(*state.tracks, replace(mug, number=7)))
-
-    def held():
-        return [(thing.number, thing.name, *thing.pixels) for thing in scene.objects]
-
-    before = held()
-    left = recogniser.left
+    before = stands(scene)
     look = copy(scene).update(second)
-    assert look.joined
-    calls = left - recogniser.left
-    assert calls > 2
+    assert look.taken
 
-    for allowed in (0, calls - 1):
-        recogniser.left = allowed
-        with pytest.raises(RuntimeError, match="the recogniser fails"):
+    for what in ("segmentation", "rule"):
+        failing[:] = [what]
+        with pytest.raises(NextviewError, match="it fails"):
             scene.update(second)
-        assert held() == before
+        assert stands(scene) == before
         assert len(scene.frames) == 1
-    recogniser.left = calls
+    failing.clear()
     assert scene.update(second) == look
 
 

@@ -451,7 +451,7 @@ def node(monkeypatch):
     for name in ours:
         monkeypatch.delitem(sys.modules, name, raising=False)
     made = object.__new__(importlib.import_module("nextview_ros.node").NextviewNode)
-    made.system = nextview.load()
+    made.system = nextview.load("ycb", threads=1)
     made.session = made.system.session(
         object=ObservedObject(life_size=False),
         distance=0.5,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from nextview.recognition.poses import (
     place_in_words,
     uncertainty_of,
 )
+from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import (
@@ -55,7 +56,7 @@ class SceneObject:
         candidates: things and poses that the object may be, the likeliest first.
         doubt: why the name is not confident, in words; "" if it is, or if there is none.
         ruled_out: names that it cannot have, with the reasons, see ``scene.rule.SceneRule``.
-        warnings: likely problems with this object; usually empty.
+        warnings: likely problems of the frames that show the object; usually empty.
     """
 
     number: int
@@ -116,18 +117,20 @@ SEEN_POINTS = 400
 
 
 def objects_of(
-    world: World, up: Float, ruled_out: Mapping[int, Mapping[str, str]]
+    world: World,
+    tops: Sequence[TableTop],
+    ruled_out: Mapping[int, Mapping[str, str]],
 ) -> tuple[SceneObject, ...]:
     """Return the objects of a scene, in the order in which they were found.
 
     Args:
         world: what explains the frames.
-        up: direction in it, (3,).
+        tops: support surfaces of each frame.
         ruled_out: names that objects cannot have, with the reasons, by their numbers.
     """
     pairs = touching(world)
     return tuple(
-        _object(world, thing, up, pairs, ruled_out.get(thing.number, {}))
+        _object(world, thing, tops, pairs, ruled_out.get(thing.number, {}))
         for thing in sorted(world.things, key=lambda one: one.number)
     )
 
@@ -135,18 +138,19 @@ def objects_of(
 def _object(
     world: World,
     thing: Thing,
-    up: Float,
+    tops: Sequence[TableTop],
     pairs: set[tuple[int, int]],
     ruled_out: Mapping[str, str],
 ) -> SceneObject:
     """Return the public view of one thing."""
     points = seen_points(world, thing.number)
-    axes = upright_axes(up)
+    axes = upright_axes(tops[0].up)
     flat = points @ axes.T
     middle = axes.T @ ((flat.min(0) + flat.max(0)) / 2)
     beside = [pair for pair in pairs if thing.number in pair]
     others = sorted({number for both in beside for number in both} - {thing.number})
     pixels = masks_of(world, thing.number)
+    warnings = [one for k in pixels for one in tops[k].warnings]
     one = SceneObject(
         thing.number,
         UNKNOWN_NAME,
@@ -161,6 +165,7 @@ def _object(
         {},
         (),
         ruled_out=tuple(ruled_out.items()),
+        warnings=tuple(dict.fromkeys(warnings)),
     )
     if thing.row < 0:
         return one
@@ -170,17 +175,19 @@ def _object(
     candidates = pose_candidates(world, found)
     if found.right < LIKELY:
         return replace(one, beliefs=found.beliefs(world), candidates=candidates)
-    sure = found.right >= CONFIDENT
+    doubt = "" if found.right >= CONFIDENT else why_in_doubt(world, thing, found)
+    for warning in tops[max(pixels)].warnings if pixels else ():
+        doubt = warning.message if warning.holds else doubt
     return replace(
         one,
         name=candidates[0].thing,
         confidence=found.right,
-        confident=sure,
-        settled=sure,
+        confident=not doubt,
+        settled=not doubt,
         place=candidates[0].place,
         beliefs=found.beliefs(world),
         candidates=candidates,
-        doubt="" if sure else why_in_doubt(world, thing, found),
+        doubt=doubt,
     )
 
 

@@ -594,10 +594,10 @@ class Scene:
         # the pose of a camera that has not moved is as right as before
         stands = self._known_frames.stands(top.frame)
         told = changes(before.world, view, stands)
-        if told.wrong_pose:
-            return before, Look(False, warnings=(self._why_wrong(top),))
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
+        if told.wrong_pose:
+            return before, Look(False, warnings=(self._why_wrong(top),))
 
         world = told.world.with_view(told.view, told.held)
         world = world.searched(np.ones(len(world.library), bool)).numbered()

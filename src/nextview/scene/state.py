@@ -53,7 +53,7 @@ class SceneState:
         Args:
             ruled_out: names that objects cannot have, with the reasons, by their numbers.
         """
-        objects = objects_of(self.world, self.tops[0].up, ruled_out)
+        objects = objects_of(self.world, self.tops, ruled_out)
         return replace(self, objects=objects, ruled_out=ruled_out)
 
     @cached_property
