@@ -15,7 +15,7 @@ from nextview.things.world import STRANGER_GAIN, Thing, World
 from nextview.types import Float, Index
 
 PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats count once
-TOTAL_ERROR = 0.02  # of what a hypothesis explains: error by its pose and scan
+TOTAL_ERROR = 0.01  # of what a hypothesis explains: error by its pose and scan
 # log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
 # explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
 CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
@@ -83,8 +83,10 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     probabilities = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))[:-1]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
     lead = float(totals[0] - totals[others].max(initial=0.0))
-    share = float(totals[0]) / max(1.0, PIXEL_GAIN * seen)
-    odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(totals[0], 1.0))
+    # what other things and planes explain as well does not speak for it
+    gain = float(totals[0] - of_row.max() + thing.gain)
+    share = gain / max(1.0, PIXEL_GAIN * seen)
+    odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(gain, 1.0))
     odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
     # of two that explain the views alike, neither is sure
     most = 1 - probabilities[others].sum() / probabilities.sum()
