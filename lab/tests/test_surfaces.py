@@ -79,7 +79,7 @@ def test_a_small_table_carries_things_though_the_floor_has_more_pixels(
     ycb, small_table, posed
 ):
     camera = LabelledCamera(small_table)
-    frame = camera.frame(looking_at((0, 0, 0.45), distance=1.3), posed)
+    frame = camera.frame(looking_at((0, 0, 0.45), distance=0.9), posed)
     assert (camera.owner == SURFACE).mean() > 0.8
 
     scene = Scene(ycb, segmentation=camera.truth)

@@ -30,7 +30,7 @@ def test_gymnasium_finds_nothing_wrong_with_it(env):
 def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     names = env.unwrapped.things.names
     observation, info = env.reset(
-        seed=0, options={"object": names.index("knob"), "draw": 1}
+        seed=0, options={"object": names.index("knob"), "draw": 0}
     )
     assert observation["belief"].sum() == pytest.approx(1, abs=1e-5)
     assert observation["hypotheses"].sum() == pytest.approx(1, abs=1e-5)

@@ -17,6 +17,7 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.sensing.tabletop import TableTop
+from nextview.sensing.view import View
 from nextview.sensing.view_warning import ViewWarning
 from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import (
@@ -197,11 +198,22 @@ def masks_of(world: World, number: int) -> dict[int, Mask]:
     for k, (view, owner) in enumerate(zip(world.views, world.owners, strict=True)):
         cells = (owner == number).reshape(view.grid().depth.shape)
         if cells.any():
-            stride = view.stride
-            large = np.repeat(np.repeat(cells, stride, 0), stride, 1)
-            mask = large[: view.depth.shape[0], : view.depth.shape[1]]
+            # what another instance shows beside the middle of a cell is not of the thing
+            label = _of_cells(view.labels[:: view.stride, :: view.stride], view)
+            mask = _of_cells(cells, view) & (label == view.labels)
             found[k] = mask & (view.depth > 0)
     return found
+
+
+def _of_cells(values: NDArray[Any], view: View) -> NDArray[Any]:
+    """Return the value of the cell of the grid that each pixel belongs to, (H, W).
+
+    Args:
+        values: of each cell, (h, w).
+        view: the view.
+    """
+    large = np.repeat(np.repeat(values, view.stride, 0), view.stride, 1)
+    return large[: view.depth.shape[0], : view.depth.shape[1]]
 
 
 def seen_points(world: World, number: int) -> Float:
