@@ -140,6 +140,8 @@ class StandIn:
     OVERVIEW = look_at_origin(np.radians(75), np.pi, 0.45)
     OVERVIEW[:3, 3] += [0.5, 0, 0.03]
     SENSOR = SENSORS["stereo"]
+    CLOSER = look_at_origin(np.radians(75), np.pi, 0.3)
+    CLOSER[:3, 3] += [0.5, 0, 0.03]
     INTRINSICS = SENSOR.intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 
     def __init__(self, parts):
@@ -253,17 +255,18 @@ def frame_of(robot):
 
 def scene_of(names, robot):
     scene = nextview.Scene(names["system"], region=names["BIN"])
+    robot.move_camera(robot.CLOSER)
     scene.update(frame_of(robot))
     return scene
 
 
 @pytest.fixture(scope="module")
 def lonely(emptied, parts):
-    """A bearing block in the middle of the bin: the scene, all free grasps, and the robot."""
+    """A flange in the middle of the bin: the scene, all free grasps, and the robot."""
     names, _, _ = emptied
-    solid = parts["bearing_block"]
+    solid = parts["flange"]
     robot = StandIn(
-        {"bearing_block": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))}
+        {"flange": (0.001 * solid[0] + [0.5, 0, 0], solid[1].astype(np.int32))}
     )
     scene = scene_of(names, robot)
     found = scene.grasps(names["grasps"], names["GRIPPER"])
@@ -278,7 +281,7 @@ def test_free_grasps_come_best_first_and_reach_neither_bottom_nor_walls(lonely):
     )
     gripper = names["GRIPPER"]
     for one in found:
-        assert one.name == "bearing_block"
+        assert one.name == "flange"
         (thing,) = (each for each in scene.objects if each.number == one.number)
         assert thing.confident
         tips = [
@@ -338,7 +341,7 @@ def test_what_no_frame_has_shown_is_not_free(lonely):
     assert len(strict) == sum(share == 0 for share in unseen)
 
     caster = RayCaster([*robot.parts.values(), *walls()])
-    camera = robot.OVERVIEW[:3, 3]
+    camera = robot.CLOSER[:3, 3]
     for one in strict[:20]:  # every place of the fingers is in the line of sight
         for side in (-1, 1):
             own = [0, side * (one.opening + 0.01) / 2, -0.01, 1]

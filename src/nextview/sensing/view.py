@@ -116,7 +116,7 @@ class View:
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         # what lies on a plane within the noise is explained by the plane
         level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
-        surface = instances.surface | level
+        surface = level.copy()
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
         for number, mask in enumerate(instances.masks, 1):
