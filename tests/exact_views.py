@@ -12,7 +12,7 @@ from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.library import Library, nearly_same
+from nextview.things.library import Library, near_turns
 from nextview.things.naming import named
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries
@@ -106,7 +106,7 @@ def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, 
 def library_of(*meshes: Mesh) -> Library:
     """What is taught of meshes: their surfaces, and the turns after which they look alike."""
     surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
-    near = {one.name: nearly_same(find_near_symmetries(one), ()) for one in surfaces}
+    near = {one.name: near_turns(find_near_symmetries(one), ()) for one in surfaces}
     return Library(surfaces, near=near)
 
 

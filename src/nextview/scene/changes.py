@@ -95,6 +95,7 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         view = corrected(world, view)
     found = _named(world, view)
     found += _unnamed(world, view, found)
+
     moved = [one for one in found if one.now == "moved"]
     gone = tuple(one.thing for one in found if one.now == "gone")
     stand = tuple(one.thing.number for one in found if one.now == "stands")
@@ -196,8 +197,8 @@ def _compared(
 
     # where they may be now: near where they were, or where the view shows something else
     taken = np.zeros(view.grid().depth.size, bool)
-    for other_thing in others:
-        taken[other_thing.cells] = True
+    for before_it in others:
+        taken[before_it.cells] = True
     for _, found in stand:
         if found is not None and found.total > NEW_OBJECT:
             taken[_explained(found)] = True
@@ -228,7 +229,7 @@ def _compared(
                 cells = _explained(found)
             elif found.total < -NEW_OBJECT and found.through > found.seen / 2:
                 now = "gone"
-            # or else it is gone, and something else has come
+            # a move has to explain more than a stranger that came there
             if (
                 other is not None
                 and other.total > NEW_OBJECT + STRANGER_GAIN * other.seen
@@ -306,11 +307,14 @@ def _measured(world: World, number: int) -> Surface | None:
             depth = np.stack(
                 [grid.depth[:-1, 1:], grid.depth[corners], grid.depth[1:, :-1]]
             )
+
+            # no triangle reaches over an edge of what was measured
             whole = np.min(across, axis=0) >= 0
             whole &= np.ptp(depth, axis=0) < grid.pitch / STEEPEST * depth.min(0)
             faces.append(np.stack(across, -1)[whole])
         vertices.append(view.points(np.flatnonzero(own)))
         count += len(vertices[-1])
+
     every = np.concatenate(faces).astype(np.int32)
     if not len(every):
         return None
@@ -331,6 +335,7 @@ def _after(world: World, moved: Sequence[_Compared], gone: Sequence[Thing]) -> W
         [row for row in range(len(world.scores)) if row not in dropped], np.int64
     )
     world = world.with_rows(kept)
+
     named = [one for one in moved if _clear(one.thing)]
     nothing = ((None,) * len(world.views),) * len(named)
     return replace(

@@ -17,7 +17,6 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.sensing.tabletop import TableTop
-from nextview.sensing.view import View
 from nextview.sensing.view_warning import ViewWarning
 from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import (
@@ -150,6 +149,7 @@ def _object(
     middle = axes.T @ ((flat.min(0) + flat.max(0)) / 2)
     beside = [pair for pair in pairs if thing.number in pair]
     others = sorted({number for both in beside for number in both} - {thing.number})
+
     pixels = masks_of(world, thing.number)
     warnings = [one for k in pixels for one in tops[k].warnings]
     one = SceneObject(
@@ -168,6 +168,8 @@ def _object(
         ruled_out=tuple(ruled_out.items()),
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+    # from what explains it to a name
     if thing.row < 0:
         return one
     found = named(world, thing, ruled_out)
@@ -176,6 +178,7 @@ def _object(
     candidates = pose_candidates(world, found)
     if found.right < LIKELY:
         return replace(one, beliefs=found.beliefs(world), candidates=candidates)
+
     doubt = "" if found.right >= CONFIDENT else why_in_doubt(world, thing, found)
     for warning in tops[max(pixels)].warnings if pixels else ():
         doubt = warning.message if warning.holds else doubt
@@ -199,21 +202,10 @@ def masks_of(world: World, number: int) -> dict[int, Mask]:
         cells = (owner == number).reshape(view.grid().depth.shape)
         if cells.any():
             # what another instance shows beside the middle of a cell is not of the thing
-            label = _of_cells(view.labels[:: view.stride, :: view.stride], view)
-            mask = _of_cells(cells, view) & (label == view.labels)
+            label = view.enlarged(view.labels[:: view.stride, :: view.stride])
+            mask = view.enlarged(cells) & (label == view.labels)
             found[k] = mask & (view.depth > 0)
     return found
-
-
-def _of_cells(values: NDArray[Any], view: View) -> NDArray[Any]:
-    """Return the value of the cell of the grid that each pixel belongs to, (H, W).
-
-    Args:
-        values: of each cell, (h, w).
-        view: the view.
-    """
-    large = np.repeat(np.repeat(values, view.stride, 0), view.stride, 1)
-    return large[: view.depth.shape[0], : view.depth.shape[1]]
 
 
 def seen_points(world: World, number: int) -> Float:
@@ -230,6 +222,7 @@ def touching(world: World) -> set[tuple[int, int]]:
     found = set()
     for view, owner in zip(world.views, world.owners, strict=True):
         depth = view.grid().depth
+
         number: NDArray[np.int32] = owner.reshape(depth.shape)
         for gap in (1, 2, 3):
             for one, two in (
@@ -240,6 +233,7 @@ def touching(world: World) -> set[tuple[int, int]]:
                 beside &= (number[two] > 0) & (
                     np.abs(depth[one] - depth[two]) < TOUCHING
                 )
+
                 low = np.minimum(number[one][beside], number[two][beside])
                 high = np.maximum(number[one][beside], number[two][beside])
                 found |= set(zip(low.tolist(), high.tolist(), strict=True))

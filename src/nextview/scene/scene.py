@@ -700,12 +700,15 @@ def _look(
     old = {one.number: one for one in before.objects}
     new = {one.number: one for one in state.objects}
     lost = [number for number in old if number not in new]
+
+    # what is neither gone nor an object any more became a part of another one
     joined = []
     for number in lost:
         into = state.world.holder(before.world, number)
         if number not in gone and into:
             joined.append((number, into))
     ended = {number for number, _ in joined}
+
     return Look(
         True,
         tuple(number for number in new if number not in old),

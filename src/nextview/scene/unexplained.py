@@ -70,11 +70,10 @@ def unexplained(
         left &= frame.mask
     for mask in top.seen.carried_by_none:
         left &= ~mask
-    stride = view.stride
+
     owned = world.owners[-1].reshape(view.grid().depth.shape) > 0
     owned = ndimage.binary_dilation(owned, iterations=EDGE_WIDTH)
-    owned = np.repeat(np.repeat(owned, stride, 0), stride, 1)
-    left &= ~owned[: frame.shape[0], : frame.shape[1]]
+    left &= ~view.enlarged(owned)
     if not left.any():
         return []
 

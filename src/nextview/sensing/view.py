@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +117,6 @@ class View:
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         # what lies on a plane within the noise is explained by the plane
         level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
-        surface = level.copy()
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
         for number, mask in enumerate(instances.masks, 1):
@@ -127,7 +127,7 @@ class View:
         given = np.where(inside & (frame.depth > 0), given, 0).astype(np.int32)
         pieces = _not_large(frame, _connected(given, frame, sigma), LARGER * widest)
         large = (labels > 0) & (alone == 0)
-        surface |= large
+        surface = level | large
         inside &= ~large
         pieces[large] = 0
         return cls(
@@ -147,10 +147,8 @@ class View:
 
     def without(self, cells: Mask) -> View:
         """Return the view without some pixels of its grid, (h, w) bool: they say nothing more."""
-        stride = self.stride
-        large = np.repeat(np.repeat(cells, stride, 0), stride, 1)
         depth = self.depth.copy()
-        depth[large[: depth.shape[0], : depth.shape[1]]] = 0
+        depth[self.enlarged(cells)] = 0
         left = replace(self, frame=self.frame.with_depth(depth))
         object.__setattr__(left, "_grids", {})
         return left
@@ -191,6 +189,11 @@ class View:
             self.surface[::stride, ::stride],
             stride / float(self.frame.intrinsics[0, 0]),
         )
+
+    def enlarged(self, cells: NDArray[Any]) -> NDArray[Any]:
+        """Return the value of the cell of the grid, (h, w), that each pixel belongs to, (H, W)."""
+        large = np.repeat(np.repeat(cells, self.stride, 0), self.stride, 1)
+        return large[: self.depth.shape[0], : self.depth.shape[1]]
 
     def points(self, cells: NDArray[np.integer]) -> Float:
         """Return the measured points of pixels of the grid, (N,), in the world, (N, 3), metres."""

@@ -102,7 +102,7 @@ class Library:
         return points, normals, self.templates.fill[things, nearest]
 
 
-def nearly_same(near: Sequence[Symmetry], exact: Sequence[Symmetry]) -> Float:
+def near_turns(near: Sequence[Symmetry], exact: Sequence[Symmetry]) -> Float:
     """Return rotations after which a thing looks nearly the same, but not quite, (N, 3, 3).
 
     Args:
@@ -174,8 +174,8 @@ class Hypotheses:
             self.sizes[rows],
         )
 
-    def nearly_same(self, library: Library) -> Hypotheses:
-        """Return the hypotheses that look nearly as these do, each turned about its centroid."""
+    def lookalikes(self, library: Library) -> Hypotheses:
+        """Return the poses in which these look nearly the same, each turned about its centroid."""
         turned = [self[:0]]
         for row, thing in enumerate(self.things):
             turns = library.near.get(library.names[thing], np.zeros((0, 3, 3)))

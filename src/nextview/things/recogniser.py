@@ -15,7 +15,7 @@ from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
 from nextview.things.expected_views import Outlook
-from nextview.things.library import Library, nearly_same
+from nextview.things.library import Library, near_turns
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
 from nextview.things.target import view_of
@@ -66,7 +66,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         self.labels: Index = np.array(labels)
         symmetries = {thing.name: thing.symmetries for thing in about.things}
         near = {
-            thing.name: nearly_same(thing.near_symmetries, thing.symmetries)
+            thing.name: near_turns(thing.near_symmetries, thing.symmetries)
             for thing in about.things
         }
         self.library = Library(surfaces, symmetries, near, threads)

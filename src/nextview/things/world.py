@@ -165,9 +165,9 @@ class World:
             new = propose(self.library, view, left, among)
             if new is not None:
                 world = world.with_hypotheses(new).chosen()
-        return world.turned().pruned()
+        return world.with_lookalikes().pruned()
 
-    def turned(self) -> World:
+    def with_lookalikes(self) -> World:
         """Return the world with the poses in which new or doubtful things look nearly the same."""
         rows = [
             one.row
@@ -175,7 +175,7 @@ class World:
             if one.row >= 0
             and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
         ]
-        new = self.hypotheses[np.array(rows, np.int64)].nearly_same(self.library)
+        new = self.hypotheses[np.array(rows, np.int64)].lookalikes(self.library)
         if not len(new):
             return self
         new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
@@ -210,9 +210,7 @@ class World:
             found = one.scores[-1]
             if one.row >= 0 and found is not None and found.share > share:
                 shown.ravel()[found.cells[found.gain > EXPLAINS]] = True
-        stride = view.stride
-        large = np.repeat(np.repeat(shown, stride, 0), stride, 1)
-        return large[: view.depth.shape[0], : view.depth.shape[1]]
+        return view.enlarged(shown)
 
     def chosen(self, ruled_out: Collection[int] = ()) -> World:
         """Return the world with the things that explain all views best together.
