@@ -469,9 +469,7 @@ def _explaining(
     gains: dict[int, float] = {}
     while kept:
         gains = _alone(kept, rows, sizes)
-        gains |= {
-            row: 0.0 for row in kept if row < 0 and gains[row] < own * total(rows[row])
-        }
+        gains |= {row: 0.0 for row in kept if gains[row] < own * total(rows[row])}
         worst = min(kept, key=lambda row: gains[row])
         if gains[worst] > NEW_OBJECT:
             break
@@ -494,7 +492,7 @@ def _greedy(
             for number, one in enumerate(rows[row])
             if one is not None
         )
-        if gain <= NEW_OBJECT or (row < 0 and gain < own * total(rows[row])):
+        if gain <= NEW_OBJECT or gain < own * total(rows[row]):
             del bounds[row]
             continue
         if gain < max((bounds[one] for one in bounds if one != row), default=0.0):
