@@ -22,6 +22,9 @@ GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
 # standard deviation of a measured depth, relative, at least: real depth is bent
 LEAST_ERROR = 0.0025
 LEVEL = 2.0  # standard deviations of the depth, within which a pixel lies on a plane
+ON_PLANE = 0.015  # metres from a plane, within which a pixel may show it
+LEAST_PLANE = 0.1  # share of an image that shows a plane on which noise is measured
+MEAN_OF_HALF = 0.3246  # mean of the smaller half of the sizes of normal errors
 LARGER = 1.2  # times the largest thing, above which an instance is none
 OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
@@ -113,7 +116,7 @@ class View:
             height: of each pixel above the plane that carries it, (H, W) float32, metres.
             widest: diameter of the largest thing, metres.
         """
-        noise = noise_of(frame)
+        noise = _as_on_plane(noise_of(frame), frame, height)
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         # what lies on a plane within the noise is explained by the plane
         level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
@@ -300,6 +303,23 @@ class View:
                 key = first[beside] * count + second[beside]
                 found += np.bincount(key, minlength=count**2).reshape(count, count)
         return found + found.T
+
+
+def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:
+    """Return the noise as it is on the plane that carries things: real depth is bent there, too.
+
+    Args:
+        noise: between neighbouring pixels.
+        frame: its frame.
+        height: of each pixel above the plane, (H, W) float32, metres.
+    """
+    depth = frame.depth
+    near = (depth > 0) & (np.abs(height) < ON_PLANE)
+    off = np.abs(height[near]) / (noise.at(depth[near]) * depth[near] ** 2)
+    if len(off) < LEAST_PLANE * depth.size:
+        return noise
+    half = np.partition(off, len(off) // 2)[: len(off) // 2]
+    return replace(noise, sigmas=noise.sigmas * half.mean() / MEAN_OF_HALF)
 
 
 def _connected(
