@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.view_templates import ViewTemplates, templates_of
-from nextview.types import Float, Float32, Index
+from nextview.types import Float, Float32, Index, Mask
 
 # errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
 CAMERA_ERROR = 0.006, 0.004
 LEAST_CAMERA_ERROR = 1e-4  # metres: a more accurate camera counts as exact
+OTHER_SIZE = 1.12  # factor by which what looks alike differs in size, at least
 TURNS = 24  # rotations that are tried of what is nearly round
 PARALLEL = 0.99  # cosine of the angle between two axes that are one
 
@@ -173,6 +174,19 @@ class Hypotheses:
             self.centres[rows],
             self.sizes[rows],
         )
+
+    @property
+    def taught(self) -> Mask:
+        """Those in the size that was taught, (M,) bool."""
+        return np.isclose(self.sizes, 1).all(1)
+
+    def in_other_sizes(self) -> Hypotheses:
+        """Return each as a whole and along each axis larger and smaller, (8 M)."""
+        along = np.concatenate([np.eye(3), np.ones((1, 3))])
+        factors = OTHER_SIZE ** np.concatenate([along, -along])
+        rows = np.repeat(np.arange(len(self)), len(factors))
+        sizes = self.sizes[:, None] * factors
+        return replace(self[rows], sizes=sizes.reshape(-1, 3))
 
     def lookalikes(self, library: Library) -> Hypotheses:
         """Return the poses in which these look nearly the same, each turned about its centroid."""

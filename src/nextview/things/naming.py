@@ -72,24 +72,29 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     of_row = totals[rows == thing.row]
     names = np.array(world.library.names)[world.hypotheses.things[rows]]
     kept = (totals > 0) & (totals <= of_row) & ~np.isin(names, list(ruled_out))
-    rows, totals = rows[kept], totals[kept]
+    # the same thing in another size is something that was not taught
+    taught = world.hypotheses.taught[rows]
+    resized = totals[kept & ~taught].max(initial=0.0)
+    rows, totals = rows[kept & taught], totals[kept & taught]
     if not len(rows):
         return None
     order = np.argsort(-totals, kind="stable")
     rows, totals = rows[order], totals[order]
 
     seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
-    every = np.append(totals, STRANGER_GAIN * seen)
-    probabilities = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))[:-1]
+    every = np.append(totals, [resized, STRANGER_GAIN * seen])
+    beliefs = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))
+    probabilities, alike = beliefs[:-2], beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
-    lead = float(totals[0] - totals[others].max(initial=0.0))
+    lead = float(totals[0] - totals[others].max(initial=resized))
     # what other things and planes explain as well does not speak for it
     gain = float(totals[0] - of_row.max() + thing.gain)
     share = gain / max(1.0, PIXEL_GAIN * seen)
     odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(gain, 1.0))
     odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
     # of two that explain the views alike, neither is sure
-    most = 1 - probabilities[others].sum() / probabilities.sum()
+    alike += probabilities[others].sum()
+    most = 1 - alike / beliefs[:-1].sum()
     return Named(rows, probabilities, float(min(expit(odds), most)), lead, share)
 
 

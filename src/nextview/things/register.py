@@ -107,8 +107,13 @@ class Projected:
         axes = view.camera[:3, :3]
         place = view.camera[:3, 3]
         towards = np.einsum("mji,mj->mi", some.rotations, place - some.centres)
+        # a ray of a stretched thing, in its own axes
+        towards /= some.sizes
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         own, across, fill = library.seen_from(some.things, towards, count)
+        sizes = some.sizes.astype(np.float32)[:, None]
+        own, across = own * sizes, across / sizes
+        across /= np.linalg.norm(across, axis=2, keepdims=True)
         turn = (axes.T @ some.rotations).astype(np.float32).swapaxes(1, 2)
         middle = ((some.centres - place) @ axes).astype(np.float32)
         points = own @ turn + middle[:, None]

@@ -30,7 +30,8 @@ EXPLAINED = (
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
-RIVALS_OF_ONE = 2
+RIVALS_OF_ONE = 3
+RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
 MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
@@ -165,17 +166,36 @@ class World:
             new = propose(self.library, view, left, among)
             if new is not None:
                 world = world.with_hypotheses(new).chosen()
-        return world.with_lookalikes().pruned()
+        return world.with_lookalikes().with_other_sizes().pruned()
 
-    def with_lookalikes(self) -> World:
-        """Return the world with the poses in which new or doubtful things look nearly the same."""
+    def with_other_sizes(self) -> World:
+        """Return the world with new or doubtful things in another size, that which fits best."""
+        some = self.hypotheses[self._doubtful()]
+        if not len(some):
+            return self
+        for _ in range(RESIZED):
+            new = some.in_other_sizes()
+            new = register(self.library, self.views, new, (0.06, 0.04, 0.03), 96)
+            columns = [score(self.library, one, new, COARSER) for one in self.views]
+            totals = np.array([total(row) for row in zip(*columns, strict=True)])
+            best_size = totals.reshape(len(some), -1).argmax(1)
+            some = new[best_size + len(new) // len(some) * np.arange(len(some))]
+        return self.with_hypotheses(some[~some.taught]).chosen()
+
+    def _doubtful(self) -> Index:
+        """Return the rows of things that are new, or that explain less than is sure."""
         rows = [
             one.row
             for one in self.things
             if one.row >= 0
             and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
         ]
-        new = self.hypotheses[np.array(rows, np.int64)].lookalikes(self.library)
+        return np.array(rows, np.int64)
+
+    def with_lookalikes(self) -> World:
+        """Return the world with the poses in which new or doubtful things look nearly the same."""
+        rows = self._doubtful()
+        new = self.hypotheses[rows].lookalikes(self.library)
         if not len(new):
             return self
         new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
@@ -230,7 +250,11 @@ class World:
         rows = {row: rows[row] for row in kept if row >= 0}
         rows |= {-1 - k: scores for k, scores in enumerate(self.strangers)}
         kept, gains = _explaining(rows, sizes, LEAST_OWN)
-        things = [Thing(0, max(row, -1), rows[row], gains[row]) for row in kept]
+        taught = self.hypotheses.taught
+        things = [
+            Thing(0, row if row >= 0 and taught[row] else -1, rows[row], gains[row])
+            for row in kept
+        ]
         return replace(self, things=tuple(things))
 
     def numbered(self) -> World:
