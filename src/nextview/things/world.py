@@ -30,7 +30,7 @@ EXPLAINED = (
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
-RIVALS_OF_ONE = 3
+RIVALS_OF_ONE = 2
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
@@ -348,7 +348,7 @@ class World:
     def pruned(self) -> World:
         """Return the world with the chosen hypotheses and the likeliest others of each place."""
         some = self.hypotheses
-        totals = self.totals
+        totals, taught = self.totals, some.taught
         kept = {one.row for one in self.things if one.row >= 0}
         places: list[int] = []
         for row in np.argsort(-totals).tolist():
@@ -359,6 +359,7 @@ class World:
             apart = np.linalg.norm(some.centres[places] - some.centres[row], axis=1)
             near = apart < 0.5 * radius
             same = near & (some.things[places] == some.things[row])
+            same &= taught[places] == taught[row]
             few = near.sum() < RIVALS and same.sum() < RIVALS_OF_ONE
             if row in kept or (few and totals[row] > 0):
                 kept.add(row)
