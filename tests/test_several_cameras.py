@@ -102,7 +102,7 @@ def an_error(rng, millimetres=4.0, degrees=0.6):
     return error
 
 
-def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
+def moments_of(rng, error, count, cameras=(LEFT, RIGHT)):
     """Frames of several cameras; the stated poses of all but the first err."""
     names = ("left", "right", "top")
     found = []
@@ -117,11 +117,18 @@ def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
     return found
 
 
-def test_an_error_of_a_camera_is_told():
-    """4 mm and .6 degrees, within 1 mm and .15 degrees."""
-    rng = np.random.default_rng(0)
+@pytest.fixture(scope="module")
+def erring():
+    """Frames of two cameras at four moments, and the error of the right one."""
+    rng = np.random.default_rng(11)
     error = an_error(rng)
-    (offset,) = camera_offsets(moments_of(rng, error))
+    return moments_of(rng, error, 4), error
+
+
+def test_an_error_of_a_camera_is_told(erring):
+    """4 mm and .6 degrees, within 1 mm and .15 degrees."""
+    moments, error = erring
+    (offset,) = camera_offsets(moments)
     assert offset.noticed
     assert (offset.camera, offset.reference) == ("right", "left")
     assert offset.millimetres == pytest.approx(4, abs=1)
@@ -229,11 +236,10 @@ def write_rig(folder, moments):
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory):
+def rig(tmp_path_factory, erring):
     """A folder of two cameras, of which the right one errs, and its frames."""
     folder = tmp_path_factory.mktemp("rigs") / "rig"
-    rng = np.random.default_rng(11)
-    moments = moments_of(rng, an_error(rng), 4)
+    moments, _ = erring
     write_rig(folder, moments)
     return folder, moments
 
