@@ -402,9 +402,9 @@ def pair():
     )
 
 
-def test_a_scene_takes_frames_of_both_cameras_together(pair):
+def test_a_scene_takes_frames_of_both_cameras_together(ycb, pair):
     left, right, truth = pair
-    scene = nextview.Scene("ycb")
+    scene = nextview.Scene(ycb)
     looks = scene.update([left, right])
     assert [look.taken for look in looks] == [True, True]
     assert scene.frames == (left, right)
@@ -416,9 +416,9 @@ def test_a_scene_takes_frames_of_both_cameras_together(pair):
     assert {thing.name for thing in scene.objects} == set(truth)
 
 
-def test_frames_enter_together_or_not_at_all(pair):
+def test_frames_enter_together_or_not_at_all(ycb, pair):
     left, right, _ = pair
-    scene = nextview.Scene("ycb")
+    scene = nextview.Scene(ycb)
     lost = Frame(right.depth, SENSOR.intrinsics, camera="right")
     with pytest.raises(ObservationError):
         scene.update([left, lost])
@@ -440,7 +440,7 @@ def test_frames_enter_together_or_not_at_all(pair):
     )
 
 
-def test_a_session_takes_frames_of_both_cameras_until_it_ends(pair):
+def test_a_session_takes_frames_of_both_cameras_until_it_ends(ycb, pair):
     left, right, truth = pair
     name, pose = next(iter(truth.items()))
     thing = ObservedObject(point=pose[:3, 3])
