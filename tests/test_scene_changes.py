@@ -45,23 +45,10 @@ def seen_once(ycb, meshes, **errors):
     return camera, scene
 
 
-def again(camera, scene):
-    """The camera and the scene as they are, for one test."""
-    camera, scene = camera.again(), copy(scene)
-    scene.segmentation = TrueMasks(camera)
-    return camera, scene
-
-
 @pytest.fixture(scope="module")
 def first_look(ycb, meshes):
     """The camera and a scene after the first frame, in which nothing errs."""
     return seen_once(ycb, meshes)
-
-
-@pytest.fixture(scope="module")
-def first_look_at_three(ycb, three):
-    """The same of some of the things."""
-    return seen_once(ycb, three)
 
 
 @pytest.fixture
@@ -70,7 +57,8 @@ def watched(first_look):
 
     A thing has a number with a name or without: scissors are hardly seen.
     """
-    camera, scene = again(*first_look)
+    camera, scene = first_look[0].again(), copy(first_look[1])
+    scene.segmentation = TrueMasks(camera)
     numbers = {}
     for one in scene.objects:
         shown = np.bincount(camera.owner[one.pixels[0]] + 1, minlength=len(NAMES) + 1)
@@ -149,8 +137,8 @@ def test_two_things_that_were_swapped_have_both_moved(watched):
             assert np.linalg.norm(thing.place[:2] - true) < 0.02
 
 
-def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(first_look_at_three, three):
-    camera, scene = again(*first_look_at_three)
+def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, three):
+    camera, scene = seen_once(ycb, three)
     belt = np.eye(4)
     start = camera.table
     for number in (1, 2):
