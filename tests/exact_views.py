@@ -103,11 +103,21 @@ def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, 
     return float(np.degrees(turn)), float(1000 * np.linalg.norm(moved[:3]))
 
 
+_NEAR: dict[tuple[bytes, bytes], np.ndarray] = {}
+
+
+def near_of(surface: Surface) -> np.ndarray:
+    """The turns after which a surface nearly looks alike, found once for all libraries."""
+    key = surface.vertices.tobytes(), surface.faces.tobytes()
+    if key not in _NEAR:
+        _NEAR[key] = near_turns(find_near_symmetries(surface), ())
+    return _NEAR[key]
+
+
 def library_of(*meshes: Mesh) -> Library:
     """What is taught of meshes: their surfaces, and the turns after which they look alike."""
     surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
-    near = {one.name: near_turns(find_near_symmetries(one), ()) for one in surfaces}
-    return Library(surfaces, near=near)
+    return Library(surfaces, near={one.name: near_of(one) for one in surfaces})
 
 
 @dataclass(frozen=True, eq=False)

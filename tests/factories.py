@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -385,6 +386,7 @@ class TableCamera:
 
     def __init__(self, table: SimulatedTable, sensor: Sensor, rng, room=()) -> None:
         self.sensor, self._rng, self._room = sensor, rng, tuple(room)
+        self._drawn: dict[tuple, tuple] = {}
         angles = [*rng.normal(0, sensor.tilt, 2), 0]
         self.lean = np.eye(4)
         self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
@@ -402,6 +404,14 @@ class TableCamera:
             things.append((slab.vertices, slab.faces.astype(np.int32)))
         self._caster = RayCaster([*things, *self._room])
 
+    def again(self) -> "TableCamera":
+        """The same camera as it is now; what either sees later changes nothing in the other, and
+        is drawn once for both.
+        """
+        other = copy(self)
+        other._rng = deepcopy(self._rng)
+        return other
+
     @property
     def truth(self) -> dict[str, np.ndarray]:
         """True pose of each object's file in the robot's world, (4, 4), metres, by name."""
@@ -409,22 +419,32 @@ class TableCamera:
 
     def frame(self, pose: np.ndarray) -> Frame:
         """A frame from the pose, (4, 4), that the robot assumes."""
+        number = self._rng.bit_generator.seed_seq.n_children_spawned
         rng = self._rng.spawn(1)[0]
+        things = tuple((one.name, one.pose.tobytes()) for one in self.table.things)
+        key = number, pose.tobytes(), things, self.sensor
+        if key not in self._drawn:
+            self._drawn[key] = self._draw(pose, rng)
+        measured, self.owner, self.true_pose = self._drawn[key]
+        count = len(self.table.things)
+        self.shown = np.bincount(self.owner[self.owner >= 0], minlength=count)
+        return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
+
+    def _draw(self, pose, rng) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Depth, the object of each pixel, and the true pose."""
         true = np.linalg.inv(self.lean) @ pose
         turn = Rotation.from_rotvec(rng.normal(0, self.sensor.turned, 3), degrees=True)
         true[:3, :3] = true[:3, :3] @ turn.as_matrix()
         true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
-        self.true_pose = true
 
         depth, owner = self._caster.cast(true[:3, 3], self._rays @ true[:3, :3].T)
         clean = np.where(np.isfinite(depth), depth, 0).reshape(self.sensor.shape)
         measured, source = self.sensor.measure(clean.astype(np.float32), rng)
         count = len(self.table.things)
         owner = np.where((owner >= 0) & (owner < count), owner, -1)
-        self.owner = np.where(source >= 0, owner[np.maximum(source, 0)], -1)
-        self.owner[measured == 0] = -1
-        self.shown = np.bincount(self.owner[self.owner >= 0], minlength=count)
-        return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
+        shown = np.where(source >= 0, owner[np.maximum(source, 0)], -1)
+        shown[measured == 0] = -1
+        return measured, shown.astype(np.int16), true
 
 
 def poses_around(azimuths, elevation, distance, centre) -> np.ndarray:

@@ -98,12 +98,23 @@ def cut(observation: Observation, share: float) -> Observation:
     )
 
 
+@pytest.fixture(scope="module")
+def things():
+    return l_block(), cup(True), cup(False)
+
+
+@pytest.fixture(scope="module")
+def library(things):
+    return library_of(*things)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
 @pytest.mark.parametrize("thing", [0, 1])
-def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(thing, share):
-    things = (l_block(), cup(True), cup(False))
+def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(
+    things, library, thing, share
+):
     views, true = turned_views(things[thing], YAW)
-    found = explained(library_of(*things), [cut(view, share) for view in views[:2]])
+    found = explained(library, [cut(view, share) for view in views[:2]])
     assert found is None or found.thing == thing or found.right < CONFIDENT
     if share < 0.2:
         assert found.thing == thing

@@ -28,7 +28,6 @@ from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncertainty_of
 from nextview.sensing import Frame, ObservedObject
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.teaching import shown_views
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
@@ -62,13 +61,11 @@ def metric_scans(shared):
 
 
 @pytest.fixture(scope="session")
-def known(shared, metric_scans, few_episodes):
-    """The models that know them, taught with as many episodes as usual."""
+def known(shared, metric_scans):
+    """The models that know them."""
 
     def make(folder):
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(shown_views, "ENOUGH_TESTS", few_episodes)
-            learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
+        learn(metric_scans, folder / "mine", unit="m", upright=True, workers=0)
 
     return shared("known", make) / "mine"
 

@@ -235,20 +235,17 @@ def undisturbed(tiny, four_frames):
     return after_all(tiny, four_frames)
 
 
-@pytest.mark.parametrize("after", [0, 1, 2])
 @pytest.mark.parametrize(
     ("what", "make", "error"),
     list(mistakes()),
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_a_session_is_as_it_was_after_each_mistake(
-    tiny, four_frames, undisturbed, what, make, error, after
+    tiny, four_frames, undisturbed, what, make, error
 ):
-    if what == "no pose" and after == 0:
-        pytest.skip("a first frame may be the only one")
-
     def mistake(session, k):
-        if k == after:
+        # a first frame without a pose may be the only one
+        if k < 3 and (k > 0 or what != "no pose"):
             before = snapshot(session)
             with pytest.raises(error):
                 session.update(make())

@@ -6,7 +6,6 @@ ROS itself is not here; ``rosbags`` is.
 import ast
 import importlib.util
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +32,7 @@ from scipy.spatial.transform import Rotation
 import nextview
 from nextview.captured.transforms import NoTransformError
 from nextview.data.samples import sample_mesh
-from nextview.errors import NextviewError, ObservationError
+from nextview.errors import ModelError, NextviewError, ObservationError
 from nextview.sensing import Frame, ObservedObject
 
 ROS = Path(__file__).parents[1] / "ros2"
@@ -204,36 +203,34 @@ def test_messages_that_cannot_be_used_are_refused(depth, wrong, match):
         conversion.frame_of(**made)
 
 
-def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
-    """Three views of a chair on a table, recorded and played back, end as the same frames
-    without ROS do.
-    """
+def views_of_a_chair():
+    """Depth in millimetres, pinhole matrix and pose of three views of a chair on a table."""
     mesh = sample_mesh("chair")
     chair = box((0.1, 0.1, 0.1))
     chair.vertices, chair.faces = 0.12 * mesh.vertices, mesh.faces
     chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
-    k, shape = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]]), (480, 640)
-    frames, messages = [], []
+    k = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
+    centres = k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     for azimuth in (20, 110, 250):
         pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
-        depth, _ = cast(
-            (TABLE, chair),
-            pose,
-            k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
-            shape,
+        depth, _ = cast((TABLE, chair), pose, centres, (480, 640))
+        yield np.rint(1000 * depth).astype(np.uint16), k, pose
+
+
+def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
+    """Views that are recorded and played back end as the same frames without ROS do."""
+    views = list(views_of_a_chair())
+    messages = [
+        (
+            image_message(depth, "16UC1"),
+            info_message(k, depth.shape),
+            transform_message(pose),
         )
-        depth = np.rint(1000 * depth).astype(np.uint16)
-        frames.append(Frame(depth, k, pose))
-        messages.append(
-            (
-                image_message(depth, "16UC1"),
-                info_message(k, shape),
-                transform_message(pose),
-            )
-        )
+        for depth, k, pose in views
+    ]
     ends = []
     for given in (
-        frames,
+        [Frame(*view) for view in views],
         [conversion.frame_of(*each) for each in recorded(tmp_path / "bag", messages)],
     ):
         session = nextview.load(threshold=1.0, max_views=3).session(
@@ -438,50 +435,94 @@ def mesh_of(told):
 # The node, with stand-ins for ROS
 
 
+class RosNode:
+    """What the node uses of ``rclpy.node.Node``."""
+
+    get_clock = get_logger = MagicMock()
+    create_publisher = create_subscription = MagicMock()
+    create_service = create_timer = MagicMock()
+
+    def __init__(self, name, parameter_overrides):
+        self.values = dict(parameter_overrides)
+
+    def declare_parameter(self, name, default, descriptor):
+        self.values.setdefault(name, default)
+
+    def get_parameter(self, name):
+        return SimpleNamespace(value=self.values[name])
+
+
 @pytest.fixture
-def node(monkeypatch):
-    """A node that was never started, with a session before its first look."""
+def node_with(monkeypatch):
+    """Make a node with some parameters."""
     for name in ROS_MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
-    monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
+    monkeypatch.setattr(sys.modules["rclpy.node"], "Node", RosNode)
     ours = [
         f"nextview_ros.{name}"
         for name in ("inputs", "outputs", "parameters", "following", "node")
     ]
     for name in ours:
         monkeypatch.delitem(sys.modules, name, raising=False)
-    made = object.__new__(importlib.import_module("nextview_ros.node").NextviewNode)
-    made.system = nextview.load("ycb", threads=1)
-    made.session = made.system.session(
-        object=ObservedObject(life_size=False),
-        distance=0.5,
-    )
-    made.scene = nextview.Scene(made.system)
-    made.taken, made.begun, made.busy = False, threading.Event(), threading.Lock()
-    made.begun.set()
-    made.goal, made.value, made.get_clock = None, {"patience": 0.1}.get, MagicMock()
-    yield made
+    made = importlib.import_module("nextview_ros.node").NextviewNode
+    yield lambda **given: made(parameter_overrides={"patience": 0.1} | given)
     for name in ours:
         sys.modules.pop(name, None)
 
 
+@pytest.fixture
+def node(node_with):
+    """A node with the usual models."""
+    return node_with()
+
+
+def trigger():
+    return SimpleNamespace(success=None, message=None)
+
+
+A_GOAL = SimpleNamespace(
+    near=[], region=[], mask=[], in_air=False, distance=0.5, threshold=0.0, max_views=0
+)
+
+
 def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
-    answer = node.failed(None, SimpleNamespace(success=None, message=None))
-    assert answer.success is False
-    assert "call look" in answer.message
-    assert not node.busy.locked()
-    node.session = None
-    answer = node.failed(None, SimpleNamespace(success=None, message=None))
-    assert answer.success is False
-    assert "no view was asked for" in answer.message
+    for begin in (lambda goal: None, node.begin_session):
+        begin(A_GOAL)
+        answer = node.failed(None, trigger())
+        assert answer.success is False
+        assert "call look" in answer.message
+        assert not node.busy.locked()
 
 
 def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
+    node.begin_session(A_GOAL)
     # before the first look there is none
     monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)
-    answer = node.answer(SimpleNamespace(success=None, message=None), lambda: "")
+    answer = node.answer(trigger(), lambda: "")
     assert answer.success is False
     assert answer.message
+
+
+def test_models_of_classes_alone_recognise_an_object_and_have_no_scene(
+    node_with, monkeypatch
+):
+    given = {"models": ["modelnet10"], "threshold": 1.0, "max_views": 3}
+    node = node_with(track_rate=0.0, **given)
+    node.tell_tf()
+    node.begin_session(A_GOAL)
+    for number, view in enumerate(views_of_a_chair()):
+        monkeypatch.setattr(node, "frames", lambda view=view: [Frame(*view)])
+        answer = node.look(None, trigger())
+        assert answer.success, answer.message
+        assert (len(node.next_views()) > 5) == (number < 2)
+    assert node.session.result.answer == "chair"
+
+    node.session = None
+    for refused in (node.look, node.failed):
+        assert refused(None, trigger()).success is False
+    assert "things of known geometry" in node.look(None, trigger()).message
+    with pytest.raises(ModelError, match="things of known geometry"):
+        node.begin_scene(SimpleNamespace(labels=[], region=[], distance=0, max_views=0))
 
 
 def test_frames_of_one_time_are_used_together_and_alone_where_one_is_refused(node):

@@ -129,7 +129,7 @@ def test_a_goal_is_cancelled_and_the_next_one_begins_anew(robot):
     found = wait(result)
     assert found.status == 5  # cancelled
     assert "ended too early: 1 view" in found.result.message
-    assert "no view was asked for" in robot.failed().message
+    assert "no pose was asked for" in robot.failed().message
 
     again, _ = robot.goal(distance=0.7)
     assert again.accepted

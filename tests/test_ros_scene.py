@@ -533,6 +533,11 @@ class BagPlayer(Node):
             self.topics[topic].publish(data)
 
 
+def is_done(node):
+    """Whether a node has looked, and its scene is done."""
+    return node.scene is not None and node.scene.done
+
+
 def test_a_bag_is_played_to_the_node(running, mine, bag):
     player = running.add(BagPlayer(bag))
     namespace = DEPTH.rpartition("/")[0]
@@ -548,7 +553,7 @@ def test_a_bag_is_played_to_the_node(running, mine, bag):
         )
     )
     end = time.monotonic() + 60
-    while not node.scene.done and time.monotonic() < end:
+    while not is_done(node) and time.monotonic() < end:
         player.play()
     player.stopped.set()
     assert len(node.scene.frames) == 2
@@ -569,7 +574,7 @@ def test_a_recording_is_played_as_a_camera(running, mine, bag):
             max_views=2,
         )
     )
-    until(lambda: node.scene.done, "the end of the looks")
+    until(lambda: is_done(node), "the end of the looks")
     assert {thing.name for thing in node.scene.objects} >= set(TAUGHT)
     seen = [frame.camera_to_world for frame in node.scene.frames]
     for pose in seen:

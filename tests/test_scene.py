@@ -33,11 +33,10 @@ def first_look(ycb, ycb_meshes):
 
 
 @pytest.fixture
-def seen_once(first_look, ycb_meshes):
+def seen_once(first_look):
     """The camera and the scene after that frame, for one test."""
-    camera = camera_over(list(ycb_meshes.values()))
-    camera.frame(view(20))
-    return camera, copy(first_look[1])
+    camera, scene, _ = first_look
+    return camera.again(), copy(scene)
 
 
 def test_all_things_are_found_named_and_placed_in_one_frame(first_look, ycb_meshes):
@@ -59,7 +58,7 @@ def test_all_things_are_found_named_and_placed_in_one_frame(first_look, ycb_mesh
         assert add_s < 0.1 * diameter
 
 
-def test_objects_keep_their_numbers_from_frame_to_frame(ycb, ycb_meshes):
+def test_objects_keep_their_numbers_and_masks_from_frame_to_frame(ycb, ycb_meshes):
     camera = camera_over(list(ycb_meshes.values()), sensor="wrist")
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
@@ -70,18 +69,9 @@ def test_objects_keep_their_numbers_from_frame_to_frame(ycb, ycb_meshes):
     for thing, shown in zip(camera.table.things, camera.shown, strict=True):
         if shown > 500:
             assert set(by_name(scene)[thing.name].pixels) == {0, 1}
-
-
-def test_a_settled_object_keeps_its_mask_in_every_frame(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["banana"]])
-    scene = nextview.Scene(ycb)
-    for degrees in (20, 60, 100, 140):
-        scene.update(camera.frame(view(degrees)))
-    for thing in scene.objects:
-        assert list(thing.pixels) == [0, 1, 2, 3]
     number = [thing.name for thing in camera.table.things].index("cracker_box")
     true = camera.owner == number
-    mask = by_name(scene)["cracker_box"].pixels[3]
+    mask = by_name(scene)["cracker_box"].pixels[1]
     assert (mask & true).sum() > 0.75 * (mask | true).sum()
 
 
@@ -159,10 +149,8 @@ def test_a_thing_that_was_taken_away_is_gone(seen_once, ycb_meshes):
     assert set(by_name(scene)) == set(ycb_meshes) - {"mug"}
 
 
-def test_a_thing_that_was_moved_stays_itself(ycb, ycb_meshes):
-    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
-    scene = nextview.Scene(ycb)
-    scene.update(camera.frame(view(20)))
+def test_a_thing_that_was_moved_stays_itself(seen_once):
+    camera, scene = seen_once
     before = by_name(scene)["mug"]
     shift = np.eye(4)
     middle = camera.table.things[1].placed.mean(0)
@@ -218,15 +206,16 @@ def test_the_cost_of_the_way_to_each_view_is_that_of_the_robot(ycb, ycb_meshes):
         asked.append(here)
         return 0.0 if there[0, 3] > 0 else np.inf
 
-    scene = nextview.Scene(ycb, travel_cost=seconds)
+    def nearest(choice, rng):
+        return -choice.views.travel
+
+    scene = nextview.Scene(ycb, travel_cost=seconds, policy=nearest)
     scene.update(frame)
     assert (scene.targets[:, 0, 3] > 0).all()
     assert all(np.array_equal(here, frame.pose) for here in asked)
 
-    nearest = nextview.Scene(ycb, policy=lambda choice, rng: -choice.views.travel)
-    nearest.update(frame)
-    nearest.travel_cost = lambda here, there: 3.0 - there[2, 3]
-    highest = nearest.targets[:, 2, 3]
+    scene.travel_cost = lambda here, there: 3.0 - there[2, 3]
+    highest = scene.targets[:, 2, 3]
     assert np.all(np.diff(highest) <= 1e-9)
     assert np.ptp(highest) > 0.1
     scene.travel_cost = lambda here, there: None

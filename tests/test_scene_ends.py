@@ -1,5 +1,7 @@
 """When a scene is empty, and when it is done."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 from factories import camera_over, meshes_of, view
@@ -7,7 +9,6 @@ from factories import camera_over, meshes_of, view
 import nextview
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
-from nextview.simulation.sensor import SENSORS
 
 K = [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]
 FROM_ABOVE = np.diag([1.0, -1, -1, 1])
@@ -56,12 +57,18 @@ def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
     assert scene.target is not None
 
 
-def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
+@pytest.fixture(scope="module")
+def first_look(ycb):
+    """A camera over a box and a plate, and a scene that has taken one low frame of it."""
     camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=1)
-    camera.sensor = SENSORS["stereo"]
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
     assert scene.open == ()
     scene.update(camera.frame(view(20, elevation=25)))
+    return camera, scene
+
+
+def test_what_is_open_is_told_with_its_place_until_it_is_settled(first_look):
+    camera, scene = first_look[0], copy(first_look[1])
     hidden = [one for one in scene.open if "hidden" in one.why]
     assert len(hidden) == 1
     box = next(thing for thing in camera.table.things if thing.name == "cracker_box")
@@ -77,12 +84,8 @@ def test_what_is_open_is_told_with_its_place_until_it_is_settled(ycb):
     assert scene.done
 
 
-def test_what_no_view_that_is_left_shows_does_not_keep_a_scene_open(ycb):
-    camera = camera_over(list(meshes_of(["cracker_box", "plate"]).values()), seed=1)
-    camera.sensor = SENSORS["stereo"]
-    scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
-    here = view(20, elevation=25)
-    scene.update(camera.frame(here))
+def test_what_no_view_that_is_left_shows_does_not_keep_a_scene_open(first_look):
+    scene = copy(first_look[1])
     assert any("hidden" in one.why and one.in_sight for one in scene.open)
     assert not scene.done
 

@@ -102,7 +102,7 @@ def an_error(rng, millimetres=4.0, degrees=0.6):
     return error
 
 
-def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
+def moments_of(rng, error, count, cameras=(LEFT, RIGHT)):
     """Frames of several cameras; the stated poses of all but the first err."""
     names = ("left", "right", "top")
     found = []
@@ -117,11 +117,18 @@ def moments_of(rng, error, count=6, cameras=(LEFT, RIGHT)):
     return found
 
 
-def test_an_error_of_a_camera_is_told():
-    """4 mm and .6 degrees, within 1 mm and .15 degrees."""
-    rng = np.random.default_rng(0)
+@pytest.fixture(scope="module")
+def erring():
+    """Frames of two cameras at four moments, and the error of the right one."""
+    rng = np.random.default_rng(11)
     error = an_error(rng)
-    (offset,) = camera_offsets(moments_of(rng, error))
+    return moments_of(rng, error, 4), error
+
+
+def test_an_error_of_a_camera_is_told(erring):
+    """4 mm and .6 degrees, within 1 mm and .15 degrees."""
+    moments, error = erring
+    (offset,) = camera_offsets(moments)
     assert offset.noticed
     assert (offset.camera, offset.reference) == ("right", "left")
     assert offset.millimetres == pytest.approx(4, abs=1)
@@ -229,11 +236,10 @@ def write_rig(folder, moments):
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory):
+def rig(tmp_path_factory, erring):
     """A folder of two cameras, of which the right one errs, and its frames."""
     folder = tmp_path_factory.mktemp("rigs") / "rig"
-    rng = np.random.default_rng(11)
-    moments = moments_of(rng, an_error(rng), 4)
+    moments, _ = erring
     write_rig(folder, moments)
     return folder, moments
 
@@ -396,9 +402,9 @@ def pair():
     )
 
 
-def test_a_scene_takes_frames_of_both_cameras_together(pair):
+def test_a_scene_takes_frames_of_both_cameras_together(ycb, pair):
     left, right, truth = pair
-    scene = nextview.Scene("ycb")
+    scene = nextview.Scene(ycb)
     looks = scene.update([left, right])
     assert [look.taken for look in looks] == [True, True]
     assert scene.frames == (left, right)
@@ -410,9 +416,9 @@ def test_a_scene_takes_frames_of_both_cameras_together(pair):
     assert {thing.name for thing in scene.objects} == set(truth)
 
 
-def test_frames_enter_together_or_not_at_all(pair):
+def test_frames_enter_together_or_not_at_all(ycb, pair):
     left, right, _ = pair
-    scene = nextview.Scene("ycb")
+    scene = nextview.Scene(ycb)
     lost = Frame(right.depth, SENSOR.intrinsics, camera="right")
     with pytest.raises(ObservationError):
         scene.update([left, lost])
@@ -434,7 +440,7 @@ def test_frames_enter_together_or_not_at_all(pair):
     )
 
 
-def test_a_session_takes_frames_of_both_cameras_until_it_ends(pair):
+def test_a_session_takes_frames_of_both_cameras_until_it_ends(ycb, pair):
     left, right, truth = pair
     name, pose = next(iter(truth.items()))
     thing = ObservedObject(point=pose[:3, 3])

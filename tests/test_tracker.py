@@ -24,26 +24,19 @@ def meshes():
     return list(meshes_of(NAMES).values())
 
 
-def first_frame(meshes):
-    """A camera over the things, and its first frame."""
-    camera = camera_over(meshes, seed=8)
-    return camera, camera.frame(view(155))
-
-
 @pytest.fixture(scope="module")
 def first_look(ycb, meshes):
-    """A scene after this frame."""
-    camera, frame = first_frame(meshes)
+    """A camera over the things, and a scene after its first frame."""
+    camera = camera_over(meshes, seed=8)
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
-    scene.update(frame)
-    return scene
+    scene.update(camera.frame(view(155)))
+    return camera, scene
 
 
 @pytest.fixture
-def watched(first_look, meshes):
+def watched(first_look):
     """The camera and the scene for one test."""
-    camera, _ = first_frame(meshes)
-    scene = copy(first_look)
+    camera, scene = first_look[0].again(), copy(first_look[1])
     scene.segmentation = lambda frame: camera.owner + 1
     assert {thing.name for thing in scene.objects if thing.confident} == set(NAMES)
     return camera, scene

@@ -6,7 +6,8 @@
 'chair'
 """
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from nextview.errors import (
     DatasetError,
@@ -23,17 +24,23 @@ from nextview.errors import (
     SessionError,
     UsageError,
 )
-from nextview.geometry.mesh import Mesh, load_mesh
-from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.viewsphere import Directions, ViewSphere
-from nextview.policies.base import EpisodeState, Evidence, Policy
-from nextview.policies.registry import make_policy
-from nextview.recognition.belief import Stopping
-from nextview.recognition.inference import Models
-from nextview.session.result import Recognition
-from nextview.session.session import Session
-from nextview.session.system import System, load, recognise
-from nextview.session.view import View
+
+if TYPE_CHECKING:
+    from nextview.geometry.mesh import Mesh, load_mesh
+    from nextview.geometry.observation import Camera, Observation
+    from nextview.geometry.viewsphere import Directions, ViewSphere
+    from nextview.policies.base import EpisodeState, Evidence, Policy
+    from nextview.policies.registry import make_policy
+    from nextview.recognition.belief import Stopping
+    from nextview.recognition.inference import Models
+    from nextview.scene.scene import Scene
+    from nextview.scene.tracker import Tracker
+    from nextview.session.result import Recognition
+    from nextview.session.session import Session
+    from nextview.session.system import System, load, recognise
+    from nextview.session.view import View
+    from nextview.simulation.simulated import SimulatedCamera
+    from nextview.teaching.learn import learn
 
 __version__ = "0.4.0"
 
@@ -75,23 +82,42 @@ __all__ = [
     "recognise",
 ]
 
+# imported when they are used: NumPy, SciPy and the networks make the start of a command slow
+_HOMES = {
+    "Camera": "geometry.observation",
+    "Directions": "geometry.viewsphere",
+    "EpisodeState": "policies.base",
+    "Evidence": "policies.base",
+    "Mesh": "geometry.mesh",
+    "Models": "recognition.inference",
+    "Observation": "geometry.observation",
+    "Policy": "policies.base",
+    "Recognition": "session.result",
+    "Scene": "scene.scene",
+    "Session": "session.session",
+    "SimulatedCamera": "simulation.simulated",
+    "Stopping": "recognition.belief",
+    "System": "session.system",
+    "Tracker": "scene.tracker",
+    "View": "session.view",
+    "ViewSphere": "geometry.viewsphere",
+    "learn": "teaching.learn",
+    "load": "session.system",
+    "load_mesh": "geometry.mesh",
+    "make_policy": "policies.registry",
+    "recognise": "session.system",
+}
+
 
 def __getattr__(name: str) -> Any:
-    """``Scene``, ``Tracker``, the simulated camera and ``learn``, imported when they are used."""
-    if name == "Scene":
-        from nextview.scene.scene import Scene
+    """Import a public name when it is used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'nextview' has no attribute {name!r}")
+    found = getattr(import_module(f"nextview.{_HOMES[name]}"), name)
+    globals()[name] = found
+    return found
 
-        return Scene
-    if name == "Tracker":
-        from nextview.scene.tracker import Tracker
 
-        return Tracker
-    if name == "SimulatedCamera":
-        from nextview.simulation.simulated import SimulatedCamera
-
-        return SimulatedCamera
-    if name == "learn":
-        from nextview.teaching.learn import learn
-
-        return learn
-    raise AttributeError(f"module 'nextview' has no attribute {name!r}")
+def __dir__() -> list[str]:
+    """List the public names, those not imported yet too."""
+    return sorted({*globals(), *_HOMES})

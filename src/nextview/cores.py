@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import Any
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from nextview.checks import whole
 
@@ -35,9 +35,6 @@ def limit_blas() -> None:
     """
     asked = asked_cores()
     if asked is not None:
-        # only here: it would slow down the start of every command
-        from threadpoolctl import threadpool_limits
-
         threadpool_limits(asked, "blas")
 
 

@@ -86,7 +86,8 @@ class NextviewNode(Node):
             None  # of the scene; None without a goal
         )
         self.segmentation = LabelledFrames()
-        self.scene = nextview.Scene(self.system)
+        # begun by the first look or goal: models of classes alone have none
+        self.scene: nextview.Scene | None = None
         self.session: nextview.Session | None = None
         # of the object, or the labels of all things, in the next image of the first camera
         self.mask = self.labels = None
@@ -106,7 +107,6 @@ class NextviewNode(Node):
             for namespace in self.value("cameras")
         ]
         self.follower = Follower(self.cameras, partial(self.frame_of, patience=0.0))
-        self.follower.begin(self.scene)
         self.followed_at = -math.inf  # seconds, when an image was followed last
         self.publish()
         self.serve(group)
@@ -292,7 +292,8 @@ class NextviewNode(Node):
 
     def look_by_itself(self) -> None:
         """Look without being asked, until the scene or the session is done."""
-        if (self.session or self.scene).done or not self.begun.is_set():
+        begun = self.session or self.scene
+        if (begun is not None and begun.done) or not self.begun.is_set():
             return
         said = self.look(None, Trigger.Response())
         log = self.get_logger()
@@ -322,11 +323,15 @@ class NextviewNode(Node):
         """Take in a frame of each camera; what was seen, in words.
 
         Raises:
+            ModelError: a scene is looked at, and the models have no geometry.
             ObservationError: no frame can be used.
             SessionError: the goal has ended.
         """
         if self.session is not None and self.session.done:
             raise SessionError("the goal has ended")
+        if self.session is None and self.scene is None:
+            self.scene = self.new_scene(None)
+            self.follower.begin(self.scene)
         found = self.frames()
         since = self.follower.things
         frames = [one for one in found if isinstance(one, Frame)]
@@ -381,10 +386,10 @@ class NextviewNode(Node):
         Raises:
             SessionError: no pose was asked for yet, or the goal has ended.
         """
-        if self.session is None:
+        if self.session is None and self.scene is not None:
             self.scene.failed()
             return "another pose is asked for"
-        if not self.session.views:
+        if self.session is None or not self.session.views:
             raise SessionError(
                 "no pose was asked for yet: bring the camera anywhere before the object, and call"
                 " look"
@@ -439,7 +444,7 @@ class NextviewNode(Node):
         now = seconds(self.get_clock().now().to_msg())
         if 0 <= now - self.followed_at < self.value("patience"):
             return
-        if self.value("track_rate"):
+        if self.value("track_rate") or self.scene is None:
             things = self.follower.found
         else:
             things = [
@@ -639,7 +644,7 @@ class NextviewNode(Node):
                     raise SessionError("a goal is active: learn before or after it")
                 response.message = self.add_to_memory(request)
                 self.system = self.load()
-                frames = self.scene.frames
+                frames = () if self.scene is None else self.scene.frames
                 self.scene = self.new_scene(self.asked)
                 for frame in frames:
                     self.scene.update(frame)

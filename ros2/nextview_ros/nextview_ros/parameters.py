@@ -62,7 +62,7 @@ PARAMETERS = {
     ),
     "models": NodeParameter(
         ["ycb"],
-        "known things: bundled memories or folders; the service learn adds to the last one",
+        "known things: bundled models or folders; the service learn adds to the last one",
         fixed=True,
     ),
     "policy": NodeParameter(

@@ -8,6 +8,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
 
 from nextview.errors import MeshError, option
 from nextview.types import Float
@@ -68,9 +72,6 @@ class Parts:
         Returns:
             The parts of the mesh.
         """
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
         places = _places(vertices)[faces]
         count = int(places.max()) + 1 if len(places) else 0
         ends = np.concatenate([places[:, :2], places[:, 1:]]).astype(np.int32)
@@ -120,8 +121,6 @@ def _size(points: Float) -> float:
     """Half the largest distance between two points, however they are turned; 0 for none."""
     if len(points) < 2:
         return 0.0
-    from scipy.spatial.distance import cdist  # importing it takes time
-
     corners = hull_corners(points)
     farthest = max(
         float(cdist(corners[at : at + FARTHEST_AT_ONCE], corners[at:]).max())
@@ -132,8 +131,6 @@ def _size(points: Float) -> float:
 
 def hull_corners(points: Float) -> Float:
     """Those of some points, (N, D), between which all others lie, (C, D)."""
-    from scipy.spatial import ConvexHull, QhullError
-
     some = np.unique(points, axis=0)
     try:
         return some[ConvexHull(some).vertices]
@@ -159,8 +156,6 @@ def thickness(points: Float) -> float:
     Args:
         points: (N, 2) or (N, 3).
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
         sides = ConvexHull(points).equations[:, :-1]
     except (QhullError, ValueError):

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError
@@ -181,10 +182,6 @@ def enough_shows(mask: Mask) -> bool:
     n = np.count_nonzero(mask)
     if not least <= n < SPECKS * least:
         return bool(n >= least)
-    from scipy.ndimage import (
-        label,
-    )  # only where little is seen: importing it takes time
-
     parts, _ = label(mask, np.ones((3, 3)))
     return bool(np.bincount(parts.ravel())[1:].max() >= least)
 

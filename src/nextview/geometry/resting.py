@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 from scipy.spatial import QhullError, cKDTree
+from scipy.spatial.transform import Rotation
 
 from nextview.checks import check_extra
 from nextview.geometry.mesh import Mesh
@@ -177,8 +178,6 @@ class _SelfComparison:
         Returns:
             True if the poses look alike.
         """
-        from scipy.spatial.transform import Rotation
-
         about_vertical = Rotation.from_euler("z", COMPARED_TURNS).as_matrix()
         turns = _upright(second_up).T @ about_vertical @ _upright(first_up)
         moved = self.few @ turns.transpose(0, 2, 1)
@@ -225,8 +224,6 @@ def _best_rotation(points: Float, targets: Float) -> Float:
 
 def _upright(up: Float) -> Float:
     """The shortest rotation that takes a direction to +z, (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
     axis = np.cross(up, (0, 0, 1))
     length = np.linalg.norm(axis)
     if length < 1e-9:

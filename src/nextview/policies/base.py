@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -10,10 +10,8 @@ from nextview.errors import PolicyError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
+from nextview.things.expected_views import Outlook
 from nextview.types import Float, Floats, Index, Mask
-
-if TYPE_CHECKING:
-    from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
 # relative to the best value; among views within this range, travel decides
 NEAR_TIE = 0.05
@@ -73,7 +71,7 @@ class EpisodeState:
     observations: Sequence[Sequence[Observation]] | None = None
     visibility: Float | None = None
     joint: Float | None = None
-    outlook: "Sequence[Outlook | None] | None" = None
+    outlook: Sequence[Outlook | None] | None = None
 
     @property
     def free(self) -> Mask:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
+from scipy.ndimage import binary_erosion, minimum_filter
 
 from nextview.checks import check_array
 from nextview.errors import ModelError
@@ -263,9 +264,6 @@ def hidden_share(scene: SceneView | None) -> float:
     """
     if scene is None:
         return 0.0
-    # only for frames: importing it takes time
-    from scipy.ndimage import binary_erosion, minimum_filter
-
     outline = scene.target & ~binary_erosion(scene.target)
     others = np.where(scene.target | (scene.depth == 0), np.inf, scene.depth)
     hidden = outline & (

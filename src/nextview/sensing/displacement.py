@@ -12,17 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from nextview.sensing.facets import Facets
+from nextview.sensing.sighting import Sighting
 from nextview.types import Float, Index, Mask
-
-if TYPE_CHECKING:
-    from nextview.sensing.sighting import Sighting
-
 
 CAMERA_PLACE = 0.003  # metres, standard deviation of the camera position
 CAMERA_AIM = 0.006  # radians, standard deviation of the viewing direction

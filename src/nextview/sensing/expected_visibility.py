@@ -3,18 +3,16 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from nextview.checks import number, whole
 from nextview.geometry.depth import FARTHEST_SURFACE
 from nextview.geometry.observation import SceneView
 from nextview.types import Float, Float32, Floats, Index, Mask
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 # states of a voxel; the maximum over all frames counts
 UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
@@ -346,12 +344,8 @@ class SightLines:
         return np.unique(self.blocks)
 
     @cached_property
-    def passed(self) -> "csr_array":
+    def passed(self) -> csr_array:
         """Unit steps of the line from each part to each camera in each voxel, (P * V, n^3)."""
-        from scipy.sparse import (
-            csr_array,
-        )  # slow to import, and rarely needed
-
         grid = self.grid
         m = self.grid.n // BLOCK
         block = np.stack(np.unravel_index(self.parts, (m, m, m)), 1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from nextview.sensing.agreement import (
@@ -276,8 +277,6 @@ def find_fitted(posed: PosedViews, kind: FittedMistake) -> Mistake | None:
     as_read = compare(posed.views, posed.poses)
     if 1 - as_read.share < LEAST_CONTRADICTED:
         return None
-    from scipy.optimize import minimize  # importing it takes time
-
     few = posed.some(_spread(len(posed.views)))
 
     def contradicted(size: Float) -> float:

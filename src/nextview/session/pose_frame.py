@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from nextview.sensing.observed_object import ObservedObject
 from nextview.types import Float
-
-if TYPE_CHECKING:
-    from nextview.sensing.observed_object import ObservedObject
 
 PoseFrameName = Literal["world", "camera", "object"]
 IN_WORDS: dict[PoseFrameName, str] = {

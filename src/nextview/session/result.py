@@ -14,6 +14,7 @@ from nextview.checks import number_of
 from nextview.geometry.ray_caster import Triangles
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
+from nextview.recognition.inference import Models
 from nextview.recognition.novelty import Quantiles, values_of
 from nextview.recognition.poses import (
     PoseCandidate,
@@ -22,6 +23,7 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.recognition.protocol import JointBelief, classes_of_other_size
+from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View, is_doubtful
@@ -29,9 +31,6 @@ from nextview.types import Float
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from nextview.recognition.inference import Models
-    from nextview.sensing.observed_object import ObservedObject
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Protocol, get_args, overload, runtime_checkable
+from typing import Any, Protocol, get_args, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,7 @@ from nextview.recognition.protocol import (
     LooksAhead,
     check_unknown,
 )
+from nextview.segmentation.instances import Segmenter
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
 from nextview.sensing.observed_object import ObservedObject
@@ -64,9 +65,6 @@ from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
-
-if TYPE_CHECKING:
-    from nextview.segmentation.instances import Segmenter
 
 FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres

@@ -43,6 +43,8 @@ from nextview.recognition.protocol import (
     check_unknown,
     tells_unknown,
 )
+from nextview.segmentation.instances import Segmenter
+from nextview.sensing.observed_object import ObservedObject
 from nextview.session.limits import Limits
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
@@ -52,8 +54,6 @@ from nextview.things.several import SeveralRecognisers
 
 if TYPE_CHECKING:
     from nextview.captured.camera import CapturedCamera
-    from nextview.segmentation.instances import Segmenter
-    from nextview.sensing.observed_object import ObservedObject
     from nextview.simulation.sensor import Sensor
 
 MOST_THREADS = 1024
@@ -104,13 +104,13 @@ class System:
         self,
         start: int | None = None,
         seed: int = 0,
-        object: "ObservedObject | None" = None,
+        object: ObservedObject | None = None,
         distance: float | None = None,
         min_height: float | None = None,
         max_height: float | None = None,
         clearance: float | None = None,
         goal: Goal = "thing",
-        segmentation: "Segmenter | None" = None,
+        segmentation: Segmenter | None = None,
     ) -> Session:
         """Create a session for one object. For a robot, a distance is enough.
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial.distance import pdist
 
 from nextview.checks import extras
 from nextview.errors import MeshError, option
@@ -71,8 +72,6 @@ class Surface:
     @cached_property
     def hull(self) -> Float32:
         """Vertices of the convex hull, (N, 3) float32, metres; all vertices of a flat surface."""
-        from scipy.spatial import ConvexHull, QhullError
-
         try:
             return self.vertices[ConvexHull(self.vertices).vertices]
         except QhullError:
@@ -97,9 +96,6 @@ class Surface:
     @cached_property
     def diameter(self) -> float:
         """Largest distance between two points of the surface, metres."""
-        from scipy.spatial import ConvexHull, QhullError
-        from scipy.spatial.distance import pdist
-
         try:
             corners = self.vertices[ConvexHull(self.vertices).vertices]
         except QhullError:  # a flat surface has no hull

@@ -1,22 +1,19 @@
 """Record a session for the Rerun viewer."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import numpy as np
 
 from nextview.checks import extras
 from nextview.errors import UsageError
+from nextview.session.session import Session
 from nextview.session.style import ACCENT, INK, heat, rgb
+from nextview.session.view import View
 
 with extras():
     import rerun as rr
     import rerun.blueprint as rrb
-
-if TYPE_CHECKING:
-    from nextview.session.session import Session
-    from nextview.session.view import View
 
 TIMELINE = "step"
 
