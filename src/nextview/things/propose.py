@@ -109,19 +109,21 @@ def best(
         of_one: number of those of one thing, at most.
     """
     turns = some.rotations.reshape(-1, 9)
-    angle = np.sqrt(np.maximum(3 - turns @ turns.T, 0))
-    apart = np.linalg.norm(some.centres[:, None] - some.centres, axis=2)
-    same = angle + apart / library.radii[some.things] < SAME_POSE
-    same &= some.things[:, None] == some.things
     left = np.ones(len(some), bool)
     counts = np.zeros(len(library), np.int64)
     kept: list[int] = []
-    for row in np.argsort(-values, kind="stable"):
+    for row in np.argsort(-values, kind="stable").tolist():
         thing = some.things[row]
-        if left[row] and counts[thing] < of_one and len(kept) < most:
-            kept.append(int(row))
-            counts[thing] += 1
-            left &= ~same[row]
+        if not left[row] or counts[thing] == of_one:
+            continue
+        kept.append(row)
+        if len(kept) == most:
+            break
+        counts[thing] += 1
+        angle = np.sqrt(np.maximum(3 - turns @ turns[row], 0))
+        apart = np.linalg.norm(some.centres - some.centres[row], axis=1)
+        same = angle + apart / library.radii[thing] < SAME_POSE
+        left &= ~same | (some.things != thing)
     return some[np.array(kept, np.int64)]
 
 

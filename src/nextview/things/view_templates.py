@@ -473,14 +473,16 @@ class SeenOutline:
         known = (depth > 0) & ~unclear & ~hiding
         found = cls.of_depth(depth, shown, known | shown, camera, pose)
 
-        around = ndimage.binary_dilation(shown, iterations=2) & ~shown
-        rows, columns = np.nonzero(around & hiding)
+        part = within(shown, 2)
+        own = shown[part]
+        around = ndimage.binary_dilation(own, iterations=2) & ~own
+        rows, columns = np.nonzero(around & hiding[part])
         # beyond the border of the image it may go on, too
         ends = np.zeros(shown.shape, bool)
         ends[[0, -1]] = ends[:, [0, -1]] = True
-        ends_at = np.nonzero(shown & ends)
-        rows = np.concatenate([rows, ends_at[0]])
-        columns = np.concatenate([columns, ends_at[1]])
+        ends_at = np.nonzero(own & ends[part])
+        rows = np.concatenate([rows, ends_at[0]]) + part[0].start
+        columns = np.concatenate([columns, ends_at[1]]) + part[1].start
         if len(rows) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
 
@@ -512,7 +514,10 @@ class SeenOutline:
         Returns:
             The outline.
         """
-        rows, columns = np.nonzero(shown)
+        part = within(shown)
+        rows, columns = np.nonzero(shown[part])
+        rows += part[0].start
+        columns += part[1].start
         centre = np.array([columns.mean(), rows.mean()])
         # a pixel is a square
         spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))
