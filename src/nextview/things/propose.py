@@ -141,7 +141,7 @@ def matched(
     """
     seen = Projected.of(library, view, some, count)
     sigma = np.hypot(0.003, view.noise.at(seen.depth) * seen.depth**2)
-    off = seen.depth - seen.points[..., 2]
+    off = seen.depth - seen.points[:, 2]
     measured = seen.inside & (seen.depth > 0)
     own = mask[seen.row, seen.column]
     match = measured & (np.abs(off) < 3 * sigma)
