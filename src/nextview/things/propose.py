@@ -21,6 +21,7 @@ from nextview.types import Float, Mask
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+LEAST_MATCH = 0.1  # of the best hypothesis of a segment, below which it shows none of the things
 MATCHED = 80  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 6  # the same of one thing
 SCORED = 24  # hypotheses that are rendered, at most
@@ -82,6 +83,8 @@ def _of_segment(
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
+    if match.max() < LEAST_MATCH:
+        return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
     found = register(library, [view], found, (0.1, 0.06, 0.04), 96, outline)
     match = matched(library, view, found, mask, 96)
@@ -93,7 +96,10 @@ def _of_segment(
             for one in score(library, view, found, COARSER)
         ]
     )
-    return best(library, found, totals, KEPT, KEPT_OF_ONE)
+    some = totals > 0
+    if not some.any():
+        return None
+    return best(library, found[some], totals[some], KEPT, KEPT_OF_ONE)
 
 
 def best(

@@ -49,6 +49,7 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
 SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
+TOWARDS_OCCLUDER = 0.7  # least cosine of the angle between a shift and the way to the occluder
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
@@ -138,14 +139,17 @@ class ViewTemplates:
         fill: share of the picture that shows the thing, (T, D) float32.
     """
 
-    def __init__(self, caster: SurfaceCaster, threads: int = 1) -> None:
-        """Render all surfaces from all directions.
+    def __init__(
+        self, caster: SurfaceCaster, threads: int = 1, directions: Float | None = None
+    ) -> None:
+        """Render all surfaces.
 
         Args:
             caster: surfaces of the things.
             threads: number of threads; 0 for one on each core.
+            directions: from a thing to its cameras, unit vectors, (D, 3); None for all around.
         """
-        self.directions = spread_directions(TEMPLATE_DIRECTIONS)
+        self.directions = ALL_AROUND if directions is None else directions
         looks = looking_from(self.directions)
         with ThreadPoolExecutor(threads or cores()) as pool:
             render = partial(_rendered, caster, looks=looks)
@@ -308,6 +312,9 @@ def spread_directions(count: int) -> Float:
     azimuth = np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - z**2)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], 1)
+
+
+ALL_AROUND = spread_directions(TEMPLATE_DIRECTIONS)
 
 
 def looking_from(directions: Float) -> Float:
@@ -490,7 +497,9 @@ class SeenOutline:
         step, reach = SHIFTS
         lines = np.arange(-reach, reach + step / 2, step)
         grid = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
-        grid = grid[(np.linalg.norm(grid, axis=1) <= reach) & (grid @ towards > 0)]
+        far = np.linalg.norm(grid, axis=1)
+        ahead = grid @ towards > TOWARDS_OCCLUDER * far * np.linalg.norm(towards)
+        grid = grid[(far <= reach) & ahead]
         return replace(found, shifts=np.concatenate([np.zeros((1, 2)), grid]))
 
     @classmethod
