@@ -21,7 +21,9 @@ from nextview.types import Float, Mask
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
-LEAST_MATCH = 0.1  # of the best hypothesis of a segment, below which it shows none of the things
+LEAST_MATCH = (
+    0.1  # of the best hypothesis of a segment, below which it shows none of the things
+)
 MATCHED = 80  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 6  # the same of one thing
 SCORED = 24  # hypotheses that are rendered, at most
@@ -96,8 +98,8 @@ def _of_segment(
             for one in score(library, view, found, COARSER)
         ]
     )
-    some = totals > 0
-    if not some.any():
+    some = np.flatnonzero(totals > 0)
+    if not len(some):
         return None
     return best(library, found[some], totals[some], KEPT, KEPT_OF_ONE)
 

@@ -49,7 +49,9 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
 SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
-TOWARDS_OCCLUDER = 0.7  # least cosine of the angle between a shift and the way to the occluder
+TOWARDS_OCCLUDER = (
+    0.7  # least cosine of the angle between a shift and the way to the occluder
+)
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
@@ -76,9 +78,7 @@ class Pictures:
     @cached_property
     def of_squares(self) -> Float32:
         """Factors of a picture's squared depth, outline and depth: the sum of the squares."""
-        return np.concatenate(
-            [self.outline, np.square(self.depth), -2 * self.depth], 1
-        )
+        return np.concatenate([self.outline, np.square(self.depth), -2 * self.depth], 1)
 
     def __getitem__(self, rows: Index | slice) -> "Pictures":
         """Return some of them."""

@@ -28,7 +28,9 @@ STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
 EXPLAINED = (
     0.6  # share of a segment that is explained, from which on it is not searched
 )
-EXPLAINED_OF_UNION = 0.3  # the same of several segments together: one of them is explained
+EXPLAINED_OF_UNION = (
+    0.3  # the same of several segments together: one of them is explained
+)
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
