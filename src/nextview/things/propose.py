@@ -98,10 +98,10 @@ def _of_segment(
             for one in score(library, view, found, COARSER)
         ]
     )
-    some = np.flatnonzero(totals > 0)
-    if not len(some):
+    gains = np.flatnonzero(totals > 0)
+    if not len(gains):
         return None
-    return best(library, found[some], totals[some], KEPT, KEPT_OF_ONE)
+    return best(library, found[gains], totals[gains], KEPT, KEPT_OF_ONE)
 
 
 def best(
