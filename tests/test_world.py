@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from drawn_views import camera, drawn, library, standing
+import trimesh
+from drawn_views import camera, drawn, library, standing, surface
 
 from nextview.scene.changes import changes
 from nextview.things.naming import CONFIDENT, named
@@ -51,6 +52,26 @@ def test_things_are_named_and_posed_after_one_view(table, things):
         middle = world.hypotheses.centres[one.row]
         centre = things.centres[world.hypotheses.things[one.row]]
         assert np.linalg.norm(middle - true[:3, :3] @ centre - true[:3, 3]) < 0.005
+
+
+def test_only_a_view_that_shows_something_new_is_searched(things):
+    box = things.caster.surfaces[0]
+    tin = surface("tin", trimesh.creation.cylinder(0.045, 0.1))
+    placed = [(box, standing(box, -0.08, 0)), (tin, standing(tin, 0.08, 0))]
+    world, _ = after(World(things), drawn(placed, camera(20)))
+    assert set(names(world).values()) == {"box", None}
+    again, told = after(world, drawn(placed, camera(20)))
+    assert set(told.stand) == set(names(world))
+    assert names(again) == names(world)
+    assert again.next_key == world.next_key
+    aside, _ = after(world, drawn(placed, camera(50)))
+    assert aside.next_key > world.next_key
+
+    # where the tin was, something else is
+    placed[1] = box, standing(box, 0.08, 0, 40)
+    other, told = after(world, drawn(placed, camera(20)))
+    assert len(told.stand) == 1
+    assert sorted(names(other).values()) == ["box", "box"]
 
 
 def test_a_second_view_keeps_the_numbers(table):

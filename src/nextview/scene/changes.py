@@ -21,6 +21,7 @@ from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
 from nextview.things.score import OUTLIER, STEEPEST, Score, score, total
 from nextview.things.surface import Surface
+from nextview.things.view_templates import ALL_AROUND
 from nextview.things.world import (
     CLEAR_SHARE,
     EXPLAINED,
@@ -32,6 +33,7 @@ from nextview.things.world import (
 )
 from nextview.types import Float, Index, Mask
 
+STILL = 0.9  # share of the pixels of a thing that look as they did if it has not moved
 ALONE = (
     0.5,
     0.3,
@@ -91,6 +93,9 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         view: the view.
         camera_stands: whether the camera has not moved since a frame that fits.
     """
+    still = _still(world, view)
+    if still is not None:
+        return still
     if not camera_stands:
         view = corrected(world, view)
     found = _named(world, view)
@@ -112,6 +117,23 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         stand,
         not camera_stands and changed > 1 and changed > len(stand),
     )
+
+
+def _still(world: World, view: View) -> Changes | None:
+    """Return that all stands where it was: the same place was seen before, and looks as it did."""
+    for before, owner in zip(world.views[::-1], world.owners[::-1], strict=True):
+        alike = view.again(before).ravel()
+        if not alike.any():
+            continue
+        counts = np.bincount(owner, minlength=world.next_number)
+        same = np.bincount(owner, alike, minlength=world.next_number)
+        numbers = [one.number for one in world.things if counts[one.number]]
+        if any(same[number] < STILL * counts[number] for number in numbers):
+            return None
+        held = np.zeros(len(owner), np.int32)
+        view = view.seen_from(before.camera)
+        return Changes(world, view, held, stand=tuple(numbers))
+    return None
 
 
 def _clear(one: Thing) -> bool:
@@ -143,7 +165,10 @@ def _unnamed(world: World, view: View, others: Sequence[_Compared]) -> list[_Com
             surfaces.append(surface)
     if not things:
         return []
-    library = Library(surfaces)
+    cameras = np.array([one.camera[:3, 3] for one in (*world.views, view)])
+    away = np.concatenate([cameras - surface.centre for surface in surfaces])
+    nearest = np.unique((away @ ALL_AROUND.T).argmax(1))
+    library = Library(surfaces, directions=ALL_AROUND[nearest])
     turns = np.tile(np.eye(3), (len(things), 1, 1))
     there = Hypotheses.of(np.arange(len(things)), turns, library.centres)
     return _compared(world, view, things, library, there, others)

@@ -149,9 +149,9 @@ def carrier_of(
     Returns:
         The level; None if the visible bottom touches none, or the surface below is not visible.
     """
-    if not levels or not (mask & (frame.depth > 0)).any():
-        return None
     points = points_of(mask, frame)
+    if not levels or not len(points):
+        return None
     camera = frame.camera_to_world[:3, 3]
     away = float(np.median(np.linalg.norm(points - camera, axis=1)))
 
@@ -310,9 +310,10 @@ def _on_others(
 
 def points_of(mask: Mask, frame: Frame) -> Float:
     """Sample points of a mask, (H, W) bool, as (N, 3), world, metres."""
-    rows, columns = np.nonzero(mask & (frame.depth > 0))
+    part = within(mask)
+    rows, columns = np.nonzero(mask[part] & (frame.depth[part] > 0))
     few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
-    return frame.positions(rows[few], columns[few])
+    return frame.positions(rows[few] + part[0].start, columns[few] + part[1].start)
 
 
 def _load(level: SurfaceLevel, frame: Frame, masks: Sequence[Mask]) -> int:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from nextview.segmentation.instances import Instances
 from nextview.sensing.facets import Noise, noise_of
-from nextview.sensing.frame import Frame, within
+from nextview.sensing.frame import Frame, one_stand, within
 from nextview.types import Float, Float32, Index, Mask
 
 GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
@@ -25,6 +25,7 @@ LEVEL = 2.0  # standard deviations of the depth, within which a pixel lies on a 
 ON_PLANE = 0.015  # metres from a plane, within which a pixel may show it
 LEAST_PLANE = 0.1  # share of an image that shows a plane on which noise is measured
 MEAN_OF_HALF = 0.3246  # mean of the smaller half of the sizes of normal errors
+ALIKE = 3.0  # standard deviations between two measurements of one place
 LARGER = 1.2  # times the largest thing, above which an instance is none
 OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
@@ -156,6 +157,16 @@ class View:
         object.__setattr__(left, "_grids", {})
         return left
 
+    def again(self, earlier: View) -> Mask:
+        """Return the pixels of the grid that an earlier view from this place shows, too, (h, w)."""
+        now = self.grid()
+        if self.frame.shape != earlier.frame.shape or not one_stand(
+            earlier.frame, self.frame
+        ):
+            return np.zeros(now.depth.shape, bool)
+        then = earlier.grid().depth
+        return (then > 0) & (np.abs(then - now.depth) < ALIKE * now.sigma)
+
     @property
     def depth(self) -> Float32:
         """Depth of the frame, (H, W) float32, metres; 0 where nothing was measured."""
@@ -254,7 +265,7 @@ class View:
 
     def fragments(self) -> Iterator[Segment]:
         """Return the pieces of instances: a thing that was joined to its neighbour is one."""
-        for mask in _parts(self.pieces, 4 * self.fewest):
+        for mask in _parts(self.pieces, 6 * self.fewest):
             owner = int(np.bincount(self.labels[mask]).argmax())
             whole = self.labels == owner if owner else mask
             if (

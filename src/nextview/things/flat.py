@@ -69,7 +69,7 @@ def _of_segment(
             sigma.ravel()[cells],
             rng,
         )
-        away = slopes @ normal
+        away = slopes[0, :, 0] * normal[0] + (slopes[:, :1, 1] * normal[1] + normal[2])
         z = 1 / np.maximum(away, 1e-3)
         margin = np.maximum(FARTHEST * sigma, LEAST_MARGIN)
         off = depth - z
@@ -79,10 +79,10 @@ def _of_segment(
         parts = ndimage.label(near)[0]
         region = parts == np.bincount(parts[near & left]).argmax()
         # of neighbouring pixels, as for a thing: a steep surface is less certain
-        steep = np.abs(np.stack([np.gradient(z, axis=0), np.gradient(z, axis=1)])).max(
-            0
-        )
-        variance = (sigma**2 + SCAN_ERROR**2 + (steep / 2) ** 2)[region]
+        part = within(region, 1)
+        down, aside = np.gradient(z[part])
+        steep = np.maximum(np.abs(down), np.abs(aside))[region[part]]
+        variance = sigma[region] ** 2 + SCAN_ERROR**2 + (steep / 2) ** 2
         gain = np.log(np.exp(-(off[region] ** 2) / 2 / variance) + np.exp(OUTLIER))
         count = float(np.count_nonzero(region))
         cells = np.flatnonzero(region)

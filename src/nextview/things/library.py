@@ -45,6 +45,7 @@ class Library:
         symmetries: Mapping[str, Any] = MappingProxyType({}),
         near: Mapping[str, Float] = MappingProxyType({}),
         threads: int = 1,
+        directions: Float | None = None,
     ) -> None:
         """Render the templates.
 
@@ -53,13 +54,19 @@ class Library:
             symmetries: of each thing, by its name.
             near: rotations of each thing, by its name.
             threads: number of threads; 0 for one on each core.
+            directions: from a thing to the cameras that see it, unit vectors, (D, 3); None for all
+                around.
         """
         self.names = tuple(surface.name for surface in surfaces)
         self.symmetries = symmetries
         self.near = near
         self.caster = SurfaceCaster(surfaces)
         self.camera = CAMERA_ERROR
-        self.templates: ViewTemplates = templates_of(self.caster, threads)
+        self.templates: ViewTemplates = (
+            templates_of(self.caster, threads)
+            if directions is None
+            else ViewTemplates(self.caster, threads, directions)
+        )
         self.centres = self.caster.centres.astype(np.float64)
         self.radii = self.caster.radii.astype(np.float64)
 

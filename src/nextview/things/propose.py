@@ -21,6 +21,9 @@ from nextview.types import Float, Mask
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+LEAST_MATCH = (
+    0.1  # of the best hypothesis of a segment, below which it shows none of the things
+)
 MATCHED = 80  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 6  # the same of one thing
 SCORED = 24  # hypotheses that are rendered, at most
@@ -82,6 +85,8 @@ def _of_segment(
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
+    if match.max() < LEAST_MATCH:
+        return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
     found = register(library, [view], found, (0.1, 0.06, 0.04), 96, outline)
     match = matched(library, view, found, mask, 96)
@@ -93,7 +98,10 @@ def _of_segment(
             for one in score(library, view, found, COARSER)
         ]
     )
-    return best(library, found, totals, KEPT, KEPT_OF_ONE)
+    gains = np.flatnonzero(totals > 0)
+    if not len(gains):
+        return None
+    return best(library, found[gains], totals[gains], KEPT, KEPT_OF_ONE)
 
 
 def best(
@@ -109,19 +117,21 @@ def best(
         of_one: number of those of one thing, at most.
     """
     turns = some.rotations.reshape(-1, 9)
-    angle = np.sqrt(np.maximum(3 - turns @ turns.T, 0))
-    apart = np.linalg.norm(some.centres[:, None] - some.centres, axis=2)
-    same = angle + apart / library.radii[some.things] < SAME_POSE
-    same &= some.things[:, None] == some.things
     left = np.ones(len(some), bool)
     counts = np.zeros(len(library), np.int64)
     kept: list[int] = []
-    for row in np.argsort(-values, kind="stable"):
+    for row in np.argsort(-values, kind="stable").tolist():
         thing = some.things[row]
-        if left[row] and counts[thing] < of_one and len(kept) < most:
-            kept.append(int(row))
-            counts[thing] += 1
-            left &= ~same[row]
+        if not left[row] or counts[thing] == of_one:
+            continue
+        kept.append(row)
+        if len(kept) == most:
+            break
+        counts[thing] += 1
+        angle = np.sqrt(np.maximum(3 - turns @ turns[row], 0))
+        apart = np.linalg.norm(some.centres - some.centres[row], axis=1)
+        same = angle + apart / library.radii[thing] < SAME_POSE
+        left &= ~same | (some.things != thing)
     return some[np.array(kept, np.int64)]
 
 
@@ -139,7 +149,7 @@ def matched(
     """
     seen = Projected.of(library, view, some, count)
     sigma = np.hypot(0.003, view.noise.at(seen.depth) * seen.depth**2)
-    off = seen.depth - seen.points[..., 2]
+    off = seen.depth - seen.points[:, 2]
     measured = seen.inside & (seen.depth > 0)
     own = mask[seen.row, seen.column]
     match = measured & (np.abs(off) < 3 * sigma)

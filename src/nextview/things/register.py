@@ -34,14 +34,14 @@ class Outline:
     """Where the nearest pixel of a segment is.
 
     Attributes:
-        row: of the nearest pixel of each block of pixels, (h, w) int32.
-        column: of the nearest pixel, (h, w) int32.
-        distance: to it, (h, w) float32, pixels; 0 inside of the segment.
+        row: of the nearest pixel of each block of pixels, (h, w) float32.
+        column: of the nearest pixel, (h, w) float32.
+        beyond: whether the block is outside of the segment, (h, w) bool.
     """
 
-    row: NDArray[np.int32]
-    column: NDArray[np.int32]
-    distance: Float32
+    row: Float32
+    column: Float32
+    beyond: Mask
 
     @classmethod
     def of(cls, mask: Mask) -> Outline:
@@ -50,22 +50,20 @@ class Outline:
         blocks = np.pad(mask, ((0, -height % OUTLINE_STEP), (0, -width % OUTLINE_STEP)))
         rows, columns = (side // OUTLINE_STEP for side in blocks.shape)
         small = blocks.reshape(rows, OUTLINE_STEP, columns, OUTLINE_STEP).max((1, 3))
-        distance, (row, column) = ndimage.distance_transform_edt(
-            ~small, return_indices=True
+        nearest = ndimage.distance_transform_edt(
+            ~small, return_distances=False, return_indices=True
         )
-        middle = OUTLINE_STEP // 2
-        return cls(
-            row * OUTLINE_STEP + middle,
-            column * OUTLINE_STEP + middle,
-            (distance * OUTLINE_STEP).astype(np.float32),
-        )
+        row, column = nearest.astype(np.float32) * OUTLINE_STEP + OUTLINE_STEP // 2
+        return cls(row, column, ~small)
 
     def at(
         self, row: NDArray[np.int32], column: NDArray[np.int32]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], Float32]:
-        """Return the way down and aside to the segment, and its length, pixels, of pixels."""
-        at = row // OUTLINE_STEP, column // OUTLINE_STEP
-        return self.row[at] - row, self.column[at] - column, self.distance[at]
+    ) -> tuple[Float32, Float32, Mask]:
+        """Return the way down and aside to the segment, pixels, and whether there is one."""
+        at = row // OUTLINE_STEP * self.row.shape[1] + column // OUTLINE_STEP
+        down = self.row.take(at) - row.astype(np.float32)
+        aside = self.column.take(at) - column.astype(np.float32)
+        return down, aside, self.beyond.take(at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +71,8 @@ class Projected:
     """Points of hypotheses in an image.
 
     Attributes:
-        points: in the axes of the camera, (M, N, 3) float32, metres.
-        normals: in the axes of the camera, (M, N, 3) float32.
+        points: in the axes of the camera, (M, 3, N) float32, metres.
+        normals: in the axes of the camera, (M, 3, N) float32.
         middle: centre of each hypothesis in the axes of the camera, (M, 3) float32, metres.
         inside: points within the image, (M, N) bool.
         row: of each point, (M, N) int32; 0 outside of the image.
@@ -114,22 +112,22 @@ class Projected:
         sizes = some.sizes.astype(np.float32)[:, None]
         own, across = own * sizes, across / sizes
         across /= np.linalg.norm(across, axis=2, keepdims=True)
-        turn = (axes.T @ some.rotations).astype(np.float32).swapaxes(1, 2)
+        turn = (axes.T @ some.rotations).astype(np.float32)
         middle = ((some.centres - place) @ axes).astype(np.float32)
-        points = own @ turn + middle[:, None]
+        points = turn @ own.swapaxes(1, 2) + middle[..., None]
 
         camera = view.frame.pinhole
-        ahead = np.maximum(points[..., 2], 0.02)
-        column = np.floor(camera.fx * points[..., 0] / ahead + camera.cx)
-        row = np.floor(camera.fy * points[..., 1] / ahead + camera.cy)
+        ahead = np.maximum(points[:, 2], 0.02)
+        column = np.floor(camera.fx * points[:, 0] / ahead + camera.cx)
+        row = np.floor(camera.fy * points[:, 1] / ahead + camera.cy)
         height, width = view.frame.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        inside &= points[..., 2] > 0.02
+        inside &= points[:, 2] > 0.02
         column = np.where(inside, column, 0).astype(np.int32)
         row = np.where(inside, row, 0).astype(np.int32)
         return cls(
             points,
-            across @ turn,
+            turn @ across.swapaxes(1, 2),
             middle,
             inside,
             row,
@@ -139,10 +137,10 @@ class Projected:
         )
 
     def measured(self, view: View) -> Float32:
-        """Return the measured point at each point, (M, N, 3) float32, axes of the camera."""
+        """Return the measured point at each point, (M, 3, N) float32, axes of the camera."""
         x, y = view.frame.rays
-        slopes = np.stack([x[self.column], y[self.row], np.ones_like(self.depth)], -1)
-        return slopes * self.depth[..., None]
+        z = self.depth
+        return np.stack([x[self.column] * z, y[self.row] * z, z], 1)
 
 
 def register(
@@ -265,29 +263,30 @@ def normal_equations(
     radius = library.radii[some.things]
     near = np.maximum(reach * radius, LEAST_REACH)[:, None].astype(np.float32)
     gap = seen.measured(view) - seen.points
-    off = np.einsum("mni,mni->mn", seen.normals, gap)
-    used = seen.inside & (seen.depth > 0) & (np.abs(gap[..., 2]) < 4 * near)
+    off = np.einsum("min,min->mn", seen.normals, gap)
+    used = seen.inside & (seen.depth > 0) & (np.abs(gap[:, 2]) < 4 * near)
     used &= ~view.surface[seen.row, seen.column]
     weight = np.where(used, 1 / (1 + (off / near) ** 2), 0)
 
-    arm = seen.points - seen.middle[:, None]
-    slope = np.concatenate([cross(arm, seen.normals), seen.normals], -1)
-    weighted = slope * weight[..., None]
-    left = weighted.swapaxes(1, 2) @ slope
-    right = np.einsum("mni,mn->mi", weighted, off)
+    arm = seen.points - seen.middle[..., None]
+    slope = np.concatenate([cross(arm, seen.normals), seen.normals], 1)
+    weighted = slope * weight[:, None]
+    left = weighted @ slope.swapaxes(1, 2)
+    right = (weighted @ off[..., None])[..., 0]
 
     if outline is not None:
-        down, aside, away = outline.at(seen.row, seen.column)
-        through = seen.inside & (seen.depth > seen.points[..., 2] + near) & (away > 0)
-        far = np.hypot(down, aside).astype(np.float32) + np.float32(1e-6)
-        towards = np.stack([aside / far, down / far, np.zeros_like(far)], -1)
+        down, aside, beyond = outline.at(seen.row, seen.column)
+        ahead = seen.points[:, 2]
+        through = seen.inside & (seen.depth > ahead + near) & beyond
+        far = np.hypot(down, aside) + np.float32(1e-6)
+        towards = np.stack([aside / far, down / far, np.zeros_like(far)], 1)
         focal = view.frame.pinhole.fx
-        off = np.minimum(far * seen.points[..., 2] / focal, 2 * near)
-        weight = np.where(through, OUTLINE_WEIGHT, 0)
-        slope = np.concatenate([cross(arm, towards), towards], -1)
-        weighted = slope * weight[..., None]
-        left = left + weighted.swapaxes(1, 2) @ slope
-        right = right + np.einsum("mni,mn->mi", weighted, off)
+        off = np.minimum(far * ahead / focal, 2 * near)
+        weight = np.where(through, np.float32(OUTLINE_WEIGHT), np.float32(0))
+        slope = np.concatenate([cross(arm, towards), towards], 1)
+        weighted = slope * weight[:, None]
+        left = left + weighted @ slope.swapaxes(1, 2)
+        right = right + (weighted @ off[..., None])[..., 0]
 
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = view.camera[:3, :3]
@@ -295,10 +294,10 @@ def normal_equations(
 
 
 def cross(one: Float32, other: Float32) -> Float32:
-    """Return the cross products of vectors, (..., 3)."""
-    x, y, z = one[..., 0], one[..., 1], one[..., 2]
-    u, v, w = other[..., 0], other[..., 1], other[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+    """Return the cross products of vectors, (M, 3, N)."""
+    x, y, z = one[:, 0], one[:, 1], one[:, 2]
+    u, v, w = other[:, 0], other[:, 1], other[:, 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
 
 
 def skew(vectors: Floats) -> Float:

@@ -288,13 +288,16 @@ class SurfaceCaster:
         rays = np.ascontiguousarray(directions.reshape(-1, 3))
         starts = np.ascontiguousarray(np.repeat(origins, directions.shape[1], 0))
         hits = self._scene(thing).run(starts, rays, output=1)
-        met = hits["primID"] >= 0
-        depth = np.where(met, hits["tfar"], MISSED).astype(np.float32)
-        across = np.where(met[:, None], hits["Ng"], 0)
+        met = np.flatnonzero(hits["primID"] >= 0)
+        depth = np.full(len(rays), MISSED)
+        depth[met] = hits["tfar"][met]
+        across = hits["Ng"][met]
         length = np.sqrt(np.einsum("ni,ni->n", across, across)) + 1e-30
-        across *= (-np.sign(np.einsum("ni,ni->n", across, rays)) / length)[:, None]
+        away = np.einsum("ni,ni->n", across, rays[met])
+        normals = np.zeros(rays.shape, np.float32)
+        normals[met] = across * (-np.sign(away) / length)[:, None]
         shape = directions.shape
-        return depth.reshape(shape[:2]), across.reshape(shape).astype(np.float32)
+        return depth.reshape(shape[:2]), normals.reshape(shape)
 
     def cast(
         self,

@@ -12,7 +12,7 @@ intersection. All scores are a few matrix products.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from hashlib import sha256
 from weakref import WeakValueDictionary
 
@@ -49,6 +49,9 @@ SIZE_STEP = 0.06  # step between the tested log-sizes of a view
 SIZES = (-0.36, 0.36)
 SIZES_HIDDEN = (-0.24, 1.2)  # the same for an occluded outline
 SHIFTS = (0.5, 1.5)  # step and range of the shifts of an occluded outline, sizes
+TOWARDS_OCCLUDER = (
+    0.7  # least cosine of the angle between a shift and the way to the occluder
+)
 HIDDEN_SHARE = (
     0.05  # share of occluders around an outline, from which it counts as occluded
 )
@@ -66,6 +69,20 @@ class Pictures:
 
     outline: Float32
     depth: Float32
+
+    @cached_property
+    def of_means(self) -> Float32:
+        """Factors of a picture's depth and outline: the sum of the differences of depth."""
+        return np.concatenate([self.outline, -self.depth], 1)
+
+    @cached_property
+    def of_squares(self) -> Float32:
+        """Factors of a picture's squared depth, outline and depth: the sum of the squares."""
+        return np.concatenate([self.outline, np.square(self.depth), -2 * self.depth], 1)
+
+    def __getitem__(self, rows: Index | slice) -> "Pictures":
+        """Return some of them."""
+        return Pictures(self.outline[rows], self.depth[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,14 +139,17 @@ class ViewTemplates:
         fill: share of the picture that shows the thing, (T, D) float32.
     """
 
-    def __init__(self, caster: SurfaceCaster, threads: int = 1) -> None:
-        """Render all surfaces from all directions.
+    def __init__(
+        self, caster: SurfaceCaster, threads: int = 1, directions: Float | None = None
+    ) -> None:
+        """Render all surfaces.
 
         Args:
             caster: surfaces of the things.
             threads: number of threads; 0 for one on each core.
+            directions: from a thing to its cameras, unit vectors, (D, 3); None for all around.
         """
-        self.directions = spread_directions(TEMPLATE_DIRECTIONS)
+        self.directions = ALL_AROUND if directions is None else directions
         looks = looking_from(self.directions)
         with ThreadPoolExecutor(threads or cores()) as pool:
             render = partial(_rendered, caster, looks=looks)
@@ -197,10 +217,8 @@ class ViewTemplates:
                 continue
             size = view.size * np.exp(step * SIZE_STEP)
             pixels = size * view.focal / view.middle
-            templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
-
             seen = view.pictures(size, view.shifts * pixels, grid)
-            costs, behind = mismatch(seen, templates)
+            costs, behind = mismatch(seen, self.pictures[rows])
             which = costs.argmin(0)
             cost = costs[which, np.arange(len(rows))]
             shift, turn = np.divmod(which, TURNS)
@@ -294,6 +312,9 @@ def spread_directions(count: int) -> Float:
     azimuth = np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - z**2)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], 1)
+
+
+ALL_AROUND = spread_directions(TEMPLATE_DIRECTIONS)
 
 
 def looking_from(directions: Float) -> Float:
@@ -459,14 +480,16 @@ class SeenOutline:
         known = (depth > 0) & ~unclear & ~hiding
         found = cls.of_depth(depth, shown, known | shown, camera, pose)
 
-        around = ndimage.binary_dilation(shown, iterations=2) & ~shown
-        rows, columns = np.nonzero(around & hiding)
+        part = within(shown, 2)
+        own = shown[part]
+        around = ndimage.binary_dilation(own, iterations=2) & ~own
+        rows, columns = np.nonzero(around & hiding[part])
         # beyond the border of the image it may go on, too
         ends = np.zeros(shown.shape, bool)
         ends[[0, -1]] = ends[:, [0, -1]] = True
-        ends_at = np.nonzero(shown & ends)
-        rows = np.concatenate([rows, ends_at[0]])
-        columns = np.concatenate([columns, ends_at[1]])
+        ends_at = np.nonzero(own & ends[part])
+        rows = np.concatenate([rows, ends_at[0]]) + part[0].start
+        columns = np.concatenate([columns, ends_at[1]]) + part[1].start
         if len(rows) < HIDDEN_SHARE * np.count_nonzero(around):
             return found
 
@@ -474,7 +497,9 @@ class SeenOutline:
         step, reach = SHIFTS
         lines = np.arange(-reach, reach + step / 2, step)
         grid = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
-        grid = grid[(np.linalg.norm(grid, axis=1) <= reach) & (grid @ towards > 0)]
+        far = np.linalg.norm(grid, axis=1)
+        ahead = grid @ towards > TOWARDS_OCCLUDER * far * np.linalg.norm(towards)
+        grid = grid[(far <= reach) & ahead]
         return replace(found, shifts=np.concatenate([np.zeros((1, 2)), grid]))
 
     @classmethod
@@ -498,7 +523,10 @@ class SeenOutline:
         Returns:
             The outline.
         """
-        rows, columns = np.nonzero(shown)
+        part = within(shown)
+        rows, columns = np.nonzero(shown[part])
+        rows += part[0].start
+        columns += part[1].start
         centre = np.array([columns.mean(), rows.mean()])
         # a pixel is a square
         spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))
@@ -506,6 +534,22 @@ class SeenOutline:
         size = spread * middle / np.sqrt(camera.fx * camera.fy)
         shifts = np.zeros((1, 2))
         return cls(depth, shown, known, camera, pose, centre, middle, size, shifts)
+
+    @cached_property
+    def area(self) -> int:
+        """Number of pixels of the outline."""
+        return int(np.count_nonzero(self.shown))
+
+    @cached_property
+    def _behind(self) -> Float32:
+        """Depth of each pixel behind the median, metres; not finite where it is not of the thing.
+
+        It is infinite where something else was measured, and NaN where nothing is known, as in the
+        last element, which stands for all that is beyond the image, (H * W + 1,).
+        """
+        others = np.where(self.known, np.float32(np.inf), np.float32(np.nan))
+        own = self.depth - np.float32(self.middle)
+        return np.append(np.where(self.shown, own, others), np.float32(np.nan))
 
     @property
     def hidden(self) -> bool:
@@ -536,23 +580,21 @@ class SeenOutline:
         """
         pixels = size * self.focal / self.middle
         centres = (self.centre + shifts).astype(np.float32)
-        turned = grid * np.float32(pixels) + centres[:, None, None]
-        turned = turned.reshape(-1, *grid.shape[1:])
-        column, row = np.rint(turned).astype(np.int32).transpose(2, 0, 1)
+        turned = grid.transpose(2, 0, 1) * np.float32(pixels)
+        turned = turned[:, None] + centres.T[..., None, None]
+        column, row = np.rint(turned.reshape(2, -1, grid.shape[1])).astype(np.int32)
         height, width = self.shown.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        row = np.where(inside, row, 0)
-        column = np.where(inside, column, 0)
-
-        outline = inside & self.shown[row, column]
-        known = inside & self.known[row, column]
-        behind = np.where(outline, (self.depth[row, column] - self.middle) / size, 0)
+        behind = self._behind.take(np.where(inside, row * width + column, -1))
+        outline = np.isfinite(behind)
+        known = ~np.isnan(behind)
+        behind = np.where(outline, behind / np.float32(size), 0)
         cell = 2 * TEMPLATE_REACH * pixels / TEMPLATE_SIDE
         return SeenPictures(
             outline.astype(np.float32),
             known.astype(np.float32),
-            np.clip(behind, -FARTHEST_BEHIND, FARTHEST_BEHIND).astype(np.float32),
-            np.count_nonzero(self.shown) / cell**2,
+            np.clip(behind, -FARTHEST_BEHIND, FARTHEST_BEHIND),
+            self.area / cell**2,
         )
 
 
@@ -618,18 +660,24 @@ def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
         template, sizes, (A, N) float32.
     """
     some = len(seen.outline)
-    of_view = np.concatenate(
-        [seen.outline, seen.known, seen.depth, np.square(seen.depth)]
+    both, told = np.split(
+        np.concatenate([seen.outline, seen.known]) @ known.outline.T, [some]
     )
-    both, told, depths, squares = np.split(of_view @ known.outline.T, 4)
-    across = np.concatenate([seen.outline, seen.depth]) @ known.depth.T
-    one = max(seen.area, 1.0) + told - both
-    overlap = both / np.maximum(one, both + 1e-6)
+    told -= both
+    told += max(seen.area, 1.0)
+    overlap = np.divide(both, np.maximum(told, both + np.float32(1e-6)), out=told)
 
-    # Variance of the depth difference in the intersection.
-    count: Float32 = np.maximum(both, np.float32(1))
-    mean = (depths - across[:some]) / count
-    squares = squares + seen.outline @ np.square(known.depth).T - 2 * across[some:]
-    squares = squares / count - np.square(mean)
-    costs = OUTLINE_WEIGHT * (1 - overlap) + DEPTH_WEIGHT * np.sqrt(squares.clip(0))
-    return costs, mean
+    # mean and variance of the depth difference in the intersection
+    count: Float32 = np.maximum(both, np.float32(1), out=both)
+    mean = np.concatenate([seen.depth, seen.outline], 1) @ known.of_means.T
+    mean /= count
+    squares = np.concatenate([np.square(seen.depth), seen.outline, seen.depth], 1)
+    spread = squares @ known.of_squares.T
+    spread /= count
+    spread -= np.square(mean)
+    spread = np.sqrt(np.maximum(spread, 0, out=spread), out=spread)
+    spread *= DEPTH_WEIGHT
+    overlap *= OUTLINE_WEIGHT
+    spread -= overlap
+    spread += OUTLINE_WEIGHT
+    return spread, mean

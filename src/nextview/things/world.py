@@ -28,6 +28,9 @@ STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
 EXPLAINED = (
     0.6  # share of a segment that is explained, from which on it is not searched
 )
+EXPLAINED_OF_UNION = (
+    0.3  # the same of several segments together: one of them is explained
+)
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
@@ -151,18 +154,23 @@ class World:
     def searched(self, among: Mask) -> World:
         """Return the world with names for what the last view shows unexplained.
 
+        What an earlier view from the same place has shown alike was searched before.
+
         Args:
             among: things that may be there, (T,) bool.
         """
         world = self
         view = self.views[-1]
-        for segments, share in (
-            (view.instances, SURE_SHARE),
-            (view.unions, CLEAR_SHARE),
-            (view.fragments, CLEAR_SHARE),
+        before = np.zeros(view.grid().depth.shape, bool)
+        for one in self.views[:-1]:
+            before |= view.again(one)
+        for segments, share, most in (
+            (view.instances, SURE_SHARE, EXPLAINED),
+            (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION),
+            (view.fragments, CLEAR_SHARE, EXPLAINED),
         ):
-            shown = world.explained(share)
-            left = [one for one in segments() if shown[one.mask].mean() < EXPLAINED]
+            shown = world.explained(share) | view.enlarged(before)
+            left = [one for one in segments() if shown[one.mask].mean() < most]
             new = propose(self.library, view, left, among)
             if new is not None:
                 world = world.with_hypotheses(new).chosen()
