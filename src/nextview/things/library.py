@@ -185,7 +185,7 @@ class Hypotheses:
     @property
     def taught(self) -> Mask:
         """Those in the size that was taught, (M,) bool."""
-        return np.isclose(self.sizes, 1).all(1)
+        return np.asarray(np.isclose(self.sizes, 1).all(1))
 
     def in_other_sizes(self) -> Hypotheses:
         """Return each as a whole and along each axis larger and smaller, (8 M)."""

@@ -188,7 +188,7 @@ class World:
             totals = np.array([total(row) for row in zip(*columns, strict=True)])
             best_size = totals.reshape(len(some), -1).argmax(1)
             some = new[best_size + len(new) // len(some) * np.arange(len(some))]
-        return self.with_hypotheses(some[~some.taught]).chosen()
+        return self.with_hypotheses(some[np.flatnonzero(~some.taught)]).chosen()
 
     def _doubtful(self) -> Index:
         """Return the rows of things that are new, or that explain less than is sure."""
