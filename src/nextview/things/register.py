@@ -266,6 +266,10 @@ def normal_equations(
     off = np.einsum("min,min->mn", seen.normals, gap)
     used = seen.inside & (seen.depth > 0) & (np.abs(gap[:, 2]) < 4 * near)
     used &= ~view.surface[seen.row, seen.column]
+    if outline is not None:
+        down, aside, beyond = outline.at(seen.row, seen.column)
+        # what is measured in front of a point beside the segment hides it
+        used &= ~(beyond & (gap[:, 2] < -near))
     weight = np.where(used, 1 / (1 + (off / near) ** 2), 0)
 
     arm = seen.points - seen.middle[..., None]
@@ -275,7 +279,6 @@ def normal_equations(
     right = (weighted @ off[..., None])[..., 0]
 
     if outline is not None:
-        down, aside, beyond = outline.at(seen.row, seen.column)
         ahead = seen.points[:, 2]
         through = seen.inside & (seen.depth > ahead + near) & beyond
         far = np.hypot(down, aside) + np.float32(1e-6)
