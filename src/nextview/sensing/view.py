@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from nextview.segmentation.instances import Instances
-from nextview.sensing.facets import Noise, noise_of
+from nextview.sensing.facets import LEAST_NOISE, Noise, noise_of
 from nextview.sensing.frame import Frame, one_stand, within
 from nextview.types import Float, Float32, Index, Mask
 
@@ -326,7 +326,8 @@ def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:
     """
     depth = frame.depth
     near = (depth > 0) & (np.abs(height) < ON_PLANE)
-    off = np.abs(height[near]) / (noise.at(depth[near]) * depth[near] ** 2)
+    sigma = np.maximum(noise.at(depth[near]), LEAST_NOISE) * depth[near] ** 2
+    off = np.abs(height[near]) / sigma
     if len(off) < LEAST_PLANE * depth.size:
         return noise
     half = np.partition(off, len(off) // 2)[: len(off) // 2]

@@ -111,7 +111,7 @@ class Projected:
         own, across, fill = library.seen_from(some.things, towards, count)
         sizes = some.sizes.astype(np.float32)[:, None]
         own, across = own * sizes, across / sizes
-        across /= np.linalg.norm(across, axis=2, keepdims=True)
+        across /= np.linalg.norm(across, axis=2, keepdims=True) + np.float32(1e-12)
         turn = (axes.T @ some.rotations).astype(np.float32)
         middle = ((some.centres - place) @ axes).astype(np.float32)
         points = turn @ own.swapaxes(1, 2) + middle[..., None]
