@@ -21,7 +21,7 @@ from nextview.types import Float, Float32, Index, Mask
 GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
 # standard deviation of a measured depth, relative, at least: real depth is bent
 LEAST_ERROR = 0.0025
-LEVEL = 2.0  # standard deviations of the depth, within which a pixel lies on a plane
+LEVEL = 2.5  # standard deviations of the depth, within which a pixel lies on a plane
 ON_PLANE = 0.015  # metres from a plane, within which a pixel may show it
 LEAST_PLANE = 0.1  # share of an image that shows a plane on which noise is measured
 MEAN_OF_HALF = 0.3246  # mean of the smaller half of the sizes of normal errors
