@@ -21,7 +21,7 @@ TOTAL_ERROR = 0.01  # of what a hypothesis explains: error by its pose and scan
 CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.05, 12.3, 0.5, 32.8
 LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
-LIKELY = 0.4  # belief below which an object is unknown
+LIKELY = 0.5  # belief below which an object is unknown
 SYMMETRIC = 1e9  # information about a turn that changes nothing, 1/radians^2
 LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 

@@ -209,7 +209,7 @@ class World:
         new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
         columns = [score(self.library, one, new, COARSER) for one in self.views]
         totals = np.array([total(row) for row in zip(*columns, strict=True)])
-        some = best(self.library, new, totals, len(rows), 1)
+        some = best(self.library, new, totals, 3 * len(rows), 3)
         return self.with_hypotheses(some).chosen()
 
     def with_hypotheses(self, new: Hypotheses) -> World:
