@@ -25,7 +25,7 @@ NOT_MEASURED = (
     -0.5
 )  # nats, of a pixel without a measurement on a surface that faces the camera
 LEFT_OVER = -1.5  # nats, of a pixel of the same piece that is not explained
-OTHER_SIZE = 0.2  # nats, of a pixel of what has another size than it was taught in
+OTHER_SIZE = 0.1  # nats, of a pixel of what has another size than it was taught in
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
 # error of the surface of a thing: of its scan, metres, and of its pose, radii
 SCAN_ERROR, POSE_ERROR = 0.0007, 0.005
