@@ -258,7 +258,7 @@ def test_things_without_geometry_are_recognised_by_features(mixed_memory, knobs)
     assert system.recognise(knob, seed=2).pose is not None
 
 
-@pytest.mark.parametrize("turned", [(2.2, -0.5, 1.1), (0.4, 1.9, -0.6), (1.0, 0.3, 2.0)])
+@pytest.mark.parametrize("turned", [(2.2, -0.5, 1.1), (1.0, 0.3, 2.0)])
 def test_a_thing_in_a_gripper_is_named_and_placed(system, turned):
     true = placed("mug", 0.0)
     turn = Rotation.from_rotvec(turned).as_matrix()

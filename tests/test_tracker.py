@@ -26,10 +26,11 @@ def meshes():
 
 @pytest.fixture(scope="module")
 def first_look(ycb, meshes):
-    """A camera over the things, and a scene after its first frame."""
+    """A camera over the things, and a scene after two frames, in which all names are confident."""
     camera = camera_over(meshes, seed=8)
     scene = nextview.Scene(ycb, segmentation=lambda frame: camera.owner + 1)
-    scene.update(camera.frame(view(155)))
+    for degrees in (65, 155):
+        scene.update(camera.frame(view(degrees)))
     return camera, scene
 
 

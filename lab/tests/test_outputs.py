@@ -248,7 +248,7 @@ def test_a_run_writes_nothing_in_the_home_folder(job, made, tmp_path):
 
 
 def test_who_wants_telemetry_keeps_it():
-    code = "import os, nextview; print(os.environ['ORT_DISABLE_TELEMETRY'])"
+    code = "import os, nextview.runtime; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     environment = {
         name: value
         for name, value in os.environ.items()
