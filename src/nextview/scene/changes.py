@@ -222,8 +222,8 @@ def _compared(
 
     # where they may be now: near where they were, or where the view shows something else
     taken = np.zeros(view.grid().depth.size, bool)
-    for before_it in others:
-        taken[before_it.cells] = True
+    for settled in others:
+        taken[settled.cells] = True
     for _, found in stand:
         if found is not None and found.total > NEW_OBJECT:
             taken[_explained(found)] = True

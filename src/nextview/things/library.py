@@ -188,7 +188,7 @@ class Hypotheses:
         return np.asarray(np.isclose(self.sizes, 1).all(1))
 
     def in_other_sizes(self) -> Hypotheses:
-        """Return each as a whole and along each axis larger and smaller, (8 M)."""
+        """Return eight of each: larger and smaller, as a whole and along each axis."""
         along = np.concatenate([np.eye(3), np.ones((1, 3))])
         factors = OTHER_SIZE ** np.concatenate([along, -along])
         rows = np.repeat(np.arange(len(self)), len(factors))

@@ -25,7 +25,7 @@ NOT_MEASURED = (
     -0.5
 )  # nats, of a pixel without a measurement on a surface that faces the camera
 LEFT_OVER = -1.5  # nats, of a pixel of the same piece that is not explained
-OTHER_SIZE = 0.1  # nats, of a pixel of what has another size than it was taught in
+SIZE_COST = 0.1  # nats, of a pixel of what has another size than it was taught in
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
 # error of the surface of a thing: of its scan, metres, and of its pose, radii
 SCAN_ERROR, POSE_ERROR = 0.0007, 0.005
@@ -186,7 +186,7 @@ def _scored(
     front = got & (off < -margin)
     behind = got & (off > margin)
     on = got & ~front & ~behind
-    most = np.where(some.taught, PIXEL_GAIN, PIXEL_GAIN - OTHER_SIZE)
+    most = np.where(some.taught, PIXEL_GAIN, PIXEL_GAIN - SIZE_COST)
     most = most.astype(np.float32)[:, None, None]
     gain = np.where(on, (likely + most) * weight, np.float32(0))
     carries = grid.surface.ravel()[at]

@@ -38,7 +38,7 @@ RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
 MOST_THROUGH = 0.6  # share of a thing that is seen through where it did not stand yet
-LEAST_OWN = 0.5  # share of a stranger that nothing else explains, at least
+LEAST_OWN = 0.5  # share of what a thing explains that nothing else does, at least
 MOVED = 60.0  # nats that another pose has to explain better, for a thing to have moved
 MOVED_SHARE = (
     0.3  # the same of what the thing explains: errors of scan and pose are alike
@@ -184,10 +184,8 @@ class World:
         for _ in range(RESIZED):
             new = some.in_other_sizes()
             new = register(self.library, self.views, new, (0.06, 0.04, 0.03), 96)
-            columns = [score(self.library, one, new, COARSER) for one in self.views]
-            totals = np.array([total(row) for row in zip(*columns, strict=True)])
-            best_size = totals.reshape(len(some), -1).argmax(1)
-            some = new[best_size + len(new) // len(some) * np.arange(len(some))]
+            totals = self._coarse_totals(new).reshape(len(some), -1)
+            some = new[totals.argmax(1) + totals.shape[1] * np.arange(len(some))]
         return self.with_hypotheses(some[np.flatnonzero(~some.taught)]).chosen()
 
     def _doubtful(self) -> Index:
@@ -207,10 +205,13 @@ class World:
         if not len(new):
             return self
         new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
-        columns = [score(self.library, one, new, COARSER) for one in self.views]
-        totals = np.array([total(row) for row in zip(*columns, strict=True)])
-        some = best(self.library, new, totals, 3 * len(rows), 3)
+        some = best(self.library, new, self._coarse_totals(new), 3 * len(rows), 3)
         return self.with_hypotheses(some).chosen()
+
+    def _coarse_totals(self, some: Hypotheses) -> Float:
+        """Score hypotheses on a coarser grid of all views, nats, (M,)."""
+        columns = [score(self.library, one, some, COARSER) for one in self.views]
+        return np.array([total(row) for row in zip(*columns, strict=True)])
 
     def with_hypotheses(self, new: Hypotheses) -> World:
         """Return the world with more hypotheses, registered to all views."""
@@ -493,7 +494,7 @@ def _explaining(
     Args:
         rows: scores in each view.
         sizes: pixels of the grid of each view.
-        own: share of what a negative row explains that the others do not, at least.
+        own: share of what a row explains that the others do not, at least.
 
     Returns:
         The rows, and what each adds, nats.
