@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.view_templates import ViewTemplates, templates_of
+from nextview.things.view_templates import ALL_AROUND, ViewTemplates, templates_of
 from nextview.types import Float, Float32, Index, Mask
 
 # errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
@@ -36,6 +36,8 @@ class Library:
         templates: their depth images from all directions.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
         radii: radius of each, (T,) float64, metres.
+        corners: points of each that reach farthest, relative to its centre, (T, N, 3) float64,
+            metres.
         camera: standard deviations of the pose of a camera: radians and metres.
     """
 
@@ -69,6 +71,12 @@ class Library:
         )
         self.centres = self.caster.centres.astype(np.float64)
         self.radii = self.caster.radii.astype(np.float64)
+        self.corners = np.stack(
+            [
+                vertices[(vertices @ ALL_AROUND.T).argmax(0)]
+                for vertices in (one.vertices - one.centre for one in surfaces)
+            ]
+        )
 
     def for_cameras(self, place: float, aim: float) -> Library:
         """Return the library for cameras with another accuracy of their poses.

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from nextview.sensing.view import Grid, View
 from nextview.things.library import Hypotheses, Library
@@ -35,7 +34,9 @@ OWN_SHARE = 0.3  # of a piece, from which on all of it should be explained
 FEWEST_OWN = 8  # pixels of a piece, from which on it should end where the thing ends
 STEEPEST = 0.15  # cosine of the steepest surface that is measured
 BLOCK = 5  # pixels of the grid whose errors are alike, along each side
-BATCH = 100_000  # rays that are cast at once
+BATCH = 30_000  # rays that are cast at once
+NEAREST = 0.05  # metres in front of the camera, from which on things are seen
+BESIDE = 3  # pixels of the grid that a window shows beside a thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ def score(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Rectangles of the grid, all of one size, which may reach beyond it.
+    """Rectangles of the grid, all of one size.
 
     Attributes:
         top: first row of each, (M,) int64.
@@ -121,35 +122,53 @@ class _Window:
     height: int
     width: int
 
+    def cells(self, pixels: Index, grid: Grid) -> tuple[Index, Index]:
+        """Return the rectangle and the pixel of the grid of some pixels of all, (N,) each."""
+        row, place = np.divmod(pixels, self.height * self.width)
+        line, column = np.divmod(place, self.width)
+        line, column = line + self.top[row], column + self.left[row]
+        return row, line * grid.depth.shape[1] + column
+
 
 def _windows(
     library: Library, view: View, some: Hypotheses, grid: Grid
 ) -> Iterator[tuple[Index, _Window]]:
     """Return batches of hypotheses of similar size, and the windows that show them."""
-    middle = (some.centres - view.camera[:3, 3]) @ view.camera[:3, :3]
-    ahead = np.maximum(middle[:, 2], 1e-3)
-    reach = 1.07 * library.radii[some.things] * some.sizes.max(1) / ahead
-    low = np.stack([middle[:, 1] / ahead - reach, middle[:, 0] / ahead - reach], 1)
-    high = low + 2 * reach[:, None]
-    first = np.stack(
-        [np.searchsorted(grid.y, low[:, 0]), np.searchsorted(grid.x, low[:, 1])], 1
+    axes, place = view.camera[:3, :3], view.camera[:3, 3]
+    own = library.corners[some.things] * some.sizes[:, None]
+    turn = axes.T @ some.rotations
+    middle = (some.centres - place) @ axes
+    points = turn @ own.swapaxes(1, 2) + middle[..., None]
+    slopes = points[:, :2] / np.maximum(points[:, 2:], NEAREST)
+    ends = []
+    for side, lines in enumerate((grid.y, grid.x)):
+        low, high = slopes[:, 1 - side].min(1), slopes[:, 1 - side].max(1)
+        first = np.searchsorted(lines, low) - BESIDE
+        last = np.searchsorted(lines, high) + BESIDE
+        ends.append(np.stack([first, last]).clip(0, len(lines)))
+    (top, bottom), (left, right) = ends
+    height, width = bottom - top, right - left
+    seen = np.flatnonzero(
+        (middle[:, 2] > NEAREST) & (height > BESIDE) & (width > BESIDE)
     )
-    last = np.stack(
-        [np.searchsorted(grid.y, high[:, 0]), np.searchsorted(grid.x, high[:, 1])], 1
-    )
-    size = last - first
-    seen = np.flatnonzero((middle[:, 2] > 0.05) & (size > 1).all(1))
-    order = seen[np.argsort(size[seen].max(1), kind="stable")]
+    order = seen[np.lexsort((width[seen], np.log2(height[seen]).astype(int)))]
     while len(order):
-        # from the largest on, as many as fit
-        height, width = size[order[-1]]
-        most = max(1, BATCH // max(1, int(size[order].max(0).prod())))
-        rows = order[-most:]
+        # from the last on, as many as fit
+        tallest = np.maximum.accumulate(height[order[::-1]])
+        widest = np.maximum.accumulate(width[order[::-1]])
+        rays = tallest * widest * np.arange(1, len(order) + 1)
+        most = max(1, int(np.searchsorted(rays, BATCH, "right")))
+        rows = np.sort(order[-most:])
         order = order[:-most]
-        height, width = size[rows].max(0).tolist()
+        tall, wide = int(tallest[most - 1]), int(widest[most - 1])
         yield (
-            np.sort(rows),
-            _Window(first[np.sort(rows), 0], first[np.sort(rows), 1], height, width),
+            rows,
+            _Window(
+                np.minimum(top[rows], len(grid.y) - tall),
+                np.minimum(left[rows], len(grid.x) - wide),
+                tall,
+                wide,
+            ),
         )
 
 
@@ -157,64 +176,62 @@ def _scored(
     library: Library, view: View, some: Hypotheses, grid: Grid, window: _Window
 ) -> Iterator[Score | None]:
     """Compare hypotheses with windows of one size."""
-    lines = window.top[:, None] + np.arange(window.height)
-    columns = window.left[:, None] + np.arange(window.width)
-    image = grid.depth.shape
-    within = ((lines >= 0) & (lines < image[0]))[:, :, None]
-    within = within & ((columns >= 0) & (columns < image[1]))[:, None]
-    lines = lines.clip(0, image[0] - 1)
-    columns = columns.clip(0, image[1] - 1)
-    at = lines[:, :, None] * image[1] + columns[:, None]
-
-    depth, cosine = _rendered(library, view, some, grid.x[columns], grid.y[lines])
-    shown = np.isfinite(depth) & within
-    z = np.where(shown, depth, 1).astype(np.float32)
-    inner = ndimage.binary_erosion(shown, _CROSS)
+    shown, z, cosine = _rendered(library, view, some, grid, window)
+    pixels = np.flatnonzero(shown)
+    row, cells = window.cells(pixels, grid)
+    inner = ~_grown(~shown).ravel()[pixels]
     weight = np.where(inner, np.float32(1), np.float32(EDGE_WEIGHT))
 
-    measured = grid.depth.ravel()[at]
+    measured = grid.depth.ravel()[cells]
     radius = library.radii[some.things] * some.sizes.max(1)
     own = SCAN_ERROR**2 + (POSE_ERROR * radius) ** 2
     slope = np.sqrt(1 - cosine**2) / cosine * z * np.float32(grid.pitch / 2)
-    variance = grid.sigma.ravel()[at] ** 2 + slope**2
-    variance += own.astype(np.float32)[:, None, None]
+    variance = grid.sigma.ravel()[cells] ** 2 + slope**2
+    variance += own.astype(np.float32)[row]
     off = measured - z
     margin = np.maximum(FARTHEST * np.sqrt(variance), LEAST_MARGIN)
     likely = np.log(np.exp(-(off**2) / 2 / variance) + np.exp(OUTLIER))
 
-    got = shown & (measured > 0)
+    got = measured > 0
     front = got & (off < -margin)
     behind = got & (off > margin)
     on = got & ~front & ~behind
     most = np.where(some.taught, PIXEL_GAIN, PIXEL_GAIN - SIZE_COST)
-    most = most.astype(np.float32)[:, None, None]
-    gain = np.where(on, (likely + most) * weight, np.float32(0))
-    carries = grid.surface.ravel()[at]
+    gain = np.where(on, (likely + most.astype(np.float32)[row]) * weight, np.float32(0))
+    carries = grid.surface.ravel()[cells]
     # a surface explains itself
     gain = np.where(on & carries, np.minimum(gain, 0), gain)
-    through = (weight * behind).sum((1, 2))
-    paid = OUTLIER * through
-    paid += NOT_MEASURED * (cosine * weight * (shown & (measured == 0))).sum((1, 2))
 
-    piece = np.where(within, grid.piece.ravel()[at], 0)
-    paid += LEFT_OVER * _left_over(
-        piece, grid.sizes, shown, got, on & (likely > -2), front, measured > 0
-    )
-    seen = (weight * (got & ~front)).sum((1, 2))
-    hidden = (weight * front).sum((1, 2))
-    held = on | front
-    for row in range(len(some)):
-        if not shown[row].any():
+    count = len(some)
+    through = np.bincount(row, weight * behind, count)
+    paid = OUTLIER * through
+    paid += NOT_MEASURED * np.bincount(row, cosine * weight * ~got, count)
+    key = row * len(grid.sizes) + grid.piece.ravel()[cells]
+    mine = np.bincount(key[on & (likely > -2)], minlength=count * len(grid.sizes))
+    held = np.bincount(key[got], minlength=len(mine))
+    ahead = np.bincount(key[front], minlength=len(mine))
+    paid += LEFT_OVER * _left_over(grid, window, shown, mine, held, ahead)
+    seen = np.bincount(row, weight * (got & ~front), count)
+    hidden = np.bincount(row, weight * front, count)
+
+    kept = on | front
+    row, cells = row[kept], cells[kept]
+    # blocks of different hypotheses are different
+    apart = -(-grid.depth.shape[0] // BLOCK) * BLOCK * grid.depth.shape[1]
+    even = evened(gain[kept], cells + row * apart, on[kept], grid.depth.shape[1])
+    ends = np.searchsorted(row, np.arange(count + 1))
+    for one in range(count):
+        if not shown[one].any():
             yield None
             continue
-        cells = at[row][held[row]]
+        part = slice(ends[one], ends[one + 1])
         yield Score(
-            cells.astype(np.int32),
-            evened(gain[row][held[row]], cells, on[row][held[row]], image[1]),
-            float(paid[row]),
-            float(seen[row]),
-            float(through[row]),
-            float(hidden[row]),
+            cells[part].astype(np.int32),
+            even[part],
+            float(paid[one]),
+            float(seen[one]),
+            float(through[one]),
+            float(hidden[one]),
         )
 
 
@@ -228,91 +245,90 @@ def evened(gain: Float32, cells: Index, on: Mask, columns: int) -> Float32:
         columns: of the grid.
     """
     line, column = np.divmod(cells, columns)
-    block = line // BLOCK * columns + column // BLOCK
+    block = line // BLOCK * (columns // BLOCK + 1) + column // BLOCK
     sums = np.bincount(block[on], gain[on], minlength=int(block.max(initial=0)) + 1)
     counts = np.bincount(block[on], minlength=len(sums))
     mean = sums / np.maximum(counts, 1)
     return np.where(on, mean[block], 0).astype(np.float32)
 
 
-_CROSS = np.zeros((3, 3, 3), bool)
-_CROSS[1] = ndimage.generate_binary_structure(2, 1)
+def _grown(mask: Mask) -> Mask:
+    """Return masks, (M, h, w) bool, with the neighbours of their pixels."""
+    grown = mask.copy()
+    grown[:, 1:] |= mask[:, :-1]
+    grown[:, :-1] |= mask[:, 1:]
+    grown[..., 1:] |= mask[..., :-1]
+    grown[..., :-1] |= mask[..., 1:]
+    return grown
 
 
 def _left_over(
-    piece: NDArray[np.int32],
-    sizes: Index,
-    shown: Mask,
-    got: Mask,
-    own: Mask,
-    front: Mask,
-    measured: Mask,
+    grid: Grid, window: _Window, shown: Mask, mine: Index, held: Index, ahead: Index
 ) -> Float:
     """Count the pixels of its own pieces that each hypothesis does not explain, (M,) float64.
 
     Args:
-        piece: number of the piece of each pixel, (M, h, w); 0 for none.
-        sizes: pixels of each piece in the whole grid, (P,).
-        shown: pixels in which the hypothesis shows, (M, h, w) bool.
-        got: those of them with a measurement.
-        own: those of them that it explains.
-        front: those of them with something in front.
-        measured: pixels with a measurement.
+        grid: of the view.
+        window: of the hypotheses.
+        shown: pixels in which they show, (M, h, w) bool.
+        mine: pixels of each piece, P in all, that each hypothesis explains, (M * P,).
+        held: those that it shows, (M * P,).
+        ahead: those of them that are in front of it, (M * P,).
     """
-    count = len(sizes)
-    key = piece + count * np.arange(len(piece))[:, None, None]
-    mine = np.bincount(key[own], minlength=len(piece) * count).reshape(-1, count)
-    mine[:, 0] = 0
-    held = np.bincount(key[got], minlength=len(piece) * count).reshape(-1, count)
-    all_of_it = mine > OWN_SHARE * np.maximum(sizes, 1)
-    left = np.where(all_of_it, sizes - held, 0).sum(1).astype(np.float64)
+    every = np.tile(grid.sizes, len(shown))
+    all_of_it = mine > OWN_SHARE * np.maximum(every, 1)
+    all_of_it[:: len(grid.sizes)] = False  # no piece
+    left = np.where(all_of_it, every - held + ahead, 0)
+    left = left.reshape(len(shown), -1).sum(1).astype(np.float64)
 
-    measured = measured & ~shown
-    beside = (mine >= FEWEST_OWN).ravel()[key] & measured
-    outline = ndimage.binary_dilation(shown, _CROSS)
-    ring = ndimage.binary_dilation(outline, _CROSS) & ~outline
-    left += EDGE_WEIGHT * np.count_nonzero(outline & beside, axis=(1, 2))
-    left += np.count_nonzero(ring & beside, axis=(1, 2))
-    before = all_of_it.ravel()[key]
-    left += np.count_nonzero(front & before, axis=(1, 2))
+    ends_here = mine >= FEWEST_OWN
+    ends_here[:: len(grid.sizes)] = False
+    outline = _grown(shown)
+    ring = _grown(outline) & ~outline
+    for beside, weight in ((outline & ~shown, EDGE_WEIGHT), (ring, 1.0)):
+        row, cells = window.cells(np.flatnonzero(beside), grid)
+        key = row * len(grid.sizes) + grid.piece.ravel()[cells]
+        counts = ends_here[key] & (grid.depth.ravel()[cells] > 0)
+        left += weight * np.bincount(row[counts], minlength=len(shown))
     return left
 
 
 def _rendered(
-    library: Library, view: View, some: Hypotheses, x: Float, y: Float
-) -> tuple[Float32, Float32]:
-    """Render hypotheses in windows.
-
-    Args:
-        library: the things.
-        view: whose camera sees them.
-        some: M hypotheses.
-        x: slopes of the columns of each window, (M, w).
-        y: slopes of the rows of each window, (M, h).
+    library: Library, view: View, some: Hypotheses, grid: Grid, window: _Window
+) -> tuple[Mask, Float32, Float32]:
+    """Render M hypotheses in windows of a view.
 
     Returns:
-        Depth, (M, h, w) float32, metres, infinity for none; and the cosine of the angle between ray
-        and normal, (M, h, w) float32.
+        Pixels that show each, (M, h, w) bool; and for each of them in this order the depth, (N,)
+        float32, metres, and the cosine of the angle between ray and normal, (N,) float32.
     """
-    count, height, width = len(some), y.shape[1], x.shape[1]
-    rays: Float32 = np.ones((count, height, width, 3), np.float32)
-    rays[..., 0] = x[:, None]
-    rays[..., 1] = y[:, :, None]
-    rays = rays.reshape(count, -1, 3)
+    lines = window.top[:, None] + np.arange(window.height)
+    columns = window.left[:, None] + np.arange(window.width)
+    x = grid.x[columns].astype(np.float32)
+    y = grid.y[lines].astype(np.float32)
+    # a ray of a stretched thing, in its own axes
     turn = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
+    turn = turn.astype(np.float32)[:, :, None]
+    across = x[..., None] * turn[:, 0]
+    down = y[..., None] * turn[:, 1] + turn[:, 2]
+    rays = (down[:, :, None] + across[:, None]).reshape(len(some), -1, 3)
     start = np.einsum("mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres)
     start = start / some.sizes + library.centres[some.things]
-    towards = rays @ turn.astype(np.float32)
-    depth, normals = library.caster.cast(some.things, start, towards)
-    # a normal of a stretched thing, in its own axes
-    normals = normals / some.sizes.astype(np.float32)[:, None]
-    length = np.sqrt(np.einsum("mpi,mpi->mp", normals, normals)) + 1e-12
-    back = (view.camera[:3, :3].T @ some.rotations).astype(np.float32)
-    against = np.einsum("mpi,mpi->mp", rays @ back, normals)
-    far = np.sqrt(np.einsum("mpi,mpi->mp", rays, rays))
-    cosine = np.abs(against) / length / far
-    shape = (count, height, width)
-    return depth.reshape(shape), cosine.clip(STEEPEST, 1).reshape(shape)
+    depth, normals = library.caster.cast(some.things, start, rays)
+
+    shown = np.isfinite(depth)
+    pixels = np.flatnonzero(shown)
+    row, place = np.divmod(pixels, shown.shape[1])
+    line, column = np.divmod(place, window.width)
+    normals = normals.reshape(-1, 3)[pixels]
+    against = np.abs(np.einsum("ni,ni->n", rays.reshape(-1, 3)[pixels], normals))
+    # a normal of a stretched thing, in the axes of the scan
+    normals = normals / some.sizes.astype(np.float32)[row]
+    length = np.sqrt(np.einsum("ni,ni->n", normals, normals)) + np.float32(1e-12)
+    far = np.sqrt(x[row, column] ** 2 + y[row, line] ** 2 + 1)
+    cosine = (against / length / far).clip(STEEPEST, 1)
+    shape = (len(some), window.height, window.width)
+    return shown.reshape(shape), depth.ravel()[pixels], cosine
 
 
 def total(scores: Sequence[Score | None]) -> float:

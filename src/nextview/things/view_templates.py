@@ -70,16 +70,6 @@ class Pictures:
     outline: Float32
     depth: Float32
 
-    @cached_property
-    def of_means(self) -> Float32:
-        """Factors of a picture's depth and outline: the sum of the differences of depth."""
-        return np.concatenate([self.outline, -self.depth], 1)
-
-    @cached_property
-    def of_squares(self) -> Float32:
-        """Factors of a picture's squared depth, outline and depth: the sum of the squares."""
-        return np.concatenate([self.outline, np.square(self.depth), -2 * self.depth], 1)
-
     def __getitem__(self, rows: Index | slice) -> "Pictures":
         """Return some of them."""
         return Pictures(self.outline[rows], self.depth[rows])
@@ -125,7 +115,7 @@ class ViewTemplates:
     """Templates of things from all directions.
 
     Attributes:
-        things: thing of each template, (N,) int64.
+        things: thing of each template, the smallest outlines first, (N,) int64.
         rotations: from the axes of the scan file to those of a camera that looks at the centre of
             the outline, (N, 3, 3) float64.
         offsets: from the centre of the outline, at its median depth, to the centre of the surface,
@@ -154,13 +144,16 @@ class ViewTemplates:
         with ThreadPoolExecutor(threads or cores()) as pool:
             render = partial(_rendered, caster, looks=looks)
             each = list(pool.map(render, range(len(caster.surfaces))))
-        self.things = np.repeat(np.arange(len(each)), [len(one.sizes) for one in each])
-        self.rotations = np.concatenate([one.rotations for one in each])
-        self.offsets = np.concatenate([one.offsets for one in each])
-        self.sizes = np.concatenate([one.sizes for one in each])
+        sizes = np.concatenate([one.sizes for one in each])
+        order = np.argsort(sizes, kind="stable")
+        things = np.repeat(np.arange(len(each)), [len(one.sizes) for one in each])
+        self.sizes = sizes[order]
+        self.things = things[order]
+        self.rotations = np.concatenate([one.rotations for one in each])[order]
+        self.offsets = np.concatenate([one.offsets for one in each])[order]
         self.pictures = Pictures(
-            np.concatenate([one.pictures.outline for one in each]),
-            np.concatenate([one.pictures.depth for one in each]),
+            np.concatenate([one.pictures.outline for one in each])[order],
+            np.concatenate([one.pictures.depth for one in each])[order],
         )
         self.points = np.stack([one.points for one in each])
         self.normals = np.stack([one.normals for one in each])
@@ -212,20 +205,21 @@ class ViewTemplates:
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
         grid = turned_grid(turns)
         for step in range(first, last + 1):
-            rows = np.flatnonzero(bins == step)
-            if not len(rows):
+            rows = slice(*np.searchsorted(bins, (step, step + 1)))
+            if rows.start == rows.stop:
                 continue
             size = view.size * np.exp(step * SIZE_STEP)
             pixels = size * view.focal / view.middle
             seen = view.pictures(size, view.shifts * pixels, grid)
             costs, behind = mismatch(seen, self.pictures[rows])
             which = costs.argmin(0)
-            cost = costs[which, np.arange(len(rows))]
+            each = np.arange(len(which))
+            cost = costs[which, each]
             shift, turn = np.divmod(which, TURNS)
             fit.cost[rows] = np.minimum(cost, NO_FIT)
             fit.turn[rows] = turns[turn]
             fit.shift[rows] = view.shifts[shift] * pixels
-            fit.behind[rows] = size * behind[which, np.arange(len(rows))]
+            fit.behind[rows] = size * behind[which, each]
         return fit
 
     def _poses(
@@ -659,20 +653,20 @@ def mismatch(seen: SeenPictures, known: Pictures) -> tuple[Float32, Float32]:
         Costs, (A, N) float32, 0 for a perfect match; and mean depth of the view behind the
         template, sizes, (A, N) float32.
     """
-    some = len(seen.outline)
-    both, told = np.split(
-        np.concatenate([seen.outline, seen.known]) @ known.outline.T, [some]
-    )
+    depth = seen.depth
+    views = np.stack([seen.outline, seen.known, depth, np.square(depth)])
+    both, told, mean, spread = views @ known.outline.T
     told -= both
     told += max(seen.area, 1.0)
     overlap = np.divide(both, np.maximum(told, both + np.float32(1e-6)), out=told)
 
     # mean and variance of the depth difference in the intersection
     count: Float32 = np.maximum(both, np.float32(1), out=both)
-    mean = np.concatenate([seen.depth, seen.outline], 1) @ known.of_means.T
+    of_known, products = views[::2] @ known.depth.T
+    mean -= of_known
     mean /= count
-    squares = np.concatenate([np.square(seen.depth), seen.outline, seen.depth], 1)
-    spread = squares @ known.of_squares.T
+    spread += seen.outline @ np.square(known.depth).T
+    spread -= np.float32(2) * products
     spread /= count
     spread -= np.square(mean)
     spread = np.sqrt(np.maximum(spread, 0, out=spread), out=spread)
