@@ -55,6 +55,7 @@ class Changes:
         moved: numbers of things that stand elsewhere.
         gone: things that are no longer where they were.
         stand: numbers of things that the view shows where they were.
+        nothing: whether the view is taken from where the last one was, and shows nothing new.
         wrong_pose: whether most of several things are not where they were, though the camera may
             have moved: its pose is likely to be wrong.
     """
@@ -65,6 +66,7 @@ class Changes:
     moved: tuple[int, ...] = ()
     gone: tuple[Thing, ...] = ()
     stand: tuple[int, ...] = ()
+    nothing: bool = False
     wrong_pose: bool = False
 
 
@@ -115,7 +117,7 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         tuple(one.thing.number for one in moved),
         gone,
         stand,
-        not camera_stands and changed > 1 and changed > len(stand),
+        wrong_pose=not camera_stands and changed > 1 and changed > len(stand),
     )
 
 
@@ -131,8 +133,13 @@ def _still(world: World, view: View) -> Changes | None:
         if any(same[number] < STILL * counts[number] for number in numbers):
             return None
         held = np.zeros(len(owner), np.int32)
+        stride = view.stride
+        nothing = before is world.views[-1] and all(
+            alike[one.mask[::stride, ::stride].ravel()].mean() > EXPLAINED
+            for one in view.instances()
+        )
         view = view.seen_from(before.camera)
-        return Changes(world, view, held, stand=tuple(numbers))
+        return Changes(world, view, held, stand=tuple(numbers), nothing=nothing)
     return None
 
 
@@ -209,7 +216,8 @@ def _compared(
             for row, since in zip(rows, stood, strict=True)
         ]
 
-    stays = totals(there), scores(view, there)
+    known = [total(one.scores) for one in things] if whole else totals(there)
+    stays = known, scores(view, there)
     better = register(library, [*world.views, view], there, (0.06, 0.03, 0.02), 96)
     refined = totals(better), scores(view, better)
     stand = [

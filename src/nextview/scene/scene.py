@@ -225,7 +225,7 @@ class Scene:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """Frames that were used."""
+        """Frames that were used: at most ``things.world.MOST_VIEWS``, from different places."""
         return tuple(top.frame for top in self._state.tops)
 
     @property
@@ -598,12 +598,14 @@ class Scene:
             raise ObservationError(NOTHING_AGAIN)
         if told.wrong_pose:
             return before, Look(False, warnings=(self._why_wrong(top),))
+        if told.nothing:
+            return before, Look(True, warnings=(*top.warnings, *before.remarks))
 
         world = told.world.with_view(told.view, told.held)
         world = world.searched(np.ones(len(world.library), bool)).numbered()
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, before.world, gone)
-        state = replace(before, world=world, tops=(*before.tops, top))
+        state = replace(before, world=world, tops=(*before.tops, top)).settled()
         state = self._ruled(state.named({}))
         look = _look(before, state, (*told.moved, *moved), gone)
         if look.moved and not (told.stand or stands):

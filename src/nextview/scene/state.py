@@ -56,6 +56,14 @@ class SceneState:
         objects = objects_of(self.world, self.tops, ruled_out)
         return replace(self, objects=objects, ruled_out=ruled_out)
 
+    def settled(self) -> SceneState:
+        """Return the scene without a frame that tells little, if there are many."""
+        number = self.world.redundant()
+        if number is None:
+            return self
+        tops = tuple(top for k, top in enumerate(self.tops) if k != number)
+        return replace(self, world=self.world.without_view(number), tops=tops)
+
     @cached_property
     def ground(self) -> TableGround | None:
         """Top view of the table, and what of it is hidden; None without an object."""

@@ -274,6 +274,19 @@ class View:
             ):
                 yield Segment(mask, whole & ~mask)
 
+    def leftovers(self, shown: Mask) -> Iterator[Segment]:
+        """Return what is left of instances that were explained in part.
+
+        Args:
+            shown: pixels that are explained, (H, W) bool.
+        """
+        left = np.where(shown, 0, self.labels)
+        for mask in _parts(left, 6 * self.fewest):
+            number = self.labels[mask][0]
+            whole = np.count_nonzero(self.labels == number)
+            if np.count_nonzero(mask) <= MOST_PARTED * whole:
+                yield Segment(mask)
+
     def unions(self) -> Iterator[Segment]:
         """Return neighbouring instances as one: a thing that was cut in two or more is one.
 

@@ -43,7 +43,10 @@ MOVED = 60.0  # nats that another pose has to explain better, for a thing to hav
 MOVED_SHARE = (
     0.3  # the same of what the thing explains: errors of scan and pose are alike
 )
+MOST_VIEWS = 6  # that are kept
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
+
+_Rows = tuple[tuple[Score | None, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +94,9 @@ class World:
     library: Library
     views: tuple[View, ...] = ()
     hypotheses: Hypotheses = field(default_factory=Hypotheses.none)
-    scores: tuple[tuple[Score | None, ...], ...] = ()
-    strangers: tuple[tuple[Score | None, ...], ...] = ()
-    flat: tuple[tuple[Score | None, ...], ...] = ()
+    scores: _Rows = ()
+    strangers: _Rows = ()
+    flat: _Rows = ()
     things: tuple[Thing, ...] = ()
     owners: tuple[NDArray[np.int32], ...] = ()
     next_number: int = 1
@@ -154,7 +157,8 @@ class World:
     def searched(self, among: Mask) -> World:
         """Return the world with names for what the last view shows unexplained.
 
-        What an earlier view from the same place has shown alike was searched before.
+        What an earlier view from the same place has shown alike was searched before. A stranger
+        that an earlier view has shown is neither joined to others nor cut again.
 
         Args:
             among: things that may be there, (T,) bool.
@@ -164,13 +168,19 @@ class World:
         before = np.zeros(view.grid().depth.shape, bool)
         for one in self.views[:-1]:
             before |= view.again(one)
-        for segments, share, most in (
-            (view.instances, SURE_SHARE, EXPLAINED),
-            (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION),
-            (view.fragments, CLEAR_SHARE, EXPLAINED),
+        strange = before.copy()
+        for row in self.strangers:
+            last = row[-1]
+            if last is not None and any(row[:-1]):
+                strange.ravel()[last.cells] = True
+        for segments, share, most, known in (
+            (lambda _: view.instances(), SURE_SHARE, EXPLAINED, before),
+            (lambda _: view.unions(), CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
+            (lambda _: view.fragments(), CLEAR_SHARE, EXPLAINED, strange),
+            (view.leftovers, CLEAR_SHARE, EXPLAINED, strange),
         ):
-            shown = world.explained(share) | view.enlarged(before)
-            left = [one for one in segments() if shown[one.mask].mean() < most]
+            shown = world.explained(share) | view.enlarged(known)
+            left = [one for one in segments(shown) if shown[one.mask].mean() < most]
             new = propose(self.library, view, left, among)
             if new is not None:
                 world = world.with_hypotheses(new).chosen()
@@ -327,6 +337,45 @@ class World:
             things=tuple(things),
             owners=tuple(given[owner] for owner in self.owners),
             given={key: int(given[number]) for key, number in self.given.items()},
+        )
+
+    def redundant(self) -> int | None:
+        """Return the number of the view that tells least beside the others; None if all are kept.
+
+        It is the one taken nearest to another one. What shows a thing alone is kept.
+        """
+        if len(self.views) <= MOST_VIEWS:
+            return None
+        places = np.array([view.camera[:3, 3] for view in self.views])
+        apart = np.linalg.norm(places[:, None] - places, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        nearest = apart.min(1)
+        for one in self.things:
+            shown = [k for k, found in enumerate(one.scores) if found is not None]
+            if len(shown) == 1:
+                nearest[shown] = np.inf
+        return int(nearest.argmin()) if nearest.min() < np.inf else None
+
+    def without_view(self, number: int) -> World:
+        """Return the world without one of its views."""
+        kept = [k for k in range(len(self.views)) if k != number]
+
+        def left(rows: Sequence[Sequence[Score | None]]) -> _Rows:
+            return tuple(tuple(row[k] for k in kept) for row in rows)
+
+        return replace(
+            self,
+            views=tuple(self.views[k] for k in kept),
+            scores=left(self.scores),
+            strangers=tuple(row for row in left(self.strangers) if any(row)),
+            flat=tuple(row for row in left(self.flat) if any(row)),
+            things=tuple(
+                replace(one, scores=scores)
+                for one, scores in zip(
+                    self.things, left([one.scores for one in self.things]), strict=True
+                )
+            ),
+            owners=tuple(self.owners[k] for k in kept),
         )
 
     def holder(self, before: World, number: int) -> int:
@@ -589,7 +638,7 @@ def _owners(
     return found
 
 
-def _seen_again(world: World, view: View) -> tuple[tuple[Score | None, ...], ...]:
+def _seen_again(world: World, view: View) -> _Rows:
     """Return strangers after another view: those of before, and new ones."""
     stride = view.stride
     measured = view.grid().depth.ravel() > 0
@@ -598,21 +647,28 @@ def _seen_again(world: World, view: View) -> tuple[tuple[Score | None, ...], ...
     ]
     sizes = np.array([np.count_nonzero(mask) for mask in masks])
     expected = [_expected(world, row, view) for row in world.strangers]
-    alike = np.zeros((len(expected), len(masks)))
-    for k, cells in enumerate(expected):
-        for n, mask in enumerate(masks):
-            alike[k, n] = np.count_nonzero(mask[cells]) / max(1, len(cells))
-    column: list[Score | None] = [None] * len(expected)
-    new = set(range(len(masks)))
-    while alike.max(initial=0) > SAME_SEGMENT:
-        k, n = divmod(int(alike.argmax()), len(masks))
-        column[k] = _weak(masks[n])
-        new.discard(n)
-        alike[k] = 0
-        alike[:, n] = 0
+    shared = np.array(
+        [[np.count_nonzero(mask[cells]) for mask in masks] for cells in expected]
+    ).reshape(len(expected), len(masks))
+    lengths = np.array([len(cells) for cells in expected])
+    shown: dict[int, Mask] = {}
+    left = set(range(len(masks)))
+    # a stranger is what shows most of it, and what is a part of it
+    for count in (lengths[:, None], sizes):
+        alike = shared / np.maximum(count, 1)
+        while alike.max(initial=0) > SAME_SEGMENT:
+            k, n = divmod(int(alike.argmax()), len(masks))
+            shown[k] = masks[n] | shown.get(k, False)
+            left.discard(n)
+            shared[:, n] = alike[:, n] = 0
+            if count is not sizes:
+                alike[k] = 0
+    column = [
+        _weak(shown[k]) if k in shown else None for k in range(len(world.strangers))
+    ]
     found = [(*row, last) for row, last in zip(world.strangers, column, strict=True)]
     before = (None,) * len(world.views)
-    found += [(*before, _weak(masks[n])) for n in sorted(new) if sizes[n]]
+    found += [(*before, _weak(masks[n])) for n in sorted(left) if sizes[n]]
     return tuple(found)
 
 
