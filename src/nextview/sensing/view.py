@@ -281,11 +281,14 @@ class View:
             shown: pixels that are explained, (H, W) bool.
         """
         left = np.where(shown, 0, self.labels)
+        touching = self._touching() >= FEWEST_NEIGHBOURS
         for mask in _parts(left, 6 * self.fewest):
             number = self.labels[mask][0]
+            beside = touching[number].copy()
+            beside[[0, number]] = False
             whole = np.count_nonzero(self.labels == number)
-            if np.count_nonzero(mask) <= MOST_PARTED * whole:
-                yield Segment(mask)
+            if np.count_nonzero(mask) <= MOST_PARTED * whole or beside.any():
+                yield Segment(mask, beside[left])
 
     def unions(self) -> Iterator[Segment]:
         """Return neighbouring instances as one: a thing that was cut in two or more is one.

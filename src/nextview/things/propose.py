@@ -21,6 +21,7 @@ from nextview.types import Float, Mask
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+OF_PAIRS = 10  # poses of every thing that pairs of points propose
 LEAST_MATCH = (
     0.1  # of the best hypothesis of a segment, below which it shows none of the things
 )
@@ -31,7 +32,7 @@ SCORED_OF_ONE = 4
 KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2
 SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
-COARSER = 2  # grid on which they are rendered to choose among them
+COARSER, COARSEST = 2, 3  # grids on which they are rendered to choose among them
 HIDING_MARGIN = (
     1.0  # sizes of the segment, within which something may hide a part of it
 )
@@ -82,26 +83,38 @@ def _of_segment(
     found = Hypotheses.of(
         given.things[some], given.rotations[some], given.centres[some]
     )
+    if False:
+        things, rotations, centres, _ = library.pairs.propose(view, mask, OF_PAIRS)
+        kept = among[things]
+        pairs = Hypotheses.of(things[kept], rotations[kept], centres[kept])
+        found = Hypotheses.joined([found, pairs])
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
     if match.max() < LEAST_MATCH:
         return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
-    found = register(library, [view], found, (0.1, 0.06, 0.04), 96, outline)
-    match = matched(library, view, found, mask, 96)
-    found = best(library, found, match, SCORED, SCORED_OF_ONE)
-    found = register(library, [view], found, (0.03, 0.02), 128, outline)
-    totals = np.array(
-        [
-            -np.inf if one is None else one.total
-            for one in score(library, view, found, COARSER)
-        ]
-    )
+    found = register(library, [view], found, (0.15, 0.1, 0.08, 0.06, 0.05, 0.04), 96)
+    totals = _totals(library, view, found, COARSEST)
+    found = best(library, found, totals, SCORED, SCORED_OF_ONE)
+    found = register(library, [view], found, (0.03, 0.03, 0.02), 128)
+    totals = _totals(library, view, found, COARSER)
     gains = np.flatnonzero(totals > 0)
     if not len(gains):
         return None
     return best(library, found[gains], totals[gains], KEPT, KEPT_OF_ONE)
+
+
+def _totals(
+    library: Library, view: View, some: Hypotheses, coarser: int
+) -> Float:
+    """Score hypotheses on a coarser grid of a view, nats, (M,); -infinity outside of the image."""
+    return np.array(
+        [
+            -np.inf if one is None else one.total
+            for one in score(library, view, some, coarser)
+        ]
+    )
 
 
 def best(
@@ -157,7 +170,7 @@ def matched(
     through = measured & (off >= margin)
     front = measured & (off <= -margin)
     visible = np.maximum((seen.inside & ~(front & ~own)).sum(1), 1)
-    share = ((match & own).sum(1) - 2 * through.sum(1) - (front & own).sum(1)) / visible
+    share = (match.sum(1) - 2 * through.sum(1) - (front & own).sum(1)) / visible
 
     # number of pixels that the hypothesis would show, and how much of the segment it covers
     side = 2 * np.sqrt(25 / 24) * library.radii[some.things]
