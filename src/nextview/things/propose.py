@@ -21,7 +21,6 @@ from nextview.types import Float, Mask
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
-OF_PAIRS = 10  # poses of every thing that pairs of points propose
 LEAST_MATCH = (
     0.1  # of the best hypothesis of a segment, below which it shows none of the things
 )
@@ -83,11 +82,6 @@ def _of_segment(
     found = Hypotheses.of(
         given.things[some], given.rotations[some], given.centres[some]
     )
-    if False:
-        things, rotations, centres, _ = library.pairs.propose(view, mask, OF_PAIRS)
-        kept = among[things]
-        pairs = Hypotheses.of(things[kept], rotations[kept], centres[kept])
-        found = Hypotheses.joined([found, pairs])
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
@@ -105,9 +99,7 @@ def _of_segment(
     return best(library, found[gains], totals[gains], KEPT, KEPT_OF_ONE)
 
 
-def _totals(
-    library: Library, view: View, some: Hypotheses, coarser: int
-) -> Float:
+def _totals(library: Library, view: View, some: Hypotheses, coarser: int) -> Float:
     """Score hypotheses on a coarser grid of a view, nats, (M,); -infinity outside of the image."""
     return np.array(
         [
