@@ -78,8 +78,8 @@ TOLERANCE = (
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"lmo": "needs a dataset of BOP: lab/tests/test_bop.py writes one and runs it",
-    r"studies\.(real_frames|segmentation)": "needs real frames, which are not part of this",
-    r"^nextview-lab benchmark tables|studies\.(moves|tracking)": (
+    r"benchmarks\.gate|studies\.segmentation": "needs scans and real frames, which are not here",
+    r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
     r"^make ": "the workflow is run by lab/tests/test_workflow.py",
@@ -109,7 +109,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
-    r"look_alikes|benchmark things (YCB|HALF_SCANS)|verified_things": (
+    r"look_alikes|benchmark things (YCB|HALF_SCANS)": (
         "needs the YCB scans, and minutes"
     ),
     r"thesis\.train_grid": "trains for hours",
