@@ -113,10 +113,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans, and minutes"
     ),
     r"thesis\.train_grid": "trains for hours",
-    r"SceneLayout\.load": (
-        "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
-    ),
-    r"nextview-lab scenes YCB ": "needs the YCB scans; lab/tests/test_room_scenes.py draws tables",
     r"agent_on_things": (
         "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),
@@ -138,7 +134,6 @@ SMALL = {  # options that make a command quick
     "nextview-lab predict": "--workers 1 --overwrite",
     "nextview-lab measure": "--workers 1",
     "nextview learn": "--workers 1",
-    "nextview-lab scenes": "--scenes 4 --workers 1",
     "nextview-lab train recogniser": (
         "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
@@ -154,7 +149,6 @@ SMALL = {  # options that make a command quick
     "python -m nextview_lab.thesis.measure": "--workers 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
-    r"--scenes \d+": "--scenes 4",
     r"--objects \d+": "--objects 2",
     r"--runs \d+": "--runs 2",
     r"--epochs \d+": "--epochs 1",
@@ -543,7 +537,6 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/add_a_recogniser.md": (
         "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear"
     ),
-    "docs/cluttered_scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
     "docs/your_table.md": "nextview learn samples mine --unit cm",
 }

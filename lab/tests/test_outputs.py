@@ -93,7 +93,6 @@ NOWHERE = {
     "learn": ("learn none {}",),
     "capture": ("capture none.off {}",),
     "download": ("download modelnet10 {}",),
-    "scenes": ("scenes none {}",),
     "render": ("render none {}.zarr",),
     "measure": ("measure {}.zarr",),
     "train recogniser": ("train recogniser none {}",),

@@ -16,7 +16,7 @@ from nextview_lab.benchmark import figures as draw
 from nextview_lab.benchmark.classes import chosen_split
 from nextview_lab.benchmark.evaluation import Evaluation, evaluate, scores_for_card
 from nextview_lab.benchmark.page import numbers, origin, picture, render, write_figures
-from nextview_lab.benchmark.published import comparable_classes, published_recognisers
+from nextview_lab.benchmark.published import published_recognisers
 from nextview_lab.data.predictions import Predictions
 
 
@@ -148,7 +148,7 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
         p=p,
         found=numbers(e.accuracy, "n_views", "label", "measure"),
         counts=counts.to_dict(),
-        published=published_recognisers(comparable_classes(p), v),
+        published=published_recognisers(p.classes, v),
         errors=curve["calibration_error"],
         fused_views=", ".join(
             f"{k}: {curve.accuracy[k]:.3f}"

@@ -28,11 +28,6 @@ COMMANDS = {
         computes=False,
         example="download modelnet10 data",
     ),
-    "scenes": Command(
-        f"{CLI}.scenes:scenes",
-        "draw cluttered scenes or rooms",
-        example="scenes data/ModelNet10 light --levels light --split test",
-    ),
     "render": Command(
         f"{CLI}.stores:render",
         "render every view of a dataset into a view store",
@@ -231,7 +226,6 @@ LABORATORY = Program(
         "train recogniser",
         "train map",
         "train segmentation",
-        "scenes",
         "bop",
         "submit",
         "benchmark things",
