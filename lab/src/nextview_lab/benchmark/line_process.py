@@ -1,4 +1,4 @@
-"""Ask a process that answers each line with a line: one loop with a deadline for both of its pipes."""
+"""Ask a process that answers each line with a line: one loop with a deadline for both pipes."""
 
 import os
 import selectors
