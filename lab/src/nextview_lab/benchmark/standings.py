@@ -465,7 +465,7 @@ def _main_table(
     return WrittenTable(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
-        " of things that are named right. CPU time is that of a method, and of processes that it has"
+        " of things that are named right. CPU time is that of a method and of processes that it has"
         " waited for."
         " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where"
         " all episodes agree.",
