@@ -1,11 +1,10 @@
-"""Things in the images of a BOP dataset: their poses in BOP's file of results, and their recall."""
+"""Things in the images of a BOP dataset: their poses in BOP's file of results."""
 
 import csv
 import hashlib
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -24,7 +23,6 @@ from nextview.files import (
     unfinished,
     write_record,
 )
-from nextview.geometry.mesh import load_mesh
 from nextview.recognition.model_card import Taught
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
@@ -36,17 +34,8 @@ from nextview_lab.benchmark.bop_dataset import (
     MODELS_FOLDER,
     BopDataset,
     BopImage,
-    TrueObject,
     model_number,
     read_bop_dataset,
-)
-from nextview_lab.benchmark.pose_recall import (
-    NO_HITS,
-    Hits,
-    hits_of,
-    mspd,
-    mssd,
-    symmetries_of,
 )
 
 BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -117,13 +106,11 @@ class FoundInImage(msgspec.Struct, frozen=True):
     Attributes:
         poses: of all things that were named.
         seconds: that it took to read the image and to look at it.
-        width: of the image, pixels.
         others: names of things that were found and are no models of the dataset.
     """
 
     poses: tuple[FoundPose, ...]
     seconds: float
-    width: int
     others: tuple[str, ...] = ()
 
 
@@ -138,12 +125,8 @@ class BopRun:
         poses: how many lines were written.
         seconds: a looked-at image, mean.
         others: how often things were found that are no models of the dataset, by name.
-        hits: of each model that is in the images, by its number; None where the truth is not known.
         not_known: models that the memory does not know, by their numbers.
         learned: what was taught; None where a memory was there.
-        without_model: how often objects without a model are in the images, by their numbers.
-        round_ones: models that can be turned by any angle, of which models_info.json says nothing,
-            by their numbers.
     """
 
     out: Path
@@ -152,11 +135,8 @@ class BopRun:
     poses: int
     seconds: float
     others: dict[str, int]
-    hits: dict[int, Hits] | None
     not_known: tuple[int, ...] = ()
     learned: Learned | None = None
-    without_model: dict[int, int] = field(default_factory=dict)
-    round_ones: tuple[int, ...] = ()
 
 
 def look_for_models(
@@ -170,9 +150,8 @@ def look_for_models(
 
     Each image of the targets is looked at by itself: nothing is told of what is in it, nor of where
     its camera is. Every thing that is named becomes a line of OUT with the belief as its score, as
-    BOP's 6D detection wants it and bop_toolkit reads it. Where scene_gt.json is there, the recall
-    by MSSD and MSPD is printed; the official figures, with VSD, are bop_toolkit's. An interrupted
-    run resumes.
+    BOP's 6D detection wants it and bop_toolkit, which evaluates it, reads it. An interrupted run
+    resumes.
 
     Args:
         dataset: folder of a whole BOP dataset: models/, test/ and the file of its targets.
@@ -199,8 +178,6 @@ def look_for_models(
     read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
-    # a mistake in them is told before any work is done
-    truths = {image: read.true_objects(image) for image in images}
     learned = None
     memory = how.models
     if memory is None:
@@ -221,7 +198,6 @@ def look_for_models(
             raise DatasetError(
                 f"{dataset}: no image can be looked at: {next(iter(left_out.values()))}"
             )
-        hits = _recall(read, truths, found)
         with new_file(out, overwrite) as new:
             _write(new, found)
 
@@ -233,11 +209,8 @@ def look_for_models(
         sum(len(one.poses) for one in found.values()),
         float(np.mean([one.seconds for one in found.values()])),
         {name: names.count(name) for name in sorted(set(names))},
-        hits,
         tuple(sorted(set(read.models) - set(numbers.values()))),
         learned,
-        dict(sorted(Counter(n for i in images for n in read.without_model(i)).items())),
-        _round_ones(memory, numbers, read),
     )
 
 
@@ -319,24 +292,6 @@ def _taught(memory: str) -> Taught:
 def _things_of(memory: str) -> list[str]:
     """Names of the things that a memory knows."""
     return [thing.name for thing in _taught(memory).things]
-
-
-def _round_ones(
-    memory: str,
-    numbers: dict[str, int],
-    dataset: BopDataset,
-) -> tuple[int, ...]:
-    """Models that can be turned by any angle, of which ``models_info.json`` says nothing."""
-    turned = {
-        numbers[thing.name]
-        for thing in _taught(memory).things
-        if thing.name in numbers and any(not one.order for one in thing.symmetries)
-    }
-    return tuple(
-        number
-        for number in sorted(turned)
-        if not dataset.info[number].symmetries_continuous
-    )
 
 
 def _numbers_of_things(
@@ -452,7 +407,7 @@ def _look(
         flat = tuple(in_camera.ravel().tolist())
         poses.append(FoundPose(numbers[name], thing.confidence, flat))
     seconds = time.perf_counter() - begun
-    return FoundInImage(tuple(poses), seconds, captured.size[0], tuple(others))
+    return FoundInImage(tuple(poses), seconds, tuple(others))
 
 
 def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
@@ -475,52 +430,3 @@ def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
                         f"{one.seconds:.6f}",
                     ]
                 )
-
-
-def _recall(
-    dataset: BopDataset,
-    truths: dict[BopImage, tuple[TrueObject, ...] | None],
-    found: dict[BopImage, FoundInImage],
-) -> dict[int, Hits] | None:
-    """Hits of each model that is in the images; None where none of them has a truth.
-
-    Images that could not be looked at count: what is in them is missed.
-    """
-    nothing = FoundInImage((), 0.0, 1)
-    known = {image: true for image, true in truths.items() if true is not None}
-    if not known:
-        return None
-
-    hits: dict[int, Hits] = {}
-    for model in sorted({one.model for true in known.values() for one in true}):
-        mesh = load_mesh(dataset.evaluated_model(model), unit="mm")
-        vertices = (mesh.vertices * mesh.radius + mesh.centre) / MILLIMETRES
-        symmetries = symmetries_of(dataset.info[model])
-        total = NO_HITS
-        for image, true in known.items():
-            there = [one for one in true if one.model == model]
-            if not there:
-                continue
-            one = found.get(image, nothing)
-            poses = [pose for pose in one.poses if pose.model == model]
-            pairs = [[(p.matrix, t.pose) for t in there] for p in poses]
-            surface = [
-                [mssd(*pair, vertices, symmetries) for pair in row] for row in pairs
-            ]
-            projection = [
-                [
-                    mspd(*pair, vertices, symmetries, dataset.camera(image).intrinsics)
-                    for pair in row
-                ]
-                for row in pairs
-            ]
-            total += hits_of(
-                np.array(surface),
-                np.array(projection),
-                [pose.score for pose in poses],
-                [t.counts for t in there],
-                dataset.info[model].diameter,
-                one.width,
-            )
-        hits[model] = total
-    return hits

@@ -35,7 +35,7 @@ from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float, Index
 from nextview_lab.benchmark.jobs import Job, Settings
-from nextview_lab.benchmark.pose_recall import add_s
+from nextview_lab.data.metrics import add_s
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 FEWEST_THINGS = 6

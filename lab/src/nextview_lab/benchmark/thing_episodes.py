@@ -38,7 +38,7 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.types import Float
 from nextview_lab.benchmark.known_things import Answer, KnownThings
-from nextview_lab.benchmark.pose_recall import add_s
+from nextview_lab.data.metrics import add_s
 
 Occlusion = Literal["none", "half", "heavy"]
 
