@@ -112,7 +112,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"look_alikes|benchmark things (YCB|HALF_SCANS)": (
         "needs the YCB scans, and minutes"
     ),
-    r"thesis\.train_grid": "trains for hours",
     r"agent_on_things": (
         "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),
@@ -123,7 +122,7 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
-    r"thesis\.(measure_study|example_maps)": "nextview-lab[benchmark]",
+    r"thesis\.measure_study": "nextview-lab[benchmark]",
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
     r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
     r"explorer_pictures": "nextview[browser]",
