@@ -87,7 +87,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview-lab download": (
         "473 MB from a server of others; lab/tests/test_download.py has a server of its own"
     ),
-    r"^nextview explore": (
+    r"^nextview(-lab)? explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
     ),
     r"pyrealsense2": (
