@@ -781,7 +781,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
-    "measures.png": "needs hours: nextview_lab.thesis.measure_study",
+    "measures.png": "drawn by an earlier version of nextview_lab.thesis.measure_study",
     "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 
