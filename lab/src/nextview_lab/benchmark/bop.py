@@ -19,19 +19,15 @@ from nextview.files import (
     new_file,
     only_one,
     read_record,
-    sha256_of,
     unfinished,
     write_record,
 )
-from nextview.recognition.model_card import Taught
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
-from nextview.teaching.learn import CARD, Learned, learn_things
-from nextview.teaching.thing_views import TeachingOptions
+from nextview.teaching.learn import CARD
 from nextview.things.memory import open_memory
 from nextview.types import Float
 from nextview_lab.benchmark.bop_dataset import (
-    MODELS_FOLDER,
     BopDataset,
     BopImage,
     model_number,
@@ -49,8 +45,7 @@ class BopOptions:
 
     Attributes:
         models: memory that was taught with the models of the dataset (nextview learn
-            DATASET/models MEMORY --unit mm), or with things in the same frames; by default they
-            are taught, and the memory is kept beside OUT.
+            DATASET/models MEMORY --unit mm), or with things in the same frames.
         ids: numbers of the models that things of the memory are, NAME=NUMBER; things called
             obj_000012 need none.
         split: folder of the scenes, such as test_primesense.
@@ -64,12 +59,9 @@ class BopOptions:
             up; by default the normal of the support plane does.
         unknown: p-value below which an object is called unknown, and is not written; by default
             0.02, so one known thing in 50 is. 0 always names a thing.
-        sensor: camera that the models are taught for: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH.
-        seed: seed of all random draws.
     """
 
-    models: str | None = None
+    models: str = "ycb"
     ids: tuple[str, ...] = ()
     split: str = "test"
     targets: Path | None = None
@@ -77,8 +69,6 @@ class BopOptions:
     frames: int | None = None
     camera_poses: bool = False
     unknown: float | None = None
-    sensor: str = "wrist"
-    seed: int = 0
 
 
 class FoundPose(msgspec.Struct, frozen=True):
@@ -126,7 +116,6 @@ class BopRun:
         seconds: a looked-at image, mean.
         others: how often things were found that are no models of the dataset, by name.
         not_known: models that the memory does not know, by their numbers.
-        learned: what was taught; None where a memory was there.
     """
 
     out: Path
@@ -136,7 +125,6 @@ class BopRun:
     seconds: float
     others: dict[str, int]
     not_known: tuple[int, ...] = ()
-    learned: Learned | None = None
 
 
 def look_for_models(
@@ -159,7 +147,7 @@ def look_for_models(
             nextview_lmo-test.csv.
         how: models and images.
         overwrite: replace OUT.
-        track: follows the images, and the models that are taught.
+        track: follows the images.
 
     Returns:
         What was found.
@@ -178,15 +166,11 @@ def look_for_models(
     read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
-    learned = None
-    memory = how.models
-    if memory is None:
-        memory, learned = _memory(read, out, how, track)
-    numbers = _numbers_of_things(memory, given, read)
-    system = load(memory, unknown=how.unknown)
+    numbers = _numbers_of_things(how.models, given, read)
+    system = load(how.models, unknown=how.unknown)
 
     left_out: dict[str, str] = {}
-    with only_one(out), unfinished(out, _key(read, memory, how)) as parts:
+    with only_one(out), unfinished(out, _key(read, how)) as parts:
         looks = _looks(read, images, system, numbers, how.camera_poses, parts, left_out)
         track(looks, len(images), "images")
         found = {
@@ -210,7 +194,6 @@ def look_for_models(
         float(np.mean([one.seconds for one in found.values()])),
         {name: names.count(name) for name in sorted(set(names))},
         tuple(sorted(set(read.models) - set(numbers.values()))),
-        learned,
     )
 
 
@@ -242,65 +225,15 @@ def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
     return numbers
 
 
-def _memory(
-    dataset: BopDataset,
-    out: Path,
-    how: BopOptions,
-    track: TrackProgress,
-) -> tuple[str, Learned | None]:
-    """The folder of the memory of the models, and what was taught, unless an earlier run did."""
-    folder = out.with_name(f"{out.stem}-memory")
-    if not (folder / CARD).exists():
-        options = TeachingOptions(unit="mm", sensor=how.sensor, seed=how.seed)
-        models = dataset.folder / MODELS_FOLDER
-        return str(folder), learn_things(models, folder, options, track=track)
-
-    if reason := _out_of_date(folder, dataset, how.sensor):
-        raise UsageError(
-            f"{folder}: {reason}; remove it, and the models are taught again, or name the right"
-            " one with --models"
-        )
-    return str(folder), None
-
-
-def _out_of_date(folder: Path, dataset: BopDataset, sensor: str) -> str:
-    """Why the memory that an earlier run taught is not that of the models; "" if it is.
-
-    Models that are not in it may be some that could not be taught: they are told at the end.
-    """
-    taught = _taught(str(folder))
-    if not taught.sensor:
-        return "was taught by an earlier version"
-    if taught.sensor != sensor:
-        return f"was taught for the sensor {taught.sensor}, not for {sensor}"
-    models = {path.stem: path for path in dataset.models.values()}
-    for thing in taught.things:
-        if thing.name not in models:
-            return f"holds the memory of another dataset ({thing.name})"
-        if thing.sha256 != sha256_of(models[thing.name]):
-            return f"was taught with another file than {models[thing.name]} is now"
-    return ""
-
-
-def _taught(memory: str) -> Taught:
-    """What a memory is of."""
-    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
-    assert card.memory is not None
-    return card.memory
-
-
-def _things_of(memory: str) -> list[str]:
-    """Names of the things that a memory knows."""
-    return [thing.name for thing in _taught(memory).things]
-
-
 def _numbers_of_things(
     memory: str,
     given: dict[str, int],
     dataset: BopDataset,
 ) -> dict[str, int]:
     """The number of each thing that is a model of the dataset, by its name."""
-    things = _things_of(memory)
+    card, _ = open_memory(_card_of(memory))
+    assert card.memory is not None
+    things = [thing.name for thing in card.memory.things]
     for name in given:
         if name not in things:
             raise UsageError(f"--ids: {memory} knows nothing called {one_line(name)}")
@@ -317,8 +250,8 @@ def _numbers_of_things(
     if not numbers:
         raise UsageError(
             f"{memory}: none of its things ({_few(things)}) is called as a model of"
-            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); leave out --models,"
-            " and the models are taught, or say which things they are with --ids NAME=NUMBER"
+            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); say which"
+            " things they are with --ids NAME=NUMBER"
         )
     return numbers
 
@@ -328,9 +261,14 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(one_line(name) for name in names[:MOST_NAMED]) + more
 
 
-def _key(dataset: BopDataset, memory: str, how: BopOptions) -> str:
+def _card_of(memory: str) -> Path | str:
+    """The card of a memory that is named, or given as a folder."""
+    return Path(memory) / CARD if Path(memory).is_dir() else memory
+
+
+def _key(dataset: BopDataset, how: BopOptions) -> str:
     """What the part of each image depends on."""
-    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
+    card, _ = open_memory(_card_of(how.models))
     depends = [
         str(dataset.folder.resolve()),
         how.split,

@@ -11,8 +11,6 @@ def print_bop(run: BopRun) -> None:
     Args:
         run: what was found.
     """
-    if run.learned is not None:
-        console.print(f"{run.learned.out}: {run.learned}", soft_wrap=True)
     if run.not_known:
         numbers = ", ".join(map(str, run.not_known))
         console.print(

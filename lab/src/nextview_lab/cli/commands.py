@@ -159,7 +159,7 @@ COMMANDS = {
         "locate the models of a BOP dataset in its images",
         "wrote {out}; next: evaluate it with bop_toolkit",
         f"{CLI}.bop:print_bop",
-        example="bop lmo nextview_lmo-test.csv --frames 10",
+        example="bop lmo nextview_lmo-test.csv --models lmo_memory",
     ),
     "submit": Command(
         "nextview_lab.benchmark.submit:submit",
