@@ -3,24 +3,19 @@
 Importing this module registers them:
 
 - ``nextview/Recognise-v0``: replays a file of predictions, without rendering.
-- ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
 - ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
 """
 
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from nextview.checks import number, one_line, whole
-from nextview.data.folders import list_dataset
-from nextview.data.samples import SAMPLE_MESHES, sample_mesh
-from nextview.errors import DatasetError, SessionError, UsageError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.errors import SessionError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState
 from nextview.policies.gain import (
@@ -36,12 +31,9 @@ from nextview.policies.gain import (
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.inference import Models, NetworkRecogniser, open_maps
 from nextview.recognition.map_names import in_order
-from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
-from nextview.simulation.simulated import SimulatedCamera
-from nextview.types import Float, Float32, Index
+from nextview.types import Float, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
@@ -52,10 +44,8 @@ with extras():
 
 log = logging.getLogger(__name__)
 PredictionsSource = str | Path | Predictions
-CAMERAS = 16  # meshes that are cached
 _HERE = "nextview_lab.benchmark.environments"
 gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv")
-gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
 gymnasium.register(
     "nextview/RecogniseThings-v0",
     "nextview_lab.benchmark.thing_environment:RecogniseThingsEnv",
@@ -462,11 +452,7 @@ class TaskEnv(ViewsEnv):
             "action_mask": (~visited[0, reached]).astype(np.int8),
         }
         going = reached if len(episodes.running) else None
-        return self.observed(seen), value, going, info
-
-    def observed(self, state: Float32) -> Any:
-        """Return the observation with a state, (D,)."""
-        return state
+        return seen, value, going, info
 
 
 class RecogniseEnv(TaskEnv):
@@ -483,106 +469,3 @@ class RecogniseEnv(TaskEnv):
         **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
-
-
-class RecogniseMeshEnv(TaskEnv):
-    """Recognise an object from few rendered views of its mesh.
-
-    Args:
-        meshes: folder CLASS/train|test/MESH or CLASS/MESH; by default the samples.
-        split: "train" or "test"; None for folders without splits, such as the samples.
-        models: name of bundled models, or a folder.
-        viewpoints: layout of ``ViewSphere.named``.
-        depth: return observations {"state": (D,), "depth": (size, size) float32, object radii, 0
-            for the background}.
-        size: side of the images, pixels, a multiple of the input size of the networks, which is 112
-            for the bundled ones.
-        balanced: draw all classes equally often.
-        rules: arguments of ``Rules``.
-
-    Raises:
-        DatasetError: there are no such meshes, or the recogniser does not know a class.
-    """
-
-    def __init__(
-        self,
-        meshes: str | Path | None = None,
-        split: EnvironmentSplit = "train",
-        models: str | Path = "modelnet10",
-        viewpoints: str = "40",
-        depth: bool = False,
-        size: int = 224,
-        balanced: bool = False,
-        **rules: Any,
-    ) -> None:
-        whole(size, "the side of an image", 1)
-        given = Rules(**rules)
-        found = find_models(models)
-        sphere = ViewSphere.named(viewpoints)
-
-        self._models = Models(
-            NetworkRecogniser(found.recogniser),
-            open_maps(found.maps, given.maps),
-        )
-        classes = self._models.classes
-        calibration = self._models.recogniser.calibration
-
-        objects: list[tuple[str, Callable[[], Mesh]]] = [
-            (name, partial(sample_mesh, name)) for name in SAMPLE_MESHES
-        ]
-        if meshes is not None:
-            entries = [
-                e for e in list_dataset(Path(meshes)) if split in (None, e.split)
-            ]
-            objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
-
-        if not objects:
-            raise DatasetError(
-                f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that"
-                " there are"
-            )
-        for label, _ in objects:
-            if label not in classes:
-                raise DatasetError(
-                    f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}"
-                )
-
-        labels = np.array([classes.index(label) for label, _ in objects])
-        self._camera = lru_cache(CAMERAS)(
-            lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
-        )
-        super().__init__(
-            EnvironmentTask(
-                labels,
-                classes,
-                sphere,
-                calibration,
-                self._rendered,
-                given,
-                balanced,
-            )
-        )
-
-        self._depth = depth
-        if depth:
-            image = gymnasium.spaces.Box(
-                0,
-                np.float32(sphere.distance + 1),
-                (size, size),
-            )
-            self.observation_space = gymnasium.spaces.Dict(
-                {"state": self.task.observation_space, "depth": image}
-            )
-
-    def _rendered(self, objects: Index, views: Index) -> Evidence:
-        poses = self.task.sphere.poses
-        seen = [
-            self._camera(int(k)).observe(poses[v])
-            for k, v in zip(objects, views, strict=True)
-        ]
-        self._last = seen[-1]
-        return self._models.evidence(seen)
-
-    def observed(self, state: Float32) -> Any:
-        """Return the state, with the depth image if requested."""
-        return {"state": state, "depth": self._last.depth} if self._depth else state
