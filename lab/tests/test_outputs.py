@@ -107,7 +107,7 @@ NOWHERE = {
     "fit size": ("fit size none none.npz {}.json",),
     "fit unknown": ("fit unknown none {}.json",),
     "fit valleys": ("fit valleys none.npz {}.json",),
-    "evaluate": ("evaluate none.npz {}", "evaluate none.npz good --figures {}"),
+    "evaluate": ("evaluate none.npz {}",),
     "benchmark classes": ("benchmark classes none.npz {}",),
     "benchmark things": ("benchmark things none {}",),
     "benchmark tables": ("benchmark tables none none {}",),

@@ -20,13 +20,11 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.protocol import log_evidence_of_views
 from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_views import Outlook
-from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.types import Float
 from nextview_lab.benchmark.known_things import Answer, KnownThings
@@ -184,28 +182,17 @@ class ThingEpisode:
 
         Args:
             views: in order.
-            needs: inputs of the policy: "joint", "observations" and "outlook" are available.
+            needs: inputs of the policy: "observations" and "outlook" are available.
         """
-        seen = self.seen(views)
-        recogniser = self.things.recogniser
-        classes = len(recogniser.classes)
+        classes = len(self.things.recogniser.classes)
         visited = np.zeros((1, len(EPISODE_SPHERE)), bool)
         visited[0, list(views)] = True
-        joint = None
-        if "joint" in needs:
-            assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
-            views_seen = [self.observation(view) for view in seen]
-            total = log_evidence_of_views(recogniser, views_seen).sum(0)
-            here = EPISODE_SPHERE.azimuth[views[-1]]
-            joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
-
         return EpisodeState(
             current=np.array([views[-1]]),
             visited=visited,
             belief=self.verified(views)[0].belief[None],
             evidence=Evidence(np.zeros((1, classes))),
             step=len(views),
-            joint=joint,
             observations=[[self.observation(view) for view in views]],
             outlook=[self.outlook(views)] if "outlook" in needs else None,
         )

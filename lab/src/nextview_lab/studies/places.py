@@ -50,8 +50,9 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import ObservationError
 from nextview.recognition.belief import Stopping
 from nextview.sensing import Frame, ObservedObject
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.methods import never
-from nextview_lab.studies.shared import markdown, results, scans_in, share
+from nextview_lab.studies.shared import results, scans_in, share
 from nextview_lab.studies.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,

@@ -145,9 +145,3 @@ def share(count: int, total: int) -> str:
         return "-"
     low, high = wilson(count, total)
     return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"
-
-
-def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in Markdown."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
