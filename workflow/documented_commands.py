@@ -103,7 +103,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_bags.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"studies\.frozen|nextview-bench": (
+    r"studies\.frozen|nextview-bench|^for policy in": (
         "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
     r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
