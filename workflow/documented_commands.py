@@ -78,8 +78,8 @@ TOLERANCE = (
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"lmo": "needs a dataset of BOP: lab/tests/test_bop.py writes one and runs it",
-    r"studies\.(real_frames|segmentation)": "needs real frames, which are not part of this",
-    r"^nextview-lab benchmark tables|studies\.(moves|tracking)": (
+    r"benchmarks\.gate|studies\.segmentation": "needs scans and real frames, which are not here",
+    r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
     r"^make ": "the workflow is run by lab/tests/test_workflow.py",
@@ -87,7 +87,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview-lab download": (
         "473 MB from a server of others; lab/tests/test_download.py has a server of its own"
     ),
-    r"^nextview explore": (
+    r"^nextview(-lab)? explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
     ),
     r"pyrealsense2": (
@@ -103,20 +103,15 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_bags.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"studies\.frozen|nextview-bench": (
+    r"studies\.frozen|nextview-bench|^for policy in": (
         "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
     r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
-    r"look_alikes|benchmark things (YCB|HALF_SCANS)|verified_things": (
+    r"look_alikes|benchmark things (YCB|HALF_SCANS)": (
         "needs the YCB scans, and minutes"
     ),
-    r"thesis\.train_grid": "trains for hours",
-    r"SceneLayout\.load": (
-        "names one of the drawn scenes; lab/tests/test_scenes.py looks into one of its own"
-    ),
-    r"nextview-lab scenes YCB ": "needs the YCB scans; lab/tests/test_room_scenes.py draws tables",
     r"agent_on_things": (
         "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
     ),
@@ -127,7 +122,7 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
     r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
-    r"thesis\.(measure_study|example_maps)": "nextview-lab[benchmark]",
+    r"thesis\.measure_study": "nextview-lab[benchmark]",
     r"--record|viewers\.(scene_)?recording|explorer_pictures": "nextview[record]",
     r"--explorer|viewers\.scene_page|explorer_pictures": "nextview[explore]",
     r"explorer_pictures": "nextview[browser]",
@@ -138,7 +133,6 @@ SMALL = {  # options that make a command quick
     "nextview-lab predict": "--workers 1 --overwrite",
     "nextview-lab measure": "--workers 1",
     "nextview learn": "--workers 1",
-    "nextview-lab scenes": "--scenes 4 --workers 1",
     "nextview-lab train recogniser": (
         "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
@@ -154,7 +148,6 @@ SMALL = {  # options that make a command quick
     "python -m nextview_lab.thesis.measure": "--workers 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
-    r"--scenes \d+": "--scenes 4",
     r"--objects \d+": "--objects 2",
     r"--runs \d+": "--runs 2",
     r"--epochs \d+": "--epochs 1",
@@ -543,7 +536,6 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
     "docs/add_a_recogniser.md": (
         "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear"
     ),
-    "docs/cluttered_scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
     "docs/your_table.md": "nextview learn samples mine --unit cm",
 }
@@ -789,7 +781,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
-    "measures.png": "needs hours: nextview_lab.thesis.measure_study",
+    "measures.png": "drawn by an earlier version of nextview_lab.thesis.measure_study",
     "picking.gif": "drawn by an earlier version, whose script is gone",
 }
 

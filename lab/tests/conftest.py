@@ -1,4 +1,4 @@
-"""Fixtures of the laboratory: stores of views, predictions, results, drawn scenes, archives.
+"""Fixtures of the laboratory: stores of views, predictions, results, archives.
 
 What the tests of both packages share is in ``tests/shared_fixtures.py``.
 """
@@ -15,7 +15,6 @@ from bop_datasets import write_dataset
 from frozen_archives import write_archive
 
 from nextview_lab.benchmark import table_runs
-from nextview_lab.data import scene_drawing
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,10 +22,9 @@ def kept_rests(shared):
     """Find the resting poses of each thing once in a run, as ``kept_things`` does."""
     folder = shared("kept", lambda folder: None)
     with pytest.MonkeyPatch.context() as patched:
-        for module in (table_runs, scene_drawing):
-            function = module.resting_poses
-            kept = kept_results.Kept(function, folder, kept_results.of_mesh)
-            patched.setattr(module, "resting_poses", kept)
+        function = table_runs.resting_poses
+        kept = kept_results.Kept(function, folder, kept_results.of_mesh)
+        patched.setattr(table_runs, "resting_poses", kept)
         yield
 
 
@@ -115,38 +113,3 @@ def results(shared) -> Path:
         )
 
     return shared("results", make)
-
-
-@pytest.fixture(scope="session")
-def cluttered(shared, furniture) -> Path:
-    """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each
-    level.
-    """
-    from nextview_lab.data.scene_drawing import draw_scenes
-
-    def make(folder: Path) -> None:
-        list(draw_scenes(furniture, folder / "scenes", scenes=1, seed=3, workers=0))
-
-    return shared("cluttered", make) / "scenes"
-
-
-@pytest.fixture(scope="session")
-def cluttered_views(shared, cluttered, furniture) -> Path:
-    """A store of ``cluttered``: 40 views, 48 pixels."""
-    from nextview_lab.data.rendering import RenderOptions, render
-
-    options = RenderOptions(meshes=furniture)
-
-    def make(folder: Path) -> None:
-        list(
-            render(
-                cluttered,
-                folder / "views.zarr",
-                pipeline.SPHERE,
-                48,
-                options,
-                workers=0,
-            )
-        )
-
-    return shared("cluttered_views", make) / "views.zarr"

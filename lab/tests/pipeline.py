@@ -3,7 +3,6 @@
 ``conftest.py`` makes fixtures of whole pipelines from it.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +12,9 @@ from lab_programs import main
 from nextview.data.folders import Entry
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.recognition.belief import Calibration
 from nextview_lab.data.measures import MeasuredView
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.store import DONE, ViewStore, describe
+from nextview_lab.data.store import DONE, RENDERED_ARRAYS, ViewStore, describe
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["ball", "box", "pillar"]
@@ -67,29 +65,6 @@ def train_predictions(
     return replace(Predictions(*given, azimuth_bins=azimuth_bins), **fields)
 
 
-def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
-    """Random logits of a store of cluttered scenes.
-
-    A view that hardly shows the target says nothing.
-    """
-    opened, rng = ViewStore.open(store), np.random.default_rng(0)
-    shows = opened.measure("visible_share") > 0.3
-    logits = np.where(
-        shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0
-    ).astype(np.float32)
-    return replace(
-        some_predictions(len(opened)),
-        logits=logits,
-        classes=tuple(classes),
-        names=tuple(opened.names),
-        maps={},
-        valley_classes={},
-        depth_entropy=opened.measure(),
-        store=str(store),
-        calibration=Calibration(1.0, 0.3),
-    )
-
-
 def benchmark(predictions: Path, out: Path, **settings):
     from nextview_lab.benchmark.classes import ClassSettings, benchmark_classes
 
@@ -106,7 +81,7 @@ def store_of(
     entries = [Entry(Path(f"{name}.off"), name, label, "train") for name, label in both]
     store = ViewStore.create(path, describe(entries, sphere, size, {}))
     for name, values in arrays.items():
-        store.group[name if name in store.rendered else f"measures/{name}"][:] = values
+        store.group[name if name in RENDERED_ARRAYS else f"measures/{name}"][:] = values
     store.group["status"][:] = DONE
     return store
 

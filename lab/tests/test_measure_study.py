@@ -24,7 +24,7 @@ def made(views, tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("study")
     shutil.copytree(views, folder / "views.zarr")
-    list(measure(folder / "views.zarr", ["view_area"], workers=0))
+    list(measure(folder / "views.zarr", ["view_area", "above_preference"], workers=0))
     store = ViewStore.open(folder / "views.zarr")
     area = store.measure("view_area")
     labels = store.labels
@@ -51,7 +51,6 @@ def made(views, tmp_path_factory):
         "policies": ("unidirectional", "true-view_area-5"),
         "runs": 4,
         "samples": 50,
-        "workers": 0,
     }
     options["measures"] = ("view_area", "above_preference", "confidence")
     predictions = {"test": folder / "test.npz", "validation": folder / "validation.npz"}
@@ -121,18 +120,7 @@ def test_scipy_agrees_on_ranks():
     assert (measure_study.correlations(np.ones((2, 40)), b[:2]) == 0).all()
 
 
-def test_the_table_and_the_figure_are_there_for_a_paper(made):
-    there = {path.name for path in (made / "out").iterdir()}
-    assert there == {
-        *(f"measures.{kind}" for kind in ("csv", "md", "png", "pdf", "svg")),
-        "table.csv",
-        "table.tex",
-    }
-    wide = pd.read_csv(made / "out" / "table.csv")
-    assert set(wide["measure"]) >= {
-        "random",
-        "view area",
-        "confidence",
-        "unidirectional",
-    }
-    assert (made / "out" / "measures.pdf").read_bytes().startswith(b"%PDF")
+def test_the_table_has_a_row_for_each_measure_and_policy(made):
+    lines = (made / "out" / "measures.md").read_text().splitlines()
+    first = {line.split(" | ")[0].strip("| ") for line in lines}
+    assert first >= {"random", "view area", "confidence", "unidirectional"}

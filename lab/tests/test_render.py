@@ -17,7 +17,7 @@ import trimesh
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview_lab.data.rendering import render
-from nextview_lab.data.store import ViewStore
+from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore
 
 SPHERE = ViewSphere.named("12")
 SIZE = 64
@@ -36,7 +36,7 @@ for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 
 
 def assert_same(a: Path, b: Path) -> None:
     first, second = ViewStore.open(a), ViewStore.open(b)
-    for name in first.rendered:
+    for name in RENDERED_ARRAYS:
         np.testing.assert_array_equal(
             first.array(name)[:], second.array(name)[:], err_msg=name
         )

@@ -1,4 +1,4 @@
-"""The page of a benchmark: whole, self-contained, and true to the results; of scenes too."""
+"""The page of a benchmark: whole, self-contained, and true to the results."""
 
 import re
 from dataclasses import replace

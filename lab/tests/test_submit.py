@@ -161,7 +161,7 @@ def asked(tmp_path, code, wait=60.0, line=b"x" * 100_000):
             "an empty line was written before",
         ),
         (
-            "read(); os.write(1, 'gr\u00fc\u00df'.encode('latin-1')); time.sleep(3)",
+            "read(); os.write(1, 'gr\u00fc\u00df\\n'.encode('latin-1')); time.sleep(3)",
             r"'gr\\xfc\\xdf' is not UTF-8 \(byte 0xfc\)",
         ),
         ("read(); os.write(1, b'half \\xc3\\n'); time.sleep(3)", "is not UTF-8"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from symmetric_parts import around, degrees_off, keyed, parts, toothed, turns_of
 
 from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry
@@ -11,14 +12,6 @@ from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
 from nextview.teaching.symmetries import named_symmetries
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
-from nextview_lab.studies.machine_parts import (
-    around,
-    degrees_off,
-    keyed,
-    parts,
-    toothed,
-    turns_of,
-)
 from nextview_lab.worlds.solids import extruded, joined, moved, ring_points
 
 PARTS = parts()
@@ -212,7 +205,7 @@ def test_one_thing_has_its_symmetries_once():
         named_symmetries(["mug=z", "mug=none"])
 
 
-def test_a_part_of_the_benchmark_is_what_it_says():
+def test_a_part_is_what_it_says():
     # Volumes in closed form: that of a prism is the area of its outline times its height.
     for name, volume in {
         "die": 16**3,

@@ -1,11 +1,10 @@
-"""Things in the images of a BOP dataset: their poses in BOP's file of results, and their recall."""
+"""Things in the images of a BOP dataset: their poses in BOP's file of results."""
 
 import csv
 import hashlib
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -20,33 +19,19 @@ from nextview.files import (
     new_file,
     only_one,
     read_record,
-    sha256_of,
     unfinished,
     write_record,
 )
-from nextview.geometry.mesh import load_mesh
-from nextview.recognition.model_card import Taught
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
-from nextview.teaching.learn import CARD, Learned, learn_things
-from nextview.teaching.thing_views import TeachingOptions
+from nextview.teaching.learn import CARD
 from nextview.things.memory import open_memory
 from nextview.types import Float
 from nextview_lab.benchmark.bop_dataset import (
-    MODELS_FOLDER,
     BopDataset,
     BopImage,
-    TrueObject,
     model_number,
     read_bop_dataset,
-)
-from nextview_lab.benchmark.pose_recall import (
-    NO_HITS,
-    Hits,
-    hits_of,
-    mspd,
-    mssd,
-    symmetries_of,
 )
 
 BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -60,8 +45,7 @@ class BopOptions:
 
     Attributes:
         models: memory that was taught with the models of the dataset (nextview learn
-            DATASET/models MEMORY --unit mm), or with things in the same frames; by default they
-            are taught, and the memory is kept beside OUT.
+            DATASET/models MEMORY --unit mm), or with things in the same frames.
         ids: numbers of the models that things of the memory are, NAME=NUMBER; things called
             obj_000012 need none.
         split: folder of the scenes, such as test_primesense.
@@ -75,12 +59,9 @@ class BopOptions:
             up; by default the normal of the support plane does.
         unknown: p-value below which an object is called unknown, and is not written; by default
             0.02, so one known thing in 50 is. 0 always names a thing.
-        sensor: camera that the models are taught for: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH.
-        seed: seed of all random draws.
     """
 
-    models: str | None = None
+    models: str = "ycb"
     ids: tuple[str, ...] = ()
     split: str = "test"
     targets: Path | None = None
@@ -88,8 +69,6 @@ class BopOptions:
     frames: int | None = None
     camera_poses: bool = False
     unknown: float | None = None
-    sensor: str = "wrist"
-    seed: int = 0
 
 
 class FoundPose(msgspec.Struct, frozen=True):
@@ -117,13 +96,11 @@ class FoundInImage(msgspec.Struct, frozen=True):
     Attributes:
         poses: of all things that were named.
         seconds: that it took to read the image and to look at it.
-        width: of the image, pixels.
         others: names of things that were found and are no models of the dataset.
     """
 
     poses: tuple[FoundPose, ...]
     seconds: float
-    width: int
     others: tuple[str, ...] = ()
 
 
@@ -138,12 +115,7 @@ class BopRun:
         poses: how many lines were written.
         seconds: a looked-at image, mean.
         others: how often things were found that are no models of the dataset, by name.
-        hits: of each model that is in the images, by its number; None where the truth is not known.
         not_known: models that the memory does not know, by their numbers.
-        learned: what was taught; None where a memory was there.
-        without_model: how often objects without a model are in the images, by their numbers.
-        round_ones: models that can be turned by any angle, of which models_info.json says nothing,
-            by their numbers.
     """
 
     out: Path
@@ -152,11 +124,7 @@ class BopRun:
     poses: int
     seconds: float
     others: dict[str, int]
-    hits: dict[int, Hits] | None
     not_known: tuple[int, ...] = ()
-    learned: Learned | None = None
-    without_model: dict[int, int] = field(default_factory=dict)
-    round_ones: tuple[int, ...] = ()
 
 
 def look_for_models(
@@ -170,9 +138,8 @@ def look_for_models(
 
     Each image of the targets is looked at by itself: nothing is told of what is in it, nor of where
     its camera is. Every thing that is named becomes a line of OUT with the belief as its score, as
-    BOP's 6D detection wants it and bop_toolkit reads it. Where scene_gt.json is there, the recall
-    by MSSD and MSPD is printed; the official figures, with VSD, are bop_toolkit's. An interrupted
-    run resumes.
+    BOP's 6D detection wants it and bop_toolkit, which evaluates it, reads it. An interrupted run
+    resumes.
 
     Args:
         dataset: folder of a whole BOP dataset: models/, test/ and the file of its targets.
@@ -180,7 +147,7 @@ def look_for_models(
             nextview_lmo-test.csv.
         how: models and images.
         overwrite: replace OUT.
-        track: follows the images, and the models that are taught.
+        track: follows the images.
 
     Returns:
         What was found.
@@ -199,17 +166,11 @@ def look_for_models(
     read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
-    # a mistake in them is told before any work is done
-    truths = {image: read.true_objects(image) for image in images}
-    learned = None
-    memory = how.models
-    if memory is None:
-        memory, learned = _memory(read, out, how, track)
-    numbers = _numbers_of_things(memory, given, read)
-    system = load(memory, unknown=how.unknown)
+    numbers = _numbers_of_things(how.models, given, read)
+    system = load(how.models, unknown=how.unknown)
 
     left_out: dict[str, str] = {}
-    with only_one(out), unfinished(out, _key(read, memory, how)) as parts:
+    with only_one(out), unfinished(out, _key(read, how)) as parts:
         looks = _looks(read, images, system, numbers, how.camera_poses, parts, left_out)
         track(looks, len(images), "images")
         found = {
@@ -221,7 +182,6 @@ def look_for_models(
             raise DatasetError(
                 f"{dataset}: no image can be looked at: {next(iter(left_out.values()))}"
             )
-        hits = _recall(read, truths, found)
         with new_file(out, overwrite) as new:
             _write(new, found)
 
@@ -233,11 +193,7 @@ def look_for_models(
         sum(len(one.poses) for one in found.values()),
         float(np.mean([one.seconds for one in found.values()])),
         {name: names.count(name) for name in sorted(set(names))},
-        hits,
         tuple(sorted(set(read.models) - set(numbers.values()))),
-        learned,
-        dict(sorted(Counter(n for i in images for n in read.without_model(i)).items())),
-        _round_ones(memory, numbers, read),
     )
 
 
@@ -269,83 +225,15 @@ def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
     return numbers
 
 
-def _memory(
-    dataset: BopDataset,
-    out: Path,
-    how: BopOptions,
-    track: TrackProgress,
-) -> tuple[str, Learned | None]:
-    """The folder of the memory of the models, and what was taught, unless an earlier run did."""
-    folder = out.with_name(f"{out.stem}-memory")
-    if not (folder / CARD).exists():
-        options = TeachingOptions(unit="mm", sensor=how.sensor, seed=how.seed)
-        models = dataset.folder / MODELS_FOLDER
-        return str(folder), learn_things(models, folder, options, track=track)
-
-    if reason := _out_of_date(folder, dataset, how.sensor):
-        raise UsageError(
-            f"{folder}: {reason}; remove it, and the models are taught again, or name the right"
-            " one with --models"
-        )
-    return str(folder), None
-
-
-def _out_of_date(folder: Path, dataset: BopDataset, sensor: str) -> str:
-    """Why the memory that an earlier run taught is not that of the models; "" if it is.
-
-    Models that are not in it may be some that could not be taught: they are told at the end.
-    """
-    taught = _taught(str(folder))
-    if not taught.sensor:
-        return "was taught by an earlier version"
-    if taught.sensor != sensor:
-        return f"was taught for the sensor {taught.sensor}, not for {sensor}"
-    models = {path.stem: path for path in dataset.models.values()}
-    for thing in taught.things:
-        if thing.name not in models:
-            return f"holds the memory of another dataset ({thing.name})"
-        if thing.sha256 != sha256_of(models[thing.name]):
-            return f"was taught with another file than {models[thing.name]} is now"
-    return ""
-
-
-def _taught(memory: str) -> Taught:
-    """What a memory is of."""
-    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
-    assert card.memory is not None
-    return card.memory
-
-
-def _things_of(memory: str) -> list[str]:
-    """Names of the things that a memory knows."""
-    return [thing.name for thing in _taught(memory).things]
-
-
-def _round_ones(
-    memory: str,
-    numbers: dict[str, int],
-    dataset: BopDataset,
-) -> tuple[int, ...]:
-    """Models that can be turned by any angle, of which ``models_info.json`` says nothing."""
-    turned = {
-        numbers[thing.name]
-        for thing in _taught(memory).things
-        if thing.name in numbers and any(not one.order for one in thing.symmetries)
-    }
-    return tuple(
-        number
-        for number in sorted(turned)
-        if not dataset.info[number].symmetries_continuous
-    )
-
-
 def _numbers_of_things(
     memory: str,
     given: dict[str, int],
     dataset: BopDataset,
 ) -> dict[str, int]:
     """The number of each thing that is a model of the dataset, by its name."""
-    things = _things_of(memory)
+    card, _ = open_memory(_card_of(memory))
+    assert card.memory is not None
+    things = [thing.name for thing in card.memory.things]
     for name in given:
         if name not in things:
             raise UsageError(f"--ids: {memory} knows nothing called {one_line(name)}")
@@ -362,8 +250,8 @@ def _numbers_of_things(
     if not numbers:
         raise UsageError(
             f"{memory}: none of its things ({_few(things)}) is called as a model of"
-            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); leave out --models,"
-            " and the models are taught, or say which things they are with --ids NAME=NUMBER"
+            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); say which"
+            " things they are with --ids NAME=NUMBER"
         )
     return numbers
 
@@ -373,9 +261,14 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(one_line(name) for name in names[:MOST_NAMED]) + more
 
 
-def _key(dataset: BopDataset, memory: str, how: BopOptions) -> str:
+def _card_of(memory: str) -> Path | str:
+    """The card of a memory that is named, or given as a folder."""
+    return Path(memory) / CARD if Path(memory).is_dir() else memory
+
+
+def _key(dataset: BopDataset, how: BopOptions) -> str:
     """What the part of each image depends on."""
-    card, _ = open_memory(Path(memory) / CARD if Path(memory).is_dir() else memory)
+    card, _ = open_memory(_card_of(how.models))
     depends = [
         str(dataset.folder.resolve()),
         how.split,
@@ -452,7 +345,7 @@ def _look(
         flat = tuple(in_camera.ravel().tolist())
         poses.append(FoundPose(numbers[name], thing.confidence, flat))
     seconds = time.perf_counter() - begun
-    return FoundInImage(tuple(poses), seconds, captured.size[0], tuple(others))
+    return FoundInImage(tuple(poses), seconds, tuple(others))
 
 
 def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
@@ -475,52 +368,3 @@ def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
                         f"{one.seconds:.6f}",
                     ]
                 )
-
-
-def _recall(
-    dataset: BopDataset,
-    truths: dict[BopImage, tuple[TrueObject, ...] | None],
-    found: dict[BopImage, FoundInImage],
-) -> dict[int, Hits] | None:
-    """Hits of each model that is in the images; None where none of them has a truth.
-
-    Images that could not be looked at count: what is in them is missed.
-    """
-    nothing = FoundInImage((), 0.0, 1)
-    known = {image: true for image, true in truths.items() if true is not None}
-    if not known:
-        return None
-
-    hits: dict[int, Hits] = {}
-    for model in sorted({one.model for true in known.values() for one in true}):
-        mesh = load_mesh(dataset.evaluated_model(model), unit="mm")
-        vertices = (mesh.vertices * mesh.radius + mesh.centre) / MILLIMETRES
-        symmetries = symmetries_of(dataset.info[model])
-        total = NO_HITS
-        for image, true in known.items():
-            there = [one for one in true if one.model == model]
-            if not there:
-                continue
-            one = found.get(image, nothing)
-            poses = [pose for pose in one.poses if pose.model == model]
-            pairs = [[(p.matrix, t.pose) for t in there] for p in poses]
-            surface = [
-                [mssd(*pair, vertices, symmetries) for pair in row] for row in pairs
-            ]
-            projection = [
-                [
-                    mspd(*pair, vertices, symmetries, dataset.camera(image).intrinsics)
-                    for pair in row
-                ]
-                for row in pairs
-            ]
-            total += hits_of(
-                np.array(surface),
-                np.array(projection),
-                [pose.score for pose in poses],
-                [t.counts for t in there],
-                dataset.info[model].diameter,
-                one.width,
-            )
-        hits[model] = total
-    return hits

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.session.episode import Outcome
 from nextview.types import Float
@@ -15,19 +14,16 @@ from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
     Counted,
-    Key,
     Tables,
     corrected,
     measures_of,
-    tests_of,
 )
 from nextview_lab.benchmark.entries import knows_truth
-from nextview_lab.benchmark.published import comparable_classes, published
+from nextview_lab.benchmark.published import published
 from nextview_lab.benchmark.replay import Grid
 from nextview_lab.data import metrics
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.extras import extras
-from nextview_lab.worlds.scene_layout import CLUTTER_LEVELS, clutter_level
 
 with extras():
     import pandas as pd
@@ -51,7 +47,6 @@ ENDS = {
 AFTER = {"accuracy": ("right", ONE), "travel": ("travel", ONE)}
 # thresholds of the curves: from stopping at the first view to taking almost all views
 SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-LEVEL_VIEWS = (2, 3, 5)  # numbers of views after which the policies are compared
 ONE_STEP = "oracle-gain"  # the policy whose lead over the reference defines the gap
 
 
@@ -59,8 +54,7 @@ ONE_STEP = "oracle-gain"  # the policy whose lead over the reference defines the
 class ClassTables(Tables):
     """The results of a benchmark of classes.
 
-    The sets are ``all``; ``class NAME``, the objects of a class; and ``LEVEL clutter``, the scenes
-    of a clutter level.
+    The sets are ``all``, and ``class NAME``, the objects of a class.
 
     Measures at a threshold are ``accuracy``; ``clean_accuracy``, without objects whose identical
     mesh also has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as
@@ -72,9 +66,8 @@ class ClassTables(Tables):
     the lead of a policy over the reference as a share of the lead of ``oracle-gain``. Published
     values have a column of their own, "published".
 
-    Holm's correction is applied to all tests of a measure at the thresholds, to all tests after
-    fixed numbers of views, without policies that know the truth, and to the tests of all clutter
-    levels.
+    Holm's correction is applied to all tests of a measure at the thresholds, and to all tests
+    after fixed numbers of views, without policies that know the truth.
 
     Attributes:
         sweep: the points of the curves of accuracy against views and travel.
@@ -141,14 +134,13 @@ def summarise(
     Returns:
         The tables.
     """
-    families = st.target_families(grid.specs.predictions.names)
-    weights = st.resample_families(families, samples, rng)
+    families = np.arange(len(grid.specs.predictions))
+    weights = st.resample(len(families), samples, rng)
     cells = list(grid.cells())
     counted = Counted.of(_ended(grid, cells), {}, ENDS, families)
     whole = counted.tests(ALL, weights, reference, lambda key: key.measure in TESTED)
     of_measures = [whole[whole["measure"] == measure] for measure in TESTED]
-    parts = [by_level(grid, reference, samples, rng)]
-    parts += [after_views(grid, n_views, weights, reference)] if n_views else []
+    parts = [after_views(grid, n_views, weights, reference)] if n_views else []
     measures = [_measures(grid, cells, counted, weights), *(part for part, _ in parts)]
     tests = [*(corrected([some]) for some in of_measures), *(part for _, part in parts)]
 
@@ -210,7 +202,7 @@ def _measures(
         of_one = by_class.among(here)
         found.append(of_one.measures(class_set(p.classes[index]), weights[:, here]))
 
-    classes = comparable_classes(p)
+    classes = p.classes
     table = pd.concat(found, ignore_index=True)
     keys = table[["set", "policy", "threshold", "measure"]].to_numpy(object).tolist()
     beside = [
@@ -275,56 +267,6 @@ def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns).astype({"threshold": "float64"})
 
 
-def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
-    """Return the clutter level of each scene, from its name, (N,); "" for a single object."""
-    return np.array([clutter_level(name) for name in names])
-
-
-def by_level(
-    grid: Grid,
-    reference: str,
-    samples: int,
-    rng: np.random.Generator,
-) -> Both:
-    """Compare policies in scenes by clutter level, after 1 view and LEVEL_VIEWS views.
-
-    Args:
-        grid: the episodes.
-        reference: name of the reference policy.
-        samples: number of bootstrap samples.
-        rng: source of all random numbers.
-
-    Returns:
-        Measures and tests; empty without scenes.
-    """
-    names = grid.specs.predictions.names
-    level_of = levels_of(names)
-    counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]
-    choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
-    known = [level for level in CLUTTER_LEVELS if level in level_of]
-    levels = [*known, *sorted({*level_of} - {*known, ""})]
-    episodes = _after(grid, choosing, counts) if levels else pd.DataFrame()
-    measures = [measures_of("", [])]
-    tests = [tests_of("", reference, [])]
-
-    for level in levels:
-        mine = np.flatnonzero(level_of == level)
-        families = st.target_families([names[i] for i in mine])
-        weights = st.resample_families(families, samples, rng)
-        rows = episodes[episodes["object"].isin(mine)]
-        counted = Counted.of(rows, AFTER, {}, families)
-        measures.append(counted.measures(f"{level} clutter", weights))
-        tests.append(
-            counted.tests(f"{level} clutter", weights, reference, _chosen_view)
-        )
-    return pd.concat(measures, ignore_index=True), corrected(tests)
-
-
-def _chosen_view(key: Key) -> bool:
-    """Return True if a measure includes a view chosen by the policy."""
-    return key.measure == "accuracy" and key.views > 1
-
-
 def after_views(
     grid: Grid,
     n_views: Sequence[int],
@@ -351,7 +293,7 @@ def after_views(
         for name, paths in grid.paths.items()
         if not paths.fixed or paths.views.shape[1] >= long
     ]
-    families = st.target_families(grid.specs.predictions.names)
+    families = np.arange(len(grid.specs.predictions))
     counted = Counted.of(_after(grid, names, n_views), AFTER, {}, families)
     measures = [counted.measures(ALL, weights), _gap(counted, reference)]
     tests = counted.tests(

@@ -13,7 +13,6 @@ from nextview.policies.baselines import orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import (
-    DEFAULT_POLICY,
     VISIBLE,
     make_policy,
     map_policy,
@@ -26,7 +25,6 @@ from nextview.types import Index
 from nextview_lab.benchmark.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview_lab.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.scene_views import SceneSight
 from nextview_lab.errors import EntryError
 
 
@@ -38,13 +36,11 @@ class EpisodeSpecs:
         predictions: of all objects from every view.
         objects: object of each episode, (E,).
         starts: first view of each, (E,).
-        scenes: occluders of the objects; None without occlusion.
     """
 
     predictions: Predictions
     objects: Index
     starts: Index
-    scenes: SceneSight | None = None
 
     @property
     def labels(self) -> Index:
@@ -108,15 +104,8 @@ def knows_truth(entry: str) -> bool:
     return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
 
 
-# additional entries in scenes with occlusion
-IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT_POLICY}", "true-visible_share-all")
-
-
 def default_entries(specs: EpisodeSpecs) -> list[str]:
-    """Return all entries that these predictions allow.
-
-    Fixed views ignore reachability, so they are not used in scenes.
-    """
+    """Return all entries that these predictions allow."""
     sphere = specs.predictions.sphere
     n = sphere.azimuths
     v = len(sphere)
@@ -131,13 +120,7 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
         *(each for name in maps for each in (name, f"{name}-peak")),
         MORE,
     ]
-    names = [
-        name
-        for name in (*names, *bundled_policies(), *ORACLES)
-        if name not in IN_SCENES
-    ]
-    if specs.scenes is not None:
-        return [name for name in (*names, *IN_SCENES) if _ready(name, specs)]
+    names += [*bundled_policies(), *ORACLES]
     names = [name for name in names if _ready(name, specs)]
     names += [f"{kind}-{min(5, v)}" for kind in FIXED_ENTRIES if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
@@ -158,7 +141,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """
     policy = _make(name, specs)
     p = specs.predictions
-    there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
+    there = {*p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
     there |= {"joint"} if p.calibration.hypotheses else set()
     lacking = [wanted for wanted in policy.needs if wanted not in there]
@@ -166,6 +149,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
         known = {
             "azimuth_bins": "what the recogniser says of the azimuth bins",
             "observations": "the depth of the views",
+            "visibility": "depth frames of what stands around the object",
         }
         what = known.get(lacking[0], f"the map {lacking[0]!r}")
         raise EntryError(f"policy {name} needs {what}, which these predictions lack")

@@ -3,24 +3,18 @@
 Importing this module registers them:
 
 - ``nextview/Recognise-v0``: replays a file of predictions, without rendering.
-- ``nextview/RecogniseMesh-v0``: renders meshes and runs the networks as the agent moves.
 - ``nextview/RecogniseThings-v0``: taught things with known geometry, see ``thing_environment``.
 """
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from nextview.checks import number, one_line, whole
-from nextview.data.folders import list_dataset
-from nextview.data.samples import SAMPLE_MESHES, sample_mesh
-from nextview.errors import DatasetError, SessionError, UsageError
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.errors import SessionError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState
 from nextview.policies.gain import (
@@ -35,13 +29,9 @@ from nextview.policies.gain import (
 )
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
-from nextview.recognition.evidence import Evidence
-from nextview.recognition.inference import Models, NetworkRecogniser, open_maps
 from nextview.recognition.map_names import in_order
-from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
-from nextview.simulation.simulated import SimulatedCamera
-from nextview.types import Float, Float32, Index
+from nextview.types import Float, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
@@ -52,10 +42,8 @@ with extras():
 
 log = logging.getLogger(__name__)
 PredictionsSource = str | Path | Predictions
-CAMERAS = 16  # meshes that are cached
 _HERE = "nextview_lab.benchmark.environments"
 gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv")
-gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
 gymnasium.register(
     "nextview/RecogniseThings-v0",
     "nextview_lab.benchmark.thing_environment:RecogniseThingsEnv",
@@ -129,141 +117,27 @@ class AfterAction(Stopping):
         return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
 
 
-def rows(values: Any, n: int, below: int, what: str) -> Index:
-    """Check integers chosen by an agent or a user.
+def whole_number(value: Any, below: int, what: str) -> int:
+    """Check a number chosen by an agent or a user.
 
     Args:
-        values: the numbers; one number for one row.
-        n: expected number of them.
+        value: the number.
         below: upper limit, exclusive; the lower limit is 0.
-        what: name of the numbers in the error message.
-
-    Returns:
-        The numbers, (n,) int64.
+        what: name of the number in the error message.
 
     Raises:
-        UsageError: they are not n such numbers.
+        UsageError: it is no such number.
     """
-    array = np.atleast_1d(np.asarray(values))
+    array = np.asarray(value)
     if (
-        array.shape != (n,)
+        array.size != 1
         or array.dtype.kind not in "iu"
-        or not ((array >= 0) & (array < below)).all()
+        or not 0 <= int(array.item()) < below
     ):
-        many = "a whole number" if n == 1 else f"{n} whole numbers"
         raise UsageError(
-            f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}"
+            f"{what}: a whole number from 0 to {below - 1}, not {one_line(repr(value))}"
         )
-    return array.astype(np.int64)
-
-
-@dataclass(frozen=True)
-class EnvironmentTask:
-    """N objects, their views, and the rules.
-
-    Attributes:
-        labels: true class of each object, (N,).
-        classes: names of the classes.
-        sphere: of the views.
-        calibration: from summed evidence to the belief.
-        observe: from objects, (A,), and views, (A,), to the evidence of each view.
-        rules: of an episode.
-        balanced: whether all classes are drawn equally often.
-    """
-
-    labels: Index
-    classes: tuple[str, ...]
-    sphere: ViewSphere
-    calibration: Calibration
-    observe: Callable[[Index, Index], Evidence] = field(repr=False)
-    rules: Rules = Rules()
-    balanced: bool = False
-
-    @property
-    def observation_space(self) -> gymnasium.spaces.Box:
-        """Space of ``policies.gain.features``, (D,) float32; all but the maps are in 0 to 1."""
-        c = len(self.classes)
-        rules = self.rules
-        widths = {
-            name: len(mirrored_features(self.sphere, c, (name,), rules.frame))
-            for name in ordered(rules.inputs)
-        }
-        high = np.concatenate(
-            [
-                np.full(wide, MAP_LIMIT if name in rules.maps else 1.0)
-                for name, wide in widths.items()
-            ]
-        )
-
-        return gymnasium.spaces.Box(
-            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
-            high.astype(np.float32),
-        )
-
-
-def replayed(
-    predictions: PredictionsSource,
-    split: EnvironmentSplit = "train",
-    balanced: bool = False,
-    rules: Rules = Rules(),
-) -> EnvironmentTask:
-    """Create the task of recognising the objects of predictions.
-
-    Train on objects that the recogniser was not trained on (``nextview-lab predict --held-out``).
-    Predictions without splits, such as those of taught things, are all used for "train".
-
-    Args:
-        predictions: the predictions, or their path.
-        split: "train" (each shape once), "test", or None for all objects.
-        balanced: whether all classes are drawn equally often.
-        rules: of the episodes.
-
-    Returns:
-        The task.
-
-    Raises:
-        PredictionsError: there are no objects of the split, or a map or the azimuth bins are
-            missing.
-    """
-    p = (
-        predictions
-        if isinstance(predictions, Predictions)
-        else Predictions.load(Path(predictions))
-    )
-    if split == "train" and not p.splits.any():
-        log.warning(
-            "the predictions name no splits, as those of taught things: all %d objects are taken",
-            len(p),
-        )
-        split = None
-
-    p = p if split is None else p.of_split(split)
-    p = p.deduplicate() if split == "train" else p
-
-    for name in rules.maps:
-        if name not in p.maps:
-            known = ", ".join((*INPUTS, *in_order(p.maps)))
-            raise PredictionsError(
-                f"these predictions hold no map {name!r}; inputs are some of {known}"
-            )
-
-    if (
-        "azimuth_bin" in rules.inputs or rules.frame == "object"
-    ) and p.azimuth_bins is None:
-        raise PredictionsError(
-            "these predictions hold no azimuth bins, which the inputs or the frame need"
-        )
-
-    p = replace(p, maps={name: p.maps[name] for name in rules.maps})
-    return EnvironmentTask(
-        p.labels,
-        p.classes,
-        p.sphere,
-        p.calibration,
-        p.evidence,
-        rules,
-        balanced,
-    )
+    return int(array.item())
 
 
 @dataclass
@@ -349,7 +223,7 @@ class ViewsEnv(gymnasium.Env[Any, Any]):
         """Take a view; see Gymnasium."""
         if self.reached is None:
             raise SessionError("no episode is under way; call reset")
-        chosen = int(rows(action, 1, len(self.sphere), "action")[0])
+        chosen = whole_number(action, len(self.sphere), "action")
         away = self.sphere.travel[self.reached[chosen]].copy()
         away[self.views] = np.inf
         view = int(away.argmin())
@@ -375,22 +249,84 @@ class ViewsEnv(gymnasium.Env[Any, Any]):
         """
         found = {name: self.np_random.integers(most) for name, most in below.items()}
         given = found | options
-        return [
-            int(rows(given[name], 1, most, name)[0]) for name, most in below.items()
-        ]
+        return [whole_number(given[name], most, name) for name, most in below.items()]
 
 
-class TaskEnv(ViewsEnv):
-    """A task as an environment.
+class RecogniseEnv(ViewsEnv):
+    """Recognise an object from few views that are looked up in predictions.
 
+    Train on objects that the recogniser was not trained on (``nextview-lab predict --held-out``).
     The info holds "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
     "prediction_target" and "action_mask", the actions that lead to an unvisited view, (V,) int8.
     """
 
-    def __init__(self, task: EnvironmentTask) -> None:
-        super().__init__(task.sphere, task.rules)
-        self.task = task
-        self.observation_space = task.observation_space
+    def __init__(
+        self,
+        predictions: PredictionsSource,
+        split: EnvironmentSplit = "train",
+        balanced: bool = False,
+        **rules: Any,
+    ) -> None:
+        """Take the objects of predictions.
+
+        Args:
+            predictions: the predictions, or their path. Those without splits, such as those of
+                taught things, are all used for "train".
+            split: "train" (each shape once), "test", or None for all objects.
+            balanced: whether all classes are drawn equally often.
+            rules: arguments of ``Rules``.
+
+        Raises:
+            PredictionsError: there are no objects of the split, or a map or the azimuth bins are
+                missing.
+        """
+        given = Rules(**rules)
+        p = (
+            predictions
+            if isinstance(predictions, Predictions)
+            else Predictions.load(Path(predictions))
+        )
+        if split == "train" and not p.splits.any():
+            log.warning(
+                "the predictions name no splits, as those of taught things: all %d objects are"
+                " taken",
+                len(p),
+            )
+            split = None
+
+        p = p if split is None else p.of_split(split)
+        p = p.deduplicate() if split == "train" else p
+        for name in given.maps:
+            if name not in p.maps:
+                known = ", ".join((*INPUTS, *in_order(p.maps)))
+                raise PredictionsError(
+                    f"these predictions hold no map {name!r}; inputs are some of {known}"
+                )
+        if p.azimuth_bins is None and (
+            "azimuth_bin" in given.inputs or given.frame == "object"
+        ):
+            raise PredictionsError(
+                "these predictions hold no azimuth bins, which the inputs or the frame need"
+            )
+
+        super().__init__(p.sphere, given)
+        self.predictions = replace(p, maps={name: p.maps[name] for name in given.maps})
+        self.balanced = balanced
+        c = len(p.classes)
+        high = np.concatenate(
+            [
+                np.full(
+                    len(mirrored_features(p.sphere, c, (name,), given.frame)),
+                    MAP_LIMIT if name in given.maps else 1.0,
+                )
+                for name in ordered(given.inputs)
+            ]
+        )
+        # of ``policies.gain.features``, (D,); all but the maps are in 0 to 1
+        self.observation_space = gymnasium.spaces.Box(
+            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
+            high.astype(np.float32),
+        )
 
     def begin(self, options: Info) -> int:
         """Begin an episode; see ``ViewsEnv``.
@@ -398,21 +334,21 @@ class TaskEnv(ViewsEnv):
         Args:
             options: "object" and "start".
         """
-        task = self.task
-        weight = 1 / np.bincount(task.labels)[task.labels]
-        chance = weight / weight.sum() if task.balanced else None
-        object_ = {"object": self.np_random.choice(len(task.labels), p=chance)}
-        below = {"object": len(task.labels), "start": len(task.sphere)}
+        p = self.predictions
+        weight = 1 / np.bincount(p.labels)[p.labels]
+        chance = weight / weight.sum() if self.balanced else None
+        object_ = {"object": self.np_random.choice(len(p), p=chance)}
+        below = {"object": len(p), "start": len(p.sphere)}
         number, start = self.drawn(object_ | options, below)
         self._objects = np.array([number])
-        self._asked = Asked(task.sphere, start)
+        self._asked = Asked(p.sphere, start)
         self._episodes = Episodes(
-            task.sphere,
+            p.sphere,
             self._asked,
             np.array([start]),
-            task.rules.stopping(task.calibration),
+            self.rules.stopping(p.calibration),
             np.random.default_rng(0),  # not used for any draw
-            task.calibration,
+            p.calibration,
         )
         return start
 
@@ -426,15 +362,15 @@ class TaskEnv(ViewsEnv):
         if episodes.steps:
             self._asked.view = view
             episodes.keep_choice(episodes.next_choice())
-        task = self.task
-        calibration = task.calibration
+        p = self.predictions
+        calibration = p.calibration
         here = np.array([view])
-        step = episodes.update(task.observe(self._objects, here))
+        step = episodes.update(p.evidence(self._objects, here))
         n_seen = np.maximum(step.seen, 1)
-        visited = np.zeros((1, len(task.sphere)), bool)
+        visited = np.zeros((1, len(p.sphere)), bool)
         visited[0, self.views] = True
-        labels = task.labels[self._objects]
-        classes = len(task.classes)
+        labels = p.labels[self._objects]
+        classes = len(p.classes)
         state = EpisodeState(
             here,
             visited,
@@ -443,14 +379,14 @@ class TaskEnv(ViewsEnv):
             len(self.views),
             np.zeros(1, np.int64),
             calibration.azimuth_bins(
-                step.total, n_seen, classes, task.sphere.azimuth[here]
+                step.total, n_seen, classes, p.sphere.azimuth[here]
             ),
         )
         logs = calibration.log_belief(step.total, n_seen, classes)
-        value = float(value_of(logs, labels, task.rules.objective)[0])
-        inputs, frame = task.rules.inputs, task.rules.frame
-        reached = cells_from(task.sphere)[origin(task.sphere, state, frame)][0]
-        seen = features(task.sphere, state, inputs, frame)[0].astype(np.float32)
+        value = float(value_of(logs, labels, self.rules.objective)[0])
+        inputs, frame = self.rules.inputs, self.rules.frame
+        reached = cells_from(p.sphere)[origin(p.sphere, state, frame)][0]
+        seen = features(p.sphere, state, inputs, frame)[0].astype(np.float32)
         info = {
             "object": self._objects[0],
             "view": view,
@@ -462,127 +398,4 @@ class TaskEnv(ViewsEnv):
             "action_mask": (~visited[0, reached]).astype(np.int8),
         }
         going = reached if len(episodes.running) else None
-        return self.observed(seen), value, going, info
-
-    def observed(self, state: Float32) -> Any:
-        """Return the observation with a state, (D,)."""
-        return state
-
-
-class RecogniseEnv(TaskEnv):
-    """Recognise an object from few views that are looked up in predictions; see ``replayed``.
-
-    ``rules`` are the arguments of ``Rules``.
-    """
-
-    def __init__(
-        self,
-        predictions: PredictionsSource,
-        split: EnvironmentSplit = "train",
-        balanced: bool = False,
-        **rules: Any,
-    ) -> None:
-        super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
-
-
-class RecogniseMeshEnv(TaskEnv):
-    """Recognise an object from few rendered views of its mesh.
-
-    Args:
-        meshes: folder CLASS/train|test/MESH or CLASS/MESH; by default the samples.
-        split: "train" or "test"; None for folders without splits, such as the samples.
-        models: name of bundled models, or a folder.
-        viewpoints: layout of ``ViewSphere.named``.
-        depth: return observations {"state": (D,), "depth": (size, size) float32, object radii, 0
-            for the background}.
-        size: side of the images, pixels, a multiple of the input size of the networks, which is 112
-            for the bundled ones.
-        balanced: draw all classes equally often.
-        rules: arguments of ``Rules``.
-
-    Raises:
-        DatasetError: there are no such meshes, or the recogniser does not know a class.
-    """
-
-    def __init__(
-        self,
-        meshes: str | Path | None = None,
-        split: EnvironmentSplit = "train",
-        models: str | Path = "modelnet10",
-        viewpoints: str = "40",
-        depth: bool = False,
-        size: int = 224,
-        balanced: bool = False,
-        **rules: Any,
-    ) -> None:
-        whole(size, "the side of an image", 1)
-        given = Rules(**rules)
-        found = find_models(models)
-        sphere = ViewSphere.named(viewpoints)
-
-        self._models = Models(
-            NetworkRecogniser(found.recogniser),
-            open_maps(found.maps, given.maps),
-        )
-        classes = self._models.classes
-        calibration = self._models.recogniser.calibration
-
-        objects: list[tuple[str, Callable[[], Mesh]]] = [
-            (name, partial(sample_mesh, name)) for name in SAMPLE_MESHES
-        ]
-        if meshes is not None:
-            entries = [
-                e for e in list_dataset(Path(meshes)) if split in (None, e.split)
-            ]
-            objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
-
-        if not objects:
-            raise DatasetError(
-                f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that"
-                " there are"
-            )
-        for label, _ in objects:
-            if label not in classes:
-                raise DatasetError(
-                    f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}"
-                )
-
-        labels = np.array([classes.index(label) for label, _ in objects])
-        self._camera = lru_cache(CAMERAS)(
-            lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
-        )
-        super().__init__(
-            EnvironmentTask(
-                labels,
-                classes,
-                sphere,
-                calibration,
-                self._rendered,
-                given,
-                balanced,
-            )
-        )
-
-        self._depth = depth
-        if depth:
-            image = gymnasium.spaces.Box(
-                0,
-                np.float32(sphere.distance + 1),
-                (size, size),
-            )
-            self.observation_space = gymnasium.spaces.Dict(
-                {"state": self.task.observation_space, "depth": image}
-            )
-
-    def _rendered(self, objects: Index, views: Index) -> Evidence:
-        poses = self.task.sphere.poses
-        seen = [
-            self._camera(int(k)).observe(poses[v])
-            for k, v in zip(objects, views, strict=True)
-        ]
-        self._last = seen[-1]
-        return self._models.evidence(seen)
-
-    def observed(self, state: Float32) -> Any:
-        """Return the state, with the depth image if requested."""
-        return {"state": state, "depth": self._last.depth} if self._depth else state
+        return seen, value, going, info

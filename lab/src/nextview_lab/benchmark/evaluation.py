@@ -14,7 +14,6 @@ from nextview.recognition.model_card import ModelCard
 from nextview.types import Float, Float32, Floats, Index, Mask
 from nextview_lab.benchmark import statistics as st
 from nextview_lab.benchmark.published import (
-    comparable_classes,
     published_map,
     published_recognisers,
 )
@@ -195,7 +194,7 @@ def _accuracy(
     one = np.ones(len(p))
     clean = np.where(p.conflicting, 0.0, 1.0)
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
-    best = published_recognisers(comparable_classes(p), len(p.sphere))
+    best = published_recognisers(p.classes, len(p.sphere))
 
     rows = []
     for n_views, logits in judged.items():
@@ -403,7 +402,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
                         beside = published_map(
                             name,
                             over + measure,
-                            comparable_classes(p),
+                            p.classes,
                             label or None,
                         )
                     rows.append(

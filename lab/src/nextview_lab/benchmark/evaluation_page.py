@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 from msgspec.structs import replace
 
 from nextview.errors import ModelError
@@ -15,8 +14,8 @@ from nextview.recognition.model_card import find_card, read_card, write_card
 from nextview_lab.benchmark import figures as draw
 from nextview_lab.benchmark.classes import chosen_split
 from nextview_lab.benchmark.evaluation import Evaluation, evaluate, scores_for_card
-from nextview_lab.benchmark.page import numbers, origin, picture, render, write_figures
-from nextview_lab.benchmark.published import comparable_classes, published_recognisers
+from nextview_lab.benchmark.page import numbers, origin, picture, render
+from nextview_lab.benchmark.published import published_recognisers
 from nextview_lab.data.predictions import Predictions
 
 
@@ -45,7 +44,6 @@ def write_evaluation(
     out: Path,
     settings: EvaluationSettings = EvaluationSettings(),
     *,
-    figures: Path | None = None,
     overwrite: bool = False,
 ) -> Evaluation:
     """Evaluate a recogniser and its maps on every view, and compare with published scores.
@@ -53,15 +51,13 @@ def write_evaluation(
     Args:
         predictions: predictions of nextview-lab predict.
         out: folder for tables (.csv), settings and evaluate.html.
-        figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
         overwrite: replace an earlier evaluation.
 
     Raises:
         UsageError: the predictions contain several splits, and none is selected.
         ResultsError: there is nothing to evaluate, or a card belongs to another model.
     """
-    for folder in filter(None, (out, figures)):
-        check_new(folder, overwrite, folder=True)
+    check_new(out, overwrite, folder=True)
     p = chosen_split(Predictions.load(predictions), predictions, settings.split)
     p = p.deduplicate() if settings.deduplicate else p
     noted = {}
@@ -92,8 +88,6 @@ def write_evaluation(
             json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n"
         )
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
-    if figures is not None:
-        write_figures(figures, _figures(found, p), found.tables(), overwrite)
     for path, (sha256, scores) in noted.items():
         with only_one(path):
             card = read_card(path)  # it may have changed
@@ -104,15 +98,6 @@ def write_evaluation(
             write_card(path, replace(card, scores={**card.scores, **scores}))
 
     return found
-
-
-def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
-    return {
-        "fusion": draw.fusion_curve(e),
-        "reliability": draw.evaluated_reliability(e),
-        "confusion_one_view": draw.evaluated_confusion(e, 1, p.classes),
-        "confusion_all_views": draw.evaluated_confusion(e, len(p.sphere), p.classes),
-    }
 
 
 def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
@@ -148,7 +133,7 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
         p=p,
         found=numbers(e.accuracy, "n_views", "label", "measure"),
         counts=counts.to_dict(),
-        published=published_recognisers(comparable_classes(p), v),
+        published=published_recognisers(p.classes, v),
         errors=curve["calibration_error"],
         fused_views=", ".join(
             f"{k}: {curve.accuracy[k]:.3f}"
@@ -164,7 +149,14 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
             for kind, rows in e.maps.groupby("map", sort=False)
         },
         baselines=[by for by in e.maps["by"].unique() if by != "network"],
-        figures={name: picture(figure) for name, figure in _figures(e, p).items()},
+        figures={
+            "fusion": picture(draw.fusion_curve(e)),
+            "reliability": picture(draw.evaluated_reliability(e)),
+            "confusion_one_view": picture(draw.evaluated_confusion(e, 1, p.classes)),
+            "confusion_all_views": picture(
+                draw.evaluated_confusion(e, len(p.sphere), p.classes)
+            ),
+        },
         left_out=e.left_out,
         made=made,
     )

@@ -4,15 +4,12 @@ An archive is a folder. ``manifest.json`` names every other file with its SHA-25
 with that of its pixels; the SHA-256 of the manifest is that of the archive. ``things.json`` lists
 the things that may be shown, ``episodes/NUMBER/`` holds the candidate views of one thing in one
 place, and ``truth/NUMBER.json`` what it is and where it lies. Only ``truth`` reads the latter.
-
-Episodes without such a file are sealed: their truth is in one file that whoever made the archive
-keeps, and whose SHA-256 is in the manifest.
 """
 
 import hashlib
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +20,6 @@ from nextview.files import (
     HashText,
     checked_bytes,
     decode_record,
-    read_record,
     regular_file,
     sha256_of,
     write_record,
@@ -52,7 +48,7 @@ class FrozenManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         made_with: versions of the libraries by name, with which it can be made again.
         files: SHA-256 of every other file, by its path in the archive; of a PNG that of its pixels
             (``pixels_sha256``).
-        sealed: SHA-256 of the file with the truth of the sealed episodes; None where none are.
+        sealed: None: the truth of all episodes is in the archive.
     """
 
     format: int
@@ -60,7 +56,7 @@ class FrozenManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int
     made_with: dict[str, str]
     files: dict[str, HashText]
-    sealed: HashText | None = None
+    sealed: None = None
 
 
 class FrozenThing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,18 +110,6 @@ class EpisodeTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pose: Matrix
     cameras: tuple[Matrix, ...]
     pixels: tuple[int, ...]
-
-
-class SealedTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the sealed episodes show: a file that is not in the archive.
-
-    Attributes:
-        secret: that they were drawn with instead of the seed, 32 hexadecimal digits.
-        episodes: what each shows, by its number.
-    """
-
-    secret: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-    episodes: dict[str, EpisodeTruth]
 
 
 class FrozenView(NamedTuple):
@@ -265,66 +249,23 @@ class FrozenArchive:
                 raise changed(image)
         return FrozenView(*(self.folder / name for name in names))
 
-    def truth(self, number: str) -> EpisodeTruth:
-        """Read what an episode shows, which no method may.
-
-        Args:
-            number: of the episode.
+    def truths(self) -> dict[str, EpisodeTruth]:
+        """Read what the episodes show, which no method may, by their numbers.
 
         Raises:
             DatasetError: a file is damaged.
         """
+        return {number: self._truth(number) for number in self.numbers}
+
+    def _truth(self, number: str) -> EpisodeTruth:
+        """Read what an episode shows; DatasetError."""
         where = f"{TRUTH_FOLDER}/{number}.json"
         truth: EpisodeTruth = self._record(where, EpisodeTruth)
-        return self._checked(truth, str(self.folder / where))
-
-    def truths(self, sealed: Path | None = None) -> dict[str, EpisodeTruth]:
-        """Read what the episodes show, by their numbers.
-
-        Args:
-            sealed: file with the truth of the sealed episodes; only these are read then.
-
-        Raises:
-            DatasetError: a file is damaged, or belongs to another archive; or there is no such
-                episode.
-        """
-        hidden = [number for number in self.numbers if not self.is_open(number)]
-        if sealed is None:
-            if len(hidden) == len(self.numbers):
-                raise DatasetError(
-                    f"{self.folder}: all episodes are sealed; give their truth (--truth)"
-                )
-            return {one: self.truth(one) for one in self.numbers if self.is_open(one)}
-
-        regular_file(sealed, "the truth of sealed episodes", DatasetError)
-        if self.manifest.sealed is None or sha256_of(sealed) != self.manifest.sealed:
-            raise DatasetError(
-                f"{sealed}: is not the truth of the sealed episodes of {self.manifest.name}, whose"
-                " SHA-256 is in the manifest"
-            )
-        read = read_record(
-            sealed, SealedTruth, "the truth of sealed episodes", DatasetError
-        )
-        if sorted(read.episodes) != hidden:
-            raise DatasetError(f"{sealed}: its episodes are not those that are sealed")
-        return {
-            number: self._checked(read.episodes[number], f"{sealed}, episode {number}")
-            for number in hidden
-        }
-
-    def is_open(self, number: str) -> bool:
-        """Whether the truth of an episode is in the archive.
-
-        Args:
-            number: of the episode.
-        """
-        return f"{TRUTH_FOLDER}/{number}.json" in self.manifest.files
-
-    def _checked(self, truth: EpisodeTruth, where: str) -> EpisodeTruth:
-        """Return a truth whose pose is rigid, and whose thing is known; DatasetError."""
-        rigid(truth.pose, where)
+        rigid(truth.pose, str(self.folder / where))
         if truth.thing not in self.things:
-            raise DatasetError(f"{where}: its thing is not in {THINGS_FILE}")
+            raise DatasetError(
+                f"{self.folder / where}: its thing is not in {THINGS_FILE}"
+            )
         return truth
 
     def scan(self, name: str) -> Path:
@@ -396,7 +337,6 @@ def seal(
     name: str,
     seed: int,
     made_with: dict[str, str],
-    sealed: str | None = None,
 ) -> str:
     """Write the manifest of an archive, which makes it whole.
 
@@ -405,7 +345,6 @@ def seal(
         name: of the archive, with its version.
         seed: of everything random in it.
         made_with: versions of the libraries by name.
-        sealed: SHA-256 of the file with the truth of the sealed episodes; None where none are.
 
     Returns:
         The SHA-256 of the archive.
@@ -419,7 +358,7 @@ def seal(
         if path.is_file() and not any(part.startswith(".") for part in place.parts):
             hashed = pixels_sha256 if path.suffix == ".png" else sha256_of
             files[place.as_posix()] = hashed(path)
-    manifest = FrozenManifest(FROZEN_FORMAT, name, seed, made_with, files, sealed)
+    manifest = FrozenManifest(FROZEN_FORMAT, name, seed, made_with, files)
     write_record(folder / MANIFEST, manifest)
     return sha256_of(folder / MANIFEST)
 

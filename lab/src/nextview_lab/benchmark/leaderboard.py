@@ -84,50 +84,6 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
     )
 
 
-def levels_in(tables: Tables) -> dict[str, dict[str, Any]]:
-    """Return the results in scenes after numbers of views, by clutter level.
-
-    Returns:
-        For each level "views"; "policies", realisable ones first; "values", see ``values_of``; and
-        "tests" by policy and number of views.
-    """
-    found = {}
-    after = tables.measures.query("set != @ALL and views > 0")
-    for name, rows in after.groupby("set", sort=False):
-        tests = tables.tests[tables.tests["set"] == name]
-        found[str(name)] = {
-            "views": rows["views"].unique().tolist(),
-            "policies": sorted(rows["policy"].unique(), key=is_oracle),
-            "values": values_of(tables.measures, str(name)),
-            "tests": tests.set_index(["policy", "views"]).to_dict("index"),
-        }
-    return found
-
-
-def level_differences(tables: ClassTables, reference: str) -> str | None:
-    """Return a sentence that names the policies that differ significantly in scenes.
-
-    Args:
-        tables: of the benchmark.
-        reference: name of the reference policy.
-
-    Returns:
-        The sentence; None if no realisable policy differs.
-    """
-    tests = tables.tests.query("set != @ALL and p_holm < @SIGNIFICANT")
-    rows = tests[["policy", "difference", "views", "set"]].to_numpy(object).tolist()
-    found = [
-        f"{policy} by {100 * difference:+.1f} points after {views} views under {name}"
-        for policy, difference, views, name in rows
-        if not is_oracle(policy)
-    ]
-    return (
-        f"With no threshold, significantly different from {reference}: {'; '.join(found)}."
-        if found
-        else None
-    )
-
-
 def nothing_differs(
     tables: ClassTables,
     threshold: float,

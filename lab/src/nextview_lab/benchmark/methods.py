@@ -159,7 +159,7 @@ class NextviewMethod:
 
         self._things = frozenset(things)
         self._system = load(
-            models, policy="random-all", stopping=_never, max_views=1000, threads=1
+            models, policy="random-all", stopping=never, max_views=1000, threads=1
         )
         if not self._things & set(self._system.classes):
             raise UsageError(f"{models}: knows none of the things of the archive")
@@ -272,7 +272,7 @@ def aimed_at(poses: Float) -> Float:
     return np.linalg.solve(total, (across @ places[:, :, None]).sum(0)[:, 0])
 
 
-def _never(believed: Any, threshold: float) -> Mask:
+def never(believed: Any, threshold: float) -> Mask:
     """Stop never: an episode has as many views as were asked for."""
     return np.zeros(np.shape(believed.highest), bool)
 

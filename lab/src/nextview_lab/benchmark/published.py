@@ -7,8 +7,6 @@ from importlib.resources import files
 import numpy as np
 
 from nextview.recognition.map_names import LCM, LEM
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.worlds.scene_layout import clutter_level
 
 PUBLISHED_COLUMNS = {  # policies of tables 5, 8 to 11 under their published names
     "random": "random",
@@ -56,11 +54,6 @@ def published_classes(classes: tuple[str, ...]) -> int | None:
     """Return 10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; else None."""
     n = len(classes)
     return n if n in ACCURACY and set(classes) == set(read_table(ACCURACY[n])) else None
-
-
-def comparable_classes(p: Predictions) -> tuple[str, ...]:
-    """Return the classes for which there are published results; empty for scenes."""
-    return () if any(map(clutter_level, p.names)) else p.classes
 
 
 def published_threshold(policy: str) -> float | None:

@@ -21,7 +21,6 @@ from nextview.types import Float, Index, Mask
 from nextview_lab.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
 from nextview_lab.benchmark.true_maps import TRUE, true_map
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.scene_views import scenes_of, sight_of
 from nextview_lab.errors import EntryError
 
 THESIS_THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # of the thesis (section 5.3)
@@ -56,7 +55,7 @@ class Trajectories:
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     """Create episodes with every object, from random first views.
 
-    In scenes, first views are reachable. The index of an episode is run * objects + object.
+    The index of an episode is run * objects + object.
 
     Args:
         predictions: of the N objects.
@@ -73,16 +72,8 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
         raise UsageError(f"at least one run is needed, not {runs}")
     n = len(predictions)
     rng = np.random.default_rng([seed])
-    scenes = scenes_of(predictions)
     starts = rng.integers(len(predictions.sphere), size=runs * n)
-    objects = np.tile(np.arange(n), runs)
-    if scenes is not None:
-        starts = np.where(
-            scenes.reachable[objects],
-            rng.random((len(objects), len(predictions.sphere))),
-            -1,
-        ).argmax(1)
-    return EpisodeSpecs(predictions, objects, starts, scenes)
+    return EpisodeSpecs(predictions, np.tile(np.arange(n), runs), starts)
 
 
 def replay(
@@ -175,7 +166,6 @@ def replay_policy(
     def observe(which: Index, views: Index) -> Evidence:
         return p.evidence(objects[which], views)
 
-    sight = sight_of(specs.scenes, objects)
     try:
         done = run_episodes(
             observe,
@@ -185,7 +175,6 @@ def replay_policy(
             stopping,
             rng,
             p.calibration,
-            *sight,
         )
     except PolicyError as error:
         where = (

@@ -1,7 +1,6 @@
 """Write a self-contained HTML report from a folder of benchmark results."""
 
 import base64
-from collections import Counter
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -14,12 +13,11 @@ from PIL import Image
 
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
-from nextview.geometry.depth import headlight
 from nextview.policies.registry import DEFAULT_POLICY
 from nextview.recognition.map_names import LEM
 from nextview_lab.benchmark import figures as draw
 from nextview_lab.benchmark import leaderboard as board
-from nextview_lab.benchmark.class_tables import ClassResults, class_set, levels_of
+from nextview_lab.benchmark.class_tables import ClassResults, class_set
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview_lab.benchmark.entries import is_oracle
@@ -27,7 +25,6 @@ from nextview_lab.benchmark.page import numbers, origin, picture, render, write_
 from nextview_lab.benchmark.published import PUBLISHED_COLUMNS, published_threshold
 from nextview_lab.benchmark.true_maps import stored_rows
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.scene_views import scene_views
 from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import EntryError
 from nextview_lab.extras import extras
@@ -36,8 +33,6 @@ with extras():
     import pandas as pd
 
 REPORT_PICTURE = 112  # side of a view's image, pixels
-# colours of background, target, other objects and table
-OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
 
 
 def report(
@@ -183,9 +178,6 @@ def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
         tests=tests,
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few_objects(t, at, len(p)),
-        levels=board.levels_in(t),
-        scenes=Counter(f"{level} clutter" for level in levels_of(p.names)),
-        level_differences=board.level_differences(t, reference),
         risks=board.promised_risks(t, s["risks"]),
         by_class_at=_thresholds(results, at),
         fixed_at=fixed_at,
@@ -240,12 +232,7 @@ def _figures(results: ClassResults, best: str, at: float) -> dict[str, Figure]:
 
 
 def _thresholds(results: ClassResults, at: float) -> dict[str, float]:
-    """Return policies by class at their published thresholds (tables 8 to 11).
-
-    Empty for scenes, for which nothing is published.
-    """
-    if any(levels_of(results.predictions.names)):
-        return {name: at for name in draw.compared(results) if not is_oracle(name)}
+    """Return policies by class at their published thresholds (tables 8 to 11)."""
     ran = set(results.tables.sweep["policy"])
     thresholds = results.settings["thresholds"]
     wanted = {
@@ -351,24 +338,9 @@ def pictures_of(
 
 
 def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Return images of views as data URIs; in scenes the target is highlighted."""
+    """Return images of views as data URIs."""
     row = store.names.index(name)
     images: NDArray = store.image(row)
-
-    if store.attributes.scene:
-        scene = scene_views(store, row)
-        shade = (
-            np.stack([headlight(depth, scene.intrinsics) for depth in scene.depth])[
-                ...,
-                None,
-            ]
-            / 255
-        )
-        images = np.where(
-            scene.owner[..., None] > 0,
-            OWNERS[scene.owner] * (0.35 + 0.65 * shade),
-            255,
-        ).astype(np.uint8)
 
     found = {}
     for view in views:

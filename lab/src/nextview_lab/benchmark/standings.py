@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -167,7 +167,6 @@ def leaderboard_of(
     archive: Path,
     out: Path,
     reference: str | None = None,
-    truth: Path | None = None,
     samples: int = 10_000,
     seed: int = 0,
     overwrite: bool = False,
@@ -186,8 +185,6 @@ def leaderboard_of(
         out: folder to write, with leaderboard.html and leaderboard.md.
         reference: method with which the others are compared; by default the blind one that is right
             most often after the first view.
-        truth: file with the truth of the sealed episodes, which whoever made the archive keeps; the
-            methods are compared on these alone. By default they are compared on all others.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap.
         overwrite: replace the two files in OUT.
@@ -211,17 +208,13 @@ def leaderboard_of(
             f"{folder}: no method is called {one_line(repr(reference))}; there are {known}"
         )
 
-    truths = frozen.truths(truth)
+    truths = frozen.truths()
     shapes: dict[str, KnownShape] = {}
     scored: list[Scored] = []
     track(_score_all(read, frozen, truths, shapes, scored), len(read), "methods")
     scored.sort(key=lambda one: (-one.right[:, -1].mean(), one.submission.method))
 
     board = _board(frozen, scored, list(truths.values()), reference, samples, seed)
-    if others := len(frozen.numbers) - len(truths):
-        kind = "sealed episode" if truth is None else "open episode"
-        note = f"Not scored here: {number_of(others, kind)} of the archive."
-        board = replace(board, notes=(*board.notes, note))
     with new_folder(Path(out), overwrite) as part:
         page = render("leaderboard.html", board=board, sha256=frozen.sha256)
         (part / PAGE_FILE).write_text(page, encoding="utf-8")
@@ -465,7 +458,8 @@ def _main_table(
     return WrittenTable(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
-        " of things that are named right. CPU time is that of all processes of a method."
+        " of things that are named right. CPU time is that of a method and of processes that it has"
+        " waited for."
         " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where"
         " all episodes agree.",
         (

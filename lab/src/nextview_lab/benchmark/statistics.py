@@ -3,13 +3,12 @@
 Objects are resampled, because the views and runs of one object are not independent.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from nextview.types import Float, Index
 from nextview_lab.data import metrics
-from nextview_lab.worlds.scene_layout import clutter_level
 
 NO_SPREAD = 1e-9  # smaller differences are rounding errors
 EXACT_FAMILIES = 16  # largest number of families for an exact test
@@ -48,19 +47,6 @@ def resample_families(
         Number of draws of each object in each sample, (samples, N) float64.
     """
     return resample(int(families.max()) + 1, samples, rng)[:, families]
-
-
-def target_families(names: Sequence[str]) -> Index:
-    """Number the families of objects, where scenes around one target are one family, (N,) int64.
-
-    Args:
-        names: of the N objects.
-    """
-    targets = [
-        name.rpartition("@")[0] if clutter_level(name) else name for name in names
-    ]
-    place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
-    return np.array([place[target] for target in targets])
 
 
 def by_family(values: Float, families: Index) -> Float:

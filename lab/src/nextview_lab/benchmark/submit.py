@@ -193,7 +193,8 @@ def submit(
     _check_options(out, how)
     frozen = FrozenArchive(archive)
     numbers = frozen.numbers[: how.episodes]
-    run = _how_run(how)
+    ours = f"--models {how.models} --policy {how.policy} --seed {how.seed}"
+    run = ours if how.command is None else how.command
 
     key = hashlib.sha256(
         msgspec.json.encode([frozen.sha256, run, how.name, how.version, how.max_views])
@@ -262,13 +263,6 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
                 f"{option}: is one line of {LONGEST_NAME} letters at most, for the table, not"
                 f" {one_line(repr(text))}"
             )
-
-
-def _how_run(how: SubmitOptions) -> str:
-    """Return how a method is run, in words."""
-    if how.command is not None:
-        return how.command
-    return f"--models {how.models} --policy {how.policy} --seed {how.seed}"
 
 
 def _method(frozen: FrozenArchive, how: SubmitOptions) -> Method:

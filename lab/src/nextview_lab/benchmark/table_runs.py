@@ -35,7 +35,7 @@ from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float, Index
 from nextview_lab.benchmark.jobs import Job, Settings
-from nextview_lab.benchmark.pose_recall import add_s
+from nextview_lab.data.metrics import add_s
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 FEWEST_THINGS = 6
@@ -374,7 +374,8 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
     choose = np.random.default_rng([how.seed, job.table, 2])
     azimuth = choose.uniform(0, 2 * np.pi)
     elevation = np.radians(choose.uniform(*VIEW_ELEVATIONS))
-    pose = _view(azimuth, elevation)
+    around = np.array([azimuth])
+    pose = poses_around(around, elevation, CAMERA_FROM_TABLE, TABLE_CENTRE)[0]
     system, segmentation = opened_models(how.models, how.network)
     looking = Looking(camera, system, segmentation, policy, choose)
 
@@ -389,10 +390,3 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
         target = looking.scene.target if number < how.views[-1] else None
         pose = pose if target is None else target
     return TableRun(counts, done)
-
-
-def _view(azimuth: float, elevation: float) -> Float:
-    """Return a camera pose aimed at the centre of the table, (4, 4), metres; angles in radians."""
-    return poses_around(
-        np.array([azimuth]), elevation, CAMERA_FROM_TABLE, TABLE_CENTRE
-    )[0]

@@ -93,13 +93,7 @@ class RecogniseThingsEnv(ViewsEnv):
         self._begin = lru_cache(KEPT_EPISODES)(
             lambda thing, draw: ThingEpisode(
                 self.things,
-                partial(
-                    scan_of,
-                    self.things,
-                    thing,
-                    files[self.things.names[thing]],
-                    unit,
-                ),
+                scan_of(self.things, thing, files[self.things.names[thing]], unit),
                 thing,
                 draw,
                 setting,

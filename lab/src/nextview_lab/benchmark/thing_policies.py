@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -149,11 +148,10 @@ def policies_of(
             memory and there is none.
         PolicyError: a policy cannot be created.
     """
-    pose = DiscriminateGeometry(EPISODE_SPHERE, goal="pose")
     rules = rules_of(EPISODE_SPHERE, EPISODE_SPHERE)
     known: dict[str, Callable[[ThingEpisode], Policy]] = {
-        **{name: partial(_of_any_episode, rule) for name, rule in rules.items()},
-        "pose": _always(pose),
+        **{name: _always(rule()) for name, rule in rules.items()},
+        "pose": _always(DiscriminateGeometry(EPISODE_SPHERE, goal="pose")),
         "ceiling": TruthCeiling,
     }
     for name in names:
@@ -178,13 +176,12 @@ def _refuse_needs(
     things: KnownThings,
 ) -> None:
     """Reject a policy that needs the hypotheses of a memory if there is none; UsageError."""
-    lacking = sorted({"joint", "outlook"} & set(needs))
-    if lacking and things.memory is None:
+    if {"joint", "outlook"} & set(needs) and things.memory is None:
         raise UsageError(
             f"the policy {name} goes by the hypotheses of a memory of taught things, which"
             f" recogniser {things.recogniser.name} does not have; leave it out"
         )
-    if "joint" in needs and not things.recogniser.azimuth_bins:
+    if "joint" in needs:
         raise UsageError(
             f"the policy {name} goes by features of views, and the memory holds none: its things"
             " are recognised by their geometry"
@@ -194,8 +191,3 @@ def _refuse_needs(
 def _always(policy: Policy) -> Callable[[ThingEpisode], Policy]:
     """Use the same policy for all episodes."""
     return lambda _: policy
-
-
-def _of_any_episode(rule: Callable[[], Policy], _: ThingEpisode) -> Policy:
-    """Create a policy that knows nothing of an episode."""
-    return rule()

@@ -6,7 +6,6 @@ Workers import this module, so it imports neither pandas nor matplotlib.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -214,18 +213,16 @@ def work(job: ThingJob) -> None:
     chosen = policies_of(job.policies, things)
     episode = ThingEpisode(
         things,
-        partial(scan_of, things, job.thing, job.scan, how.unit),
+        scan_of(things, job.thing, job.scan, how.unit),
         job.thing,
         job.draw,
         Setting(how.sensor, how.occlusion, how.seed),
-        job.out / "episodes" / job.name,
     )
     before = job.earlier(EpisodeRuns)
     runs: dict[str, list[ThingRun]] = {} if before is None else before.runs
     # The upper bound comes first, as it verifies views that the others use.
     for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
         runs[name] = replayed(episode, name, chosen[name], job)
-    episode.save()
     job.write(EpisodeRuns(things.names[job.thing], job.draw, runs))
 
 
@@ -282,7 +279,7 @@ def replayed(
     """Return the runs of one policy in one episode.
 
     Args:
-        episode: with cached views and verifications.
+        episode: the thing.
         name: of the policy.
         make: creates the policy for an episode.
         job: first views and rules of all episodes.

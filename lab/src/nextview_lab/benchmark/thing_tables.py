@@ -188,7 +188,14 @@ def summarise_things(
         how.reference,
         tuple(boards),
         chosen,
-        _as_table(alike),
+        pd.DataFrame(
+            {
+                "thing": alike.names,
+                "most_alike": alike.nearest,
+                "distance": alike.distance,
+                "confusable": alike.confusable,
+            }
+        ),
         len(runs),
     )
 
@@ -330,14 +337,3 @@ def _pose_p(own: "pd.DataFrame", reference: "pd.DataFrame", family: Index) -> fl
     if not len(order):
         return np.nan
     return float(exchange_p(int(family.max()) + 1, difference)[0])
-
-
-def _as_table(alike: Alikeness) -> "pd.DataFrame":
-    return pd.DataFrame(
-        {
-            "thing": alike.names,
-            "most_alike": alike.nearest,
-            "distance": alike.distance,
-            "confusable": alike.confusable,
-        }
-    )

@@ -1,8 +1,4 @@
-"""The benchmark of next views of taught things: from scans to a folder of results, resumable.
-
-In addition to the files described in ``jobs``, a folder of results contains ``episodes`` with the
-cached views and verifications, one folder per episode.
-"""
+"""The benchmark of next views of taught things: from scans to a folder of results, resumable."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -54,8 +50,7 @@ def benchmark_things(
 
     The scans are taught first, unless --models names a memory that contains them. Each thing is
     shown at its true size through a simulated sensor, and all policies continue from the same first
-    view. Each view is rendered once and each set of views is verified once. Both are stored in OUT:
-    an interrupted run resumes, and a further policy is replayed in seconds.
+    view. An interrupted run resumes, and a further policy takes part in the same episodes.
 
     A policy of your own, MODULE:CLASS, is created with the viewpoints. With needs = ("outlook",) it
     receives the leading hypotheses (things in poses), their beliefs and their surfaces.

@@ -57,9 +57,6 @@ def print_leaderboard(results: ClassResults) -> None:
 
     if after := board.after_views_table(tables):
         print_tables([after])
-    if sentence := board.level_differences(tables, reference):
-        terminal.print(sentence)
-
     for r in board.promised_risks(tables, results.settings["risks"]):
         if r.broken:
             wrong = (

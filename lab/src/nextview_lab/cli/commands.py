@@ -28,11 +28,6 @@ COMMANDS = {
         computes=False,
         example="download modelnet10 data",
     ),
-    "scenes": Command(
-        f"{CLI}.scenes:scenes",
-        "draw cluttered scenes or rooms",
-        example="scenes data/ModelNet10 light --levels light --split test",
-    ),
     "render": Command(
         f"{CLI}.stores:render",
         "render every view of a dataset into a view store",
@@ -164,7 +159,7 @@ COMMANDS = {
         "locate the models of a BOP dataset in its images",
         "wrote {out}; next: evaluate it with bop_toolkit",
         f"{CLI}.bop:print_bop",
-        example="bop lmo nextview_lmo-test.csv --frames 10",
+        example="bop lmo nextview_lmo-test.csv --models lmo_memory",
     ),
     "submit": Command(
         "nextview_lab.benchmark.submit:submit",
@@ -231,7 +226,6 @@ LABORATORY = Program(
         "train recogniser",
         "train map",
         "train segmentation",
-        "scenes",
         "bop",
         "submit",
         "benchmark things",

@@ -26,16 +26,13 @@ def render(
     workers: Workers = Workers(),
     overwrite: bool = False,
 ) -> None:
-    """Render the meshes or scenes of a dataset folder into a view store.
+    """Render the meshes of a dataset folder into a view store.
 
     The store holds a depth image of every object from every viewpoint. The layout of the folder is
     CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH. An interrupted run resumes.
 
-    A folder of scenes (nextview-lab scenes) can be rendered too. The store then holds the visible
-    part of each target, and the surrounding scene.
-
     Args:
-        dataset: folder of meshes or scenes.
+        dataset: folder of meshes.
         store: view store to create or to complete.
         viewpoints: number of viewpoints.
         azimuths: views per ring; by default 8 for the 40 viewpoints and 12 for the 12.

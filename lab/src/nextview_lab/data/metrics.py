@@ -1,7 +1,8 @@
-"""Accuracy, calibration error, and the errors of predicted maps."""
+"""Accuracy, calibration error, and the errors of predicted maps and of poses."""
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from nextview.types import Float, Floats, Index, Mask
 
@@ -183,3 +184,15 @@ def map_scores(predicted: Floats, true: Floats) -> dict[str, float]:
         name: round(float(v.mean()), MAP_DIGITS[name])
         for name, v in map_errors(predicted, true).items()
     }
+
+
+def add_s(points: Float, pose: Float, true: Float) -> float:
+    """Return the mean distance of points in a pose from the nearest points in the true pose.
+
+    Args:
+        points: of the surface, (N, 3).
+        pose: (4, 4).
+        true: pose, (4, 4).
+    """
+    here, there = (points @ one[:3, :3].T + one[:3, 3] for one in (pose, true))
+    return float(np.mean(cKDTree(there).query(here)[0]))

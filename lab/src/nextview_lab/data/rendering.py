@@ -33,22 +33,18 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float
 from nextview_lab.data.measures import depth_entropy
-from nextview_lab.data.scene_views import SCENE_SIDE, render_scene
 from nextview_lab.data.store import (
     DEPTH_UNIT,
     DONE,
     FAILED,
     POINT_UNIT,
+    RENDERED_ARRAYS,
     Attributes,
     ViewStore,
     describe,
     opened,
     writing,
 )
-from nextview_lab.worlds.robot_camera import sensed_camera
-from nextview_lab.worlds.scene import build_scene
-from nextview_lab.worlds.scene_cameras import OccludedCamera
-from nextview_lab.worlds.scene_layout import SUFFIX, SceneLayout
 
 AnySensor = Sensor | SensorMix | None
 # bytes, largest chunk for the compressor, including its overhead
@@ -152,7 +148,6 @@ class RenderOptions:
             (ModelNet: inch).
         split: render only this split of the dataset.
         held_out: render only objects that this model (name or card) held out of its training.
-        meshes: for scenes: folder of their meshes.
         max_faces: largest number of triangles in a mesh; also limits the file to 60 bytes per
             triangle.
         largest_part: keep only the largest connected part of each mesh.
@@ -165,7 +160,6 @@ class RenderOptions:
     unit: str | None = None
     split: str | None = None
     held_out: str | None = None
-    meshes: Path | None = None
     max_faces: int = MAX_FACES
     largest_part: bool = False
 
@@ -180,12 +174,12 @@ def render(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render the meshes, or the targets of the scenes, that are missing in a store.
+    """Render the meshes that are missing in a store.
 
     An object that failed before is tried again. An interrupted run can be continued at any point.
 
     Args:
-        dataset: folder of meshes or scenes.
+        dataset: folder of meshes.
         path: of the view store.
         sphere: the viewpoints.
         size: side of the images, pixels.
@@ -217,10 +211,7 @@ def render(
             "sha256": hashes,
             "sensor": None if sensor is None else sensor.to_dict(),
         }
-        recipe |= {
-            "scene": None if options.meshes is None else SCENE_SIDE,
-            "dataset": dataset.name,
-        }
+        recipe |= {"dataset": dataset.name}
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
@@ -290,15 +281,6 @@ def _check(
     if options.unit not in (None, *UNITS):
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
 
-    if options.meshes is not None and options.deform != Deform():
-        raise UsageError(
-            "scenes are rendered as they are: objects in them are neither stretched nor rotated"
-        )
-    if options.meshes is not None and options.largest_part:
-        raise UsageError(
-            "scenes are rendered as they are: the largest part is of a folder of meshes"
-        )
-
     if sphere.distance + 1 > FARTHEST_STORED:
         raise DatasetError(
             f"{path}: depth is stored up to {FARTHEST_STORED:.2f} object radii, so the distance can"
@@ -316,7 +298,7 @@ def _check(
 
 
 def listing(dataset: Path, options: RenderOptions) -> Listing:
-    """List the meshes or scenes to render and the files left out.
+    """List the meshes to render and the files left out.
 
     Args:
         dataset: the folder.
@@ -328,14 +310,7 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
     Raises:
         DatasetError: there is nothing to render.
     """
-    try:
-        found = scan_dataset(dataset, FORMATS if options.meshes is None else (SUFFIX,))
-    except DatasetError:
-        if options.meshes is None and any(dataset.glob(f"*/**/*@*{SUFFIX}")):
-            raise DatasetError(
-                f"{dataset}: holds scenes; say with --meshes where the meshes are in them"
-            ) from None
-        raise
+    found = scan_dataset(dataset, FORMATS)
     return replace(
         found,
         entries=select(found.entries, dataset, options.split, options.held_out),
@@ -380,7 +355,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     store = ViewStore.open(path)
     there = store.attributes
     # attributes that do not affect the views
-    noted = ["unit"] if wanted.sensor is None or wanted.scene is not None else []
+    noted = ["unit"] if wanted.sensor is None else []
     for key in wanted.__struct_fields__:
         if key in (*noted, "dataset", "failures", "commands") or (
             key == "sha256" and there.sha256 is None
@@ -399,7 +374,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
         raise DatasetError(
             f"{path}: its meshes are measured in {there.unit}, not {wanted.unit}"
         )
-    for name in store.rendered:
+    for name in RENDERED_ARRAYS:
         store.array(name)  # raises an error if it is missing
     for leftover in path.rglob("*.partial"):  # incomplete files of an interrupted run
         leftover.unlink()
@@ -412,7 +387,7 @@ def _render_entry(
     sensor: AnySensor,
     item: tuple[int, Entry],
 ) -> tuple[str | None, tuple[str, ...]]:
-    """Render one object, or the target of one scene, into the store.
+    """Render one object into the store.
 
     Returns:
         The reason if its mesh cannot be used; and sentences about unusual properties.
@@ -441,35 +416,20 @@ def _rendered(
     size = store.attributes.size
     seed = options.seed if options.noise_seed is None else options.noise_seed
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
-    camera: Camera
-    if options.meshes is None:
-        read = load_mesh(
-            entry.path,
-            unit=options.unit,
-            max_faces=options.max_faces,
-            largest_part=options.largest_part,
-        )
-        doubts = mesh_warnings(read)
-        mesh = deformed(store, read, entry.name)
-        camera = (
-            SimulatedCamera(mesh, size, sphere.distance)
-            if sensor is None
-            else SensedCamera(mesh, sensor, rng)
-        )
-        # A store keeps the lengths of the files, whose unit may be specified later.
-        metres = 1.0 if options.unit is None else UNITS[options.unit]
-        radius = np.array(mesh.radius / metres)
-        return render_object(camera, sphere, size) | {"radius": radius}, doubts
-
-    scene = build_scene(
-        SceneLayout.load(entry.path),
-        Path(options.meshes).absolute(),
-        options.max_faces,
+    read = load_mesh(
+        entry.path,
+        unit=options.unit,
+        max_faces=options.max_faces,
+        largest_part=options.largest_part,
     )
-    camera = (
-        OccludedCamera(scene, size, sphere.distance)
+    doubts = mesh_warnings(read)
+    mesh = deformed(store, read, entry.name)
+    camera: Camera = (
+        SimulatedCamera(mesh, size, sphere.distance)
         if sensor is None
-        else sensed_camera(scene, sensor, rng)
+        else SensedCamera(mesh, sensor, rng)
     )
-    rendered = render_object(camera, sphere, size) | render_scene(scene, sphere)
-    return rendered | {"radius": np.array(scene.target.radius)}, ()
+    # A store keeps the lengths of the files, whose unit may be specified later.
+    metres = 1.0 if options.unit is None else UNITS[options.unit]
+    radius = np.array(mesh.radius / metres)
+    return render_object(camera, sphere, size) | {"radius": radius}, doubts

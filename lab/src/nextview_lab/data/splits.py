@@ -168,8 +168,8 @@ def some_objects(
     Args:
         store: the view store.
         split: name of the split; None for all.
-        held_out: card, or its name or path, whose held-out objects are selected (scenes by their
-            target); None for all.
+        held_out: card, or its name or path, whose held-out objects are selected; None
+            for all.
         count: number of evenly spaced objects; None for all.
 
     Returns:
@@ -182,9 +182,7 @@ def some_objects(
     of = "" if split is None else f" of the split {split!r}"
     if held_out is not None:
         card = held_out if isinstance(held_out, ModelCard) else find_card(held_out)
-        # the target of a scene; the whole name otherwise
-        targets = [name.partition("@")[0] for name in store.names]
-        chosen &= np.isin(targets, card.held_out) | np.isin(store.names, card.held_out)
+        chosen &= np.isin(store.names, card.held_out)
         of += f" that {card.name} calls held out"
     if not chosen.any():
         raise DatasetError(f"{store.path}: holds no rendered object{of}")

@@ -34,7 +34,7 @@ POINT_UNIT = 1 / 32767  # unit of the int16 points, object radii
 PENDING = 0
 DONE = 1
 FAILED = 2
-# arrays created by rendering, and additional ones for scenes
+# arrays created by rendering
 RENDERED_ARRAYS = (
     "image",
     "depth",
@@ -42,13 +42,6 @@ RENDERED_ARRAYS = (
     "measures/depth_entropy",
     "radius",
     "status",
-)
-SCENE = (
-    "scene/depth",
-    "scene/owner",
-    "scene/reachable",
-    "measures/visible_share",
-    "measures/clearance",
 )
 Name = Annotated[str, Meta(min_length=1)]
 Split = Literal["train", "test", "val", ""]
@@ -73,7 +66,6 @@ class Attributes(msgspec.Struct, omit_defaults=True):
         rotated: whether each object is rotated at random about the vertical.
         largest_part: whether only the largest connected part of each mesh is kept.
         sensor: parameters of the simulated sensor; None for clean renders.
-        scene: side of the stored scene images, pixels; None if the objects stand alone.
         sha256: hash of the mesh file of each object.
         unit: unit of length of the mesh files; None if it is not known.
         dataset: path of the meshes.
@@ -98,7 +90,6 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     rotated: bool = False
     largest_part: bool = False
     sensor: dict[str, Any] | None = None
-    scene: Pixels | None = None
     sha256: list[str] | None = None
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
     dataset: str = ""
@@ -176,11 +167,11 @@ class ViewStore:
         with new_folder(path, overwrite, last="zarr.json") as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
             store.note()
-            for name in store.rendered:
+            for name in RENDERED_ARRAYS:
                 store.add(name)
             if overwrite and (path / "zarr.json").exists():
                 there = cls.open(path)
-                for name in (*there.rendered, *there.added):
+                for name in (*RENDERED_ARRAYS, *there.added):
                     there.remove(name)
         return cls.open(path)
 
@@ -219,21 +210,12 @@ class ViewStore:
         )
 
     @property
-    def rendered(self) -> tuple[str, ...]:
-        """Names of the arrays created by rendering; there are more for cluttered scenes."""
-        return (
-            RENDERED_ARRAYS
-            if self.attributes.scene is None
-            else (*RENDERED_ARRAYS, *SCENE)
-        )
-
-    @property
     def added(self) -> list[str]:
         """Names of the arrays that were added later."""
         files = self.path.glob("[!.]*/*/zarr.json")
         return sorted(
             {file.parent.relative_to(self.path).as_posix() for file in files}
-            - {*self.rendered}
+            - {*RENDERED_ARRAYS}
         )
 
     def note(self, **changes: Any) -> None:
@@ -265,7 +247,6 @@ class ViewStore:
         """Return shape per object, type and fill value of an array."""
         v = len(self.sphere)
         size = self.attributes.size
-        scene = self.attributes.scene or 0
         layouts = {
             "image": ((v, size, size), "uint8", 0),
             "depth": ((v, size, size), "uint16", 0),
@@ -273,9 +254,6 @@ class ViewStore:
             "measures/depth_entropy": ((v,), "float32", 0),
             "radius": ((), "float64", np.nan),
             "status": ((), "uint8", PENDING),
-            "scene/depth": ((v, scene, scene), "uint16", 0),
-            "scene/owner": ((v, scene, scene), "uint8", 0),
-            "scene/reachable": ((v,), "bool", False),
         }
         measure = ((v,), "float32", np.nan)
         return layouts.get(name, measure)
@@ -306,7 +284,7 @@ class ViewStore:
         return array
 
     def _remedy(self, name: str) -> str:
-        if name in self.rendered:
+        if name in RENDERED_ARRAYS:
             return "remove the store and render again"
         kind, _, rest = name.partition("/")
         maker = (
@@ -541,7 +519,7 @@ def check(
         The name of each object and None, or what is wrong with it.
     """
     store = ViewStore.open(path)
-    for name in store.rendered:
+    for name in RENDERED_ARRAYS:
         store.array(name)  # raises an error if it is damaged
     objects = np.flatnonzero(store.done).tolist()
     for i, result in each(
@@ -562,7 +540,7 @@ def _check_object(path: Path, i: int) -> str | None:
     store = opened(path)
     try:
         for name in (
-            *store.rendered,
+            *RENDERED_ARRAYS,
             *(name for name in store.added if store.has(name, i)),
         ):
             store.read(name, i)

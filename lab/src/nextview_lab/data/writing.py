@@ -17,12 +17,13 @@ from nextview.geometry.pinhole import PinholeCamera, pinhole_matrix
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, look_at_origin
 from nextview.types import Float32
-from nextview_lab.worlds.scene import square
+from nextview_lab.worlds.worlds import slab
 
 # default intrinsics of a Kinect in ROS; first pixel's centre at 0
 PINHOLE = pinhole_matrix(525.0, 525.0, 319.5, 239.5)
 SHAPE = 480, 640
 TABLE_HALF_SIDE = 2.0  # half the side of the table, object radii
+TABLE_THICKNESS = 0.01  # metres
 DEPTH_STEP = 0.0001  # metres per unit of the depth images
 
 
@@ -63,7 +64,10 @@ def write_capture(
         )
     height = -radius * float(mesh.vertices[:, 2].min())
     vertices = radius * mesh.vertices + np.array([0, 0, height])
-    things = [(vertices, mesh.faces)] + [square(TABLE_HALF_SIDE * radius, 0.0)] * table
+    side = 2 * TABLE_HALF_SIDE * radius
+    things = [(vertices, mesh.faces)] + [
+        slab((side, side, TABLE_THICKNESS), (0, 0), 0)
+    ] * table
     caster = RayCaster(things)
     rays = PinholeCamera.of(
         pinhole_matrix(525.0, 525.0, 320.0, 240.0),

@@ -2,7 +2,6 @@
 
     python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0
     python -m nextview_lab.studies.frozen SCANS part --things 4 --draws 1 --grid 3 4
-    python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0 --sealed 78
 
 Each thing lies in some of seven places (``places`` says what they are), by the
 physics of ``staged_things``, and a stereo camera takes all candidate views of it:
@@ -13,9 +12,7 @@ All that a method is told of the cameras is drawn before the scene, and without 
 (``draw_views``); the scene is then placed so that a detector would have aimed the cameras there.
 
 The same scans, seed and versions of the libraries give the same archive, with the same SHA-256, on
-every x86-64 processor with AVX2. Sealed episodes depend on a secret instead of the seed. The secret
-and their truth are in a file beside the archive, NAME-truth.json, which is not published with it; a
-file that is already there gives its secret. A run that was stopped goes on when the same command is
+every x86-64 processor with AVX2. A run that was stopped goes on when the same command is
 given again: the manifest is written last, and a folder without it is no archive.
 
 SCANS holds NAME.ply, metres. MuJoCo is needed: ``pip install './lab[arm]'``.
@@ -25,7 +22,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import shutil
 import sys
 from dataclasses import asdict, dataclass
@@ -53,7 +49,6 @@ from nextview_lab.benchmark.frozen import (
     EpisodeTruth,
     FrozenEpisode,
     FrozenThing,
-    SealedTruth,
     as_matrix,
     seal,
 )
@@ -102,6 +97,7 @@ TERMS_FILE = ".terms.json"  # which does not belong to the archive
 PARTIAL = ".partial"  # ends the folder of an episode that is not whole
 LICENCE = "CC BY 4.0"
 SOURCE = "YCB Object and Model Set, https://www.ycbbenchmarks.com"
+# its words, too, are part of the SHA-256 of an archive
 CARD = """\
 # {name}
 
@@ -111,7 +107,7 @@ CARD = """\
 - **What**: depth of 640 x 480 pixels in steps of 0.1 mm (`NNN.png`), the pixels of the thing
   (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
   holds names, poses of the things and true poses of the cameras: only `nextview-lab leaderboard`
-  reads it. A method is not shown it. The truth of {sealed} sealed episodes is not in the archive.
+  reads it. A method is not shown it. The truth of 0 sealed episodes is not in the archive.
 - **How**: things fall by the physics of MuJoCo and are seen along its rays. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and
@@ -142,8 +138,7 @@ class FrozenTerms:
         grid: elevations and azimuths of the candidate views.
         arm_error: standard deviations of the camera's poses along and about each axis, mm, degrees.
         farthest: metres, beyond which the camera measures nothing.
-        seed: of everything random in episodes that are not sealed.
-        sealed: number of further episodes, whose truth is not in the archive.
+        seed: of everything random.
     """
 
     places: tuple[Place, ...] = FROZEN_PLACES
@@ -153,7 +148,6 @@ class FrozenTerms:
     arm_error: tuple[float, float] = (3.0, 0.3)
     farthest: float = 1.5
     seed: int = 1
-    sealed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,11 +192,6 @@ def draw_views(
     world = rounded(world)
     told = [as_told(world @ pose, how.arm_error, rng) for pose in poses]
     return CandidateViews(poses, world, told, int(rng.integers(len(poses))))
-
-
-def episode_rng(seed: int, place: Place, name: str) -> np.random.Generator:
-    """Source of everything random in an episode."""
-    return np.random.default_rng([seed, FROZEN_PLACES.index(place), *name.encode()])
 
 
 def moved(pose: Float, by: Float) -> Float:
@@ -281,10 +270,10 @@ def shown_pixels(depth: NDArray[np.uint16], mask: NDArray[np.bool_]) -> int:
 
 
 def make_episode(
-    folder: Path, scans: Path, name: str, place: Place, how: FrozenTerms, seed: int
+    folder: Path, scans: Path, name: str, place: Place, how: FrozenTerms
 ) -> EpisodeTruth | None:
     """Write an episode; its truth, or None if the thing cannot be shown there."""
-    rng = episode_rng(seed, place, name)
+    rng = np.random.default_rng([how.seed, FROZEN_PLACES.index(place), *name.encode()])
     views = draw_views(place, how, rng)
     scene = scene_before(views, place, scans, name, rng)
     if scene is None:
@@ -331,22 +320,12 @@ def drawn(names: list[str], how: FrozenTerms) -> list[tuple[str, Place]]:
     return [pairs[row] for row in rng.permutation(len(pairs))]
 
 
-def sealed_pairs(
-    names: list[str], how: FrozenTerms, secret: int
-) -> list[tuple[str, Place]]:
-    """Things and places of the sealed episodes, which only the secret tells."""
-    rng = np.random.default_rng([secret, len(names)])
-    pairs = [(name, place) for name in names for place in how.places]
-    return [pairs[row] for row in rng.permutation(len(pairs))[: how.sealed]]
-
-
 def finish(
     out: Path,
     scans: Path,
     names: list[str],
     shown: dict[str, str],
     how: FrozenTerms,
-    sealed: SealedTruth | None,
 ) -> str:
     """Write scans, things, card and manifest; the SHA-256 of the archive.
 
@@ -354,9 +333,8 @@ def finish(
         out: folder of the archive.
         scans: folder of the scans.
         names: of the things that may be shown.
-        shown: things of the episodes that are not sealed, by number.
+        shown: things of the episodes, by number.
         how: what the archive depends on.
-        sealed: truth of the others; None where none are.
     """
     things = [
         FrozenThing(name, sha256_of(scans / f"{name}.ply"), LICENCE, SOURCE)
@@ -368,7 +346,6 @@ def finish(
         shutil.copyfile(scans / f"{name}.ply", out / SCANS_FOLDER / f"{name}.ply")
 
     made_with = {name: version(name) for name in LIBRARIES}
-    count = 0 if sealed is None else len(sealed.episodes)
     card = CARD.format(
         name=out.name,
         episodes=len(shown),
@@ -377,7 +354,6 @@ def finish(
         draws=how.draws,
         places=len(how.places),
         names=", ".join(how.places),
-        sealed=count,
         views=how.grid[0] * how.grid[1],
         seed=how.seed,
         millimetres=how.arm_error[0],
@@ -392,27 +368,11 @@ def finish(
         licence=LICENCE,
     )
     (out / "README.md").write_text(card, encoding="utf-8")
-
-    digest = None
-    if sealed is not None:
-        in_order = dict(sorted(sealed.episodes.items()))
-        beside = truth_beside(out)
-        write_record(beside, SealedTruth(sealed.secret, in_order), overwrite=True)
-        digest = sha256_of(beside)
-    return seal(out, out.name, how.seed, made_with, digest)
+    return seal(out, out.name, how.seed, made_with)
 
 
-def truth_beside(out: Path) -> Path:
-    """The file of the sealed truth of an archive."""
-    return out.with_name(f"{out.name}-truth.json")
-
-
-def begin(out: Path, names: list[str], how: FrozenTerms) -> SealedTruth | None:
-    """Note the terms of a new archive, or compare them with those that it was begun with.
-
-    Returns:
-        The truth of the sealed episodes that are done, with the secret; None if none are wanted.
-    """
+def begin(out: Path, names: list[str], how: FrozenTerms) -> None:
+    """Note the terms of a new archive, or compare them with those that it was begun with."""
     known = hashlib.sha256(str(names).encode()).hexdigest()
     terms = msgspec.json.decode(msgspec.json.encode({**asdict(how), "scans": known}))
     out.mkdir(parents=True, exist_ok=True)
@@ -420,22 +380,12 @@ def begin(out: Path, names: list[str], how: FrozenTerms) -> SealedTruth | None:
     if new and any(out.iterdir()):
         raise UsageError(f"{out}: is not empty")
 
-    sealed = None
-    if how.sealed:
-        beside = truth_beside(out)
-        if new and not beside.exists():
-            write_record(beside, SealedTruth(secrets.token_hex(16), {}))
-        sealed = read_record(beside, SealedTruth, "the truth of sealed episodes")
-        if new:  # of another archive nothing but the secret is used
-            sealed = SealedTruth(sealed.secret, {})
-        terms["secret"] = hashlib.sha256(sealed.secret.encode()).hexdigest()
     if new:
         write_record(out / TERMS_FILE, terms)
     if read_record(out / TERMS_FILE, dict, "the terms of an archive") != terms:
-        raise UsageError(f"{out}: was begun with other options, or another secret")
+        raise UsageError(f"{out}: was begun with other options")
     for folder in (EPISODES_FOLDER, TRUTH_FOLDER):
         (out / folder).mkdir(exist_ok=True)
-    return sealed
 
 
 def main(
@@ -454,41 +404,31 @@ def main(
     names = list(scans_in(scans, (".ply",)))
     if not 1 <= how.draws <= len(how.places):
         raise UsageError("each thing is shown in one place or more, and in each once")
-    if not 0 <= how.sealed <= len(names) * len(how.places):
-        raise UsageError("each thing is sealed in each place once or not at all")
     if (out / MANIFEST).exists():
         raise UsageError(f"{out}: exists, and is whole; name another folder")
 
     with only_one(out):
-        sealed = begin(out, names, how)
-        open_ones = [(*pair, how.seed) for pair in drawn(names, how)]
-        hidden = []
-        if sealed is not None:
-            secret = int(sealed.secret, 16)
-            hidden = [(*pair, secret) for pair in sealed_pairs(names, how, secret)]
-
+        begin(out, names, how)
         shown = {}
-        count = len(open_ones) + len(hidden)
-        for row, (name, place, seed) in enumerate([*open_ones, *hidden]):
+        pairs = drawn(names, how)
+        for row, (name, place) in enumerate(pairs):
             number = f"{row:04d}"
             folder = out / EPISODES_FOLDER / number
             if not folder.exists():
                 part = folder.with_name(number + PARTIAL)
-                truth = make_episode(part, scans, name, place, how, seed)
+                truth = make_episode(part, scans, name, place, how)
                 if truth is not None:
                     file = out / TRUTH_FOLDER / f"{number}.json"
-                    kept: EpisodeTruth | SealedTruth = truth
-                    if sealed is not None and row >= len(open_ones):
-                        sealed.episodes[number] = truth
-                        file, kept = truth_beside(out), sealed
-                    write_record(file, kept, overwrite=True)
+                    write_record(file, truth, overwrite=True)
                     os.replace(part, folder)
             done = folder.exists()
             said = "done" if done else "cannot be shown there"
-            print(f"{row + 1} of {count}: {name}, {place}: {said}", file=sys.stderr)
-            if done and row < len(open_ones):
+            print(
+                f"{row + 1} of {len(pairs)}: {name}, {place}: {said}", file=sys.stderr
+            )
+            if done:
                 shown[number] = name
-        print(f"{out}: {finish(out, scans, names, shown, how, sealed)}")
+        print(f"{out}: {finish(out, scans, names, shown, how)}")
 
 
 if __name__ == "__main__":

@@ -50,13 +50,14 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import ObservationError
 from nextview.recognition.belief import Stopping
 from nextview.sensing import Frame, ObservedObject
-from nextview_lab.studies.shared import markdown, results, scans_in, share
+from nextview_lab.benchmark.board_page import markdown
+from nextview_lab.benchmark.methods import never
+from nextview_lab.studies.shared import results, scans_in, share
 from nextview_lab.studies.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
     PLACES,
     VIEW_COUNT,
-    Bools,
     Float,
     Place,
     Shot,
@@ -114,18 +115,13 @@ class AfterView:
     seconds: float
 
 
-def never_early(believed: Any, threshold: float) -> Bools:
-    """A stopping rule for an arm that always takes all views."""
-    return np.zeros(np.shape(believed.highest), bool)
-
-
 @lru_cache(maxsize=1)
 def system_of(models: str) -> nextview.System:
     """What recognises the things; its policy does not matter, as the views are given."""
     return nextview.load(
         models=models,
         max_views=VIEW_COUNT,
-        stopping=never_early,
+        stopping=never,
         policy="random",
         threads=1,
     )

@@ -16,6 +16,7 @@ network of ``nextview-lab train segmentation``; without it the bundled one is as
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -30,7 +31,7 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
-from nextview_lab.studies.shared import frame_in, progress
+from nextview_lab.studies.shared import progress
 
 LEAST_PIXELS = 200  # of a thing that counts; of a segment half as many
 GOOD_IOU = 0.5
@@ -102,6 +103,13 @@ class Counts:
             f"segments {self.segments}, precision {precision:.3f}, merges {self.merges},"
             f" splits {self.splits}, {self.seconds / self.frames:.3f} s a frame"
         )
+
+
+def frame_in(folder: Path) -> Frame:
+    """The frame without a pose in a folder."""
+    fx, fy, cx, cy = json.loads((folder / "K.json").read_text())
+    depth = np.asarray(Image.open(folder / "depth.png"))
+    return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
 
 
 def real_frames(folder: Path) -> Iterator[tuple[Frame, Labels]]:

@@ -1,4 +1,4 @@
-"""What studies share: scans, frames in files, results line by line, shares, tables, progress."""
+"""What studies share: scans, results line by line, shares, tables, progress."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from PIL import Image
 from rich.progress import track
 from scipy.stats import binomtest
 
@@ -19,8 +17,6 @@ from nextview.cli.progress import console
 from nextview.data.pool import WorkerDied, each
 from nextview.errors import NextviewError, UsageError
 from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
-from nextview.sensing import Frame
-from nextview.types import Float
 
 SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
 Item = TypeVar("Item")
@@ -47,44 +43,9 @@ def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def scans_of(folder: Path, names: Sequence[str]) -> list[Path]:
-    """The scans of things, in the order of their names.
-
-    Raises:
-        UsageError: some are missing.
-    """
-    files = scans_in(folder)
-    missing = [name for name in names if name not in files]
-    if missing:
-        raise UsageError(
-            f"{folder}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
-        )
-    return [files[name] for name in names]
-
-
 def mesh_of(scan: Path) -> Mesh:
     """A scan in metres, called as its file."""
     return replace(load_mesh(scan, unit="m"), name=scan.stem)
-
-
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float:
-    """Intrinsics, (3, 3), pixels."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-def frame_in(folder: Path) -> Frame:
-    """The frame without a pose that a folder holds.
-
-    Args:
-        folder: of depth.png (uint16, millimetres; scale.json has metres a step, if it is another
-            one) and K.json (fx, fy, cx, cy, with the middle of the first pixel at 0).
-    """
-    intrinsics = camera_matrix(*json.loads((folder / "K.json").read_text()))
-    depth = np.asarray(Image.open(folder / "depth.png"))
-    scale = folder / "scale.json"
-    if scale.exists():
-        depth = depth * np.float32(json.loads(scale.read_text()))
-    return Frame(depth, intrinsics)
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -184,9 +145,3 @@ def share(count: int, total: int) -> str:
         return "-"
     low, high = wilson(count, total)
     return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"
-
-
-def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in Markdown."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)

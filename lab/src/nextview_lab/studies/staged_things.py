@@ -580,11 +580,6 @@ def as_told(
     return rounded(told)
 
 
-def camera_distance(scan: trimesh.Trimesh) -> float:
-    """From which a thing is looked at, metres."""
-    return float(np.clip(2 * np.linalg.norm(scan.extents), 0.3, 0.6))
-
-
 def field(rng: np.random.Generator) -> Float:
     """Normal noise of unit variance, correlated over about two pixels, of an image's shape."""
     gaussian = np.exp(-0.5 * np.arange(-4, 5) ** 2)
@@ -733,7 +728,7 @@ def shots_of(
     model, data = scene
     true = true_pose(data)
     middle = true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3]
-    distance = camera_distance(scan)
+    distance = float(np.clip(2 * np.linalg.norm(scan.extents), 0.3, 0.6))
     left, right, low, high = WHERE_CAMERAS_STAND[place]
     around = (right - left) / VIEW_COUNT
     first = rng.uniform(0, 360) if right - left == 360 else 0.0

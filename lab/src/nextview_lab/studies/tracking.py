@@ -210,14 +210,12 @@ def _gripper(placed: Float) -> tuple[Triangles, ...]:
     for size, place in parts:
         # sizes are given along the opening first
         turned = size if side == 0 else (size[1], size[0], size[2])
-        boxes.append(trimesh.creation.box(turned, _shift(place)))
+        boxes.append(
+            trimesh.creation.box(
+                turned, trimesh.transformations.translation_matrix(place)
+            )
+        )
     return tuple((np.asarray(box.vertices), np.asarray(box.faces)) for box in boxes)
-
-
-def _shift(place: Float) -> Float:
-    matrix = np.eye(4)
-    matrix[:3, 3] = place
-    return matrix
 
 
 def _forearm(camera: Float) -> Triangles:

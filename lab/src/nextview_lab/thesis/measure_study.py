@@ -1,14 +1,12 @@
 """Which measure of a view serves recognition? Every measure that a store holds, against what a
 recogniser says.
 
-    python -m nextview_lab.thesis.measure_study views.zarr measures [--meshes data/ModelNet10]
-        [--objects 300] [--runs 10] [--policies random-all gain] [--test test.npz
-        --validation validation.npz]
+    python -m nextview_lab.thesis.measure_study views.zarr measures --test test.npz
+        --validation validation.npz [--objects 300] [--runs 10] [--policies random-all gain]
 
-From the view store alone: what the models say of its views is predicted, and what the measures say
-is measured, where that is not there yet. Writes into the folder the table (measures.md, table.csv
-and table.tex), measures.csv (every number in a row of its own), and the figure (measures.png, .pdf
-and .svg). Stopped, it goes on where it was.
+What the models say of the views is predicted, and what the measures say is measured before
+(nextview-lab predict, nextview-lab measure, nextview_lab.thesis.measure). Writes into the folder
+the table (measures.md) and measures.csv (every number in a row of its own).
 
 For each measure: the rank correlation, over the views of an object, of its value with the
 log-probability that the recogniser gives the true class there, as the mean over objects, of all
@@ -27,45 +25,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from nextview_lab.extras import extras, require
 
 if __name__ == "__main__":
     require("benchmark")
 
-import matplotlib
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.special import log_softmax
 from scipy.stats import rankdata
 
 from nextview.cli.exit_status import orderly_end
-from nextview.cli.progress import console, follow, track
+from nextview.cli.progress import track
 from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.recognition.map_names import map_name
-from nextview.recognition.model_card import find_card, find_models
-from nextview.session.style import BLUE, FIGURE_STYLE, INK, PlainFigure, to_png
-from nextview_lab.benchmark.page import write_figures
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.replay import make_specs, replay
 from nextview_lab.benchmark.statistics import holm, interval, resample, sign_flip_p
 from nextview_lab.benchmark.true_maps import true_map, true_measure
-from nextview_lab.data import predicting
-from nextview_lab.data.measures import measure
 from nextview_lab.data.metrics import ratio
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import sample
 from nextview_lab.data.store import ViewStore
-from nextview_lab.thesis.measure import measure as measure_meshes
 from nextview_lab.training.card_fits import valley_gains
 
 with extras():
     import pandas as pd
 
-Split = Literal["train", "test"]
 RANDOM = "random"
 """What the policies are compared with: a view of the local window drawn at random."""
 CONFIDENCE = "confidence"
@@ -270,13 +260,6 @@ def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=head)
 
 
-def markdown(wide: pd.DataFrame) -> str:
-    """The table as text."""
-    lines = [map(str, wide.columns), ["---"] * wide.shape[1], *wide.to_numpy().tolist()]
-    said = ["| " + " | ".join(cells) + " |" for cells in lines]
-    return "\n".join([*said, "", "\\* p < 0.05 after Holm's correction."]) + "\n"
-
-
 def points(row: Any) -> str:
     """A difference of shares in points, with its interval; a star where it is significant."""
     value, low, high = (
@@ -300,136 +283,11 @@ def others(table: pd.DataFrame) -> list[str]:
     ]
 
 
-def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
-    """Correlation overall, by class, and what the policies gain, one row a measure."""
-    names = ordered(table)
-    classes = [
-        label
-        for label in table[table["quantity"] == "correlation"]["label"].unique()
-        if label
-    ]
-    with matplotlib.rc_context(FIGURE_STYLE):
-        made = PlainFigure((13, 0.34 * len(names) + 1.9), layout="constrained")
-        left, middle, right = made.subplots(
-            1,
-            3,
-            sharey=True,
-            width_ratios=[1, 0.11 * len(classes) + 0.6, 1],
-        )
-    y = np.arange(len(names))
-
-    def numbers(quantity: str) -> pd.DataFrame:
-        return (
-            table[(table["quantity"] == quantity) & (table["label"] == "")]
-            .set_index("measure")
-            .loc[names]
-        )
-
-    overall = numbers("correlation")
-    left.hlines(y, overall["low"], overall["high"], color=INK)
-    left.plot(overall["value"], y, "o", color=INK, markersize=5)
-    left.axvline(0, color=INK, linewidth=0.8)
-    left.set_yticks(y, [name.replace("_", " ") for name in names])
-    left.set_xlabel(
-        "rank correlation with the log-probability\nof the true class, mean of objects"
-    )
-
-    of_class = table[(table["quantity"] == "correlation") & (table["label"] != "")]
-    cells = of_class.pivot(index="measure", columns="label", values="value").loc[
-        names,
-        classes,
-    ]
-    reach = max(
-        float(
-            np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(
-                initial=0
-            )
-        ),
-        1e-9,
-    )
-    shown = middle.imshow(
-        cells,
-        cmap="RdBu_r",
-        vmin=-reach,
-        vmax=reach,
-        aspect="auto",
-        origin="lower",
-    )
-    for (i, j), value in np.ndenumerate(cells.to_numpy()):
-        faint = abs(value) > 0.6 * reach
-        middle.text(
-            j,
-            i,
-            f"{value:.2f}",
-            ha="center",
-            va="center",
-            fontsize=7,
-            color="white" if faint else INK,
-        )
-    middle.set_xticks(
-        range(len(classes)),
-        [name.replace("_", " ") for name in classes],
-        rotation=45,
-        ha="right",
-    )
-    middle.grid(False)
-    middle.set_xlabel("the same, by class")
-    made.colorbar(shown, ax=middle, location="top", shrink=0.6, aspect=30)
-
-    for step, (k, colour) in enumerate(
-        zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)
-    ):
-        over = numbers(f"over_random_{k}")
-        at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
-        right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)
-        right.plot(
-            100 * over["value"],
-            at,
-            "o",
-            color=colour,
-            markersize=4,
-            label=f"{k} views",
-        )
-    right.axvline(0, color=INK, linewidth=0.8)
-    right.set_xlabel(
-        "accuracy of the policy that climbs the true map,\npoints over a random view of the window"
-    )
-    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(n_views))
-    return made
-
-
-def predicted(
-    out: Path,
-    store: Path,
-    models: str,
-    split: Split,
-    workers: int | None,
-) -> Predictions:
-    """What models say of a split of a store; of the training split only of what they held out."""
-    if not out.exists():
-        recogniser = find_card(find_models(models).recogniser)
-        held_out = None if split == "test" else recogniser
-        steps = predicting.predict(
-            store,
-            out,
-            recogniser,
-            {},
-            split,
-            held_out,
-            size=False,
-            workers=workers,
-        )
-        follow(steps, f"predicting {out.name}")
-    return Predictions.load(out)
-
-
 def main(
     store: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
-    meshes: Path | None = None,
-    models: str = "modelnet10",
-    test: Path | None = None,
-    validation: Path | None = None,
+    test: Path,
+    validation: Path,
     measures: tuple[str, ...] = (),
     policies: tuple[str, ...] = (),
     objects: int | None = None,
@@ -437,61 +295,35 @@ def main(
     runs: int = 10,
     samples: int = 1000,
     seed: int = 0,
-    workers: int | None = None,
 ) -> None:
     """Compare the measures.
 
     Args:
-        store: view store made by nextview-lab render.
+        store: view store that holds the measures.
         out: folder of the results.
-        meshes: the dataset folder that the store was rendered from, for measures that need the
-            mesh.
-        models: bundled models by name, or a folder with models of your own; of these the
-            recogniser.
-        test: predictions of the test split, if there are some; else OUT/test.npz, made by the
-            models.
-        validation: of training objects that the recogniser has not seen; else OUT/validation.npz.
-        measures: names, or MODULE:FUNCTION of your own; by default all that the store then holds,
-            and the confidence.
+        test: predictions of the test split.
+        validation: of training objects that the recogniser has not seen.
+        measures: names, or MODULE:FUNCTION of your own; by default all that the store holds, and
+            the confidence.
         policies: others in the same table, as nextview-lab benchmark names them.
         objects: only so many of each split, spread evenly, as nextview-lab measure takes them.
         views: after which policies are compared.
         runs: random first views of each object.
         samples: of the bootstrap.
         seed: of everything random.
-        workers: processes; one for each core by default.
     """
     if not views or min(views) < 2:
         raise UsageError("policies are compared after two views or more")
-    out.mkdir(parents=True, exist_ok=True)
-    given: list[tuple[Path | None, Split]] = [(test, "test"), (validation, "train")]
-    found = [
-        path or out / f"{name}.npz"
-        for (path, _), name in zip(given, ("test", "validation"), strict=True)
-    ]
-    tables = [
-        Predictions.load(path) if path else predicted(to, store, models, split, workers)
-        for (path, split), to in zip(given, found, strict=True)
-    ]
+    tables = [Predictions.load(path) for path in (test, validation)]
     tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
     tables = [replace(p, store=str(store.resolve())) for p in tables]
     if set(tables[0].names) & set(tables[1].names):
         raise UsageError(
-            f"{found[1]}: holds objects of {found[0]}: peak or valley would be chosen on what is"
+            f"{validation}: holds objects of {test}: peak or valley would be chosen on what is"
             " judged"
         )
     if tables[0].classes != tables[1].classes:
-        raise UsageError(f"{found[1]}: is of other classes than {found[0]}")
-    rows = np.flatnonzero(
-        np.isin(ViewStore.open(store).names, [*tables[0].names, *tables[1].names])
-    )
-    wanted = [name for name in measures if name != CONFIDENCE]
-    if meshes is not None:
-        steps = measure_meshes(store, meshes, wanted or ["all"], workers, objects=rows)
-    else:
-        steps = measure(store, wanted, workers, objects=rows)
-    if wanted or not measures:
-        follow(steps, f"measuring {store.name}")
+        raise UsageError(f"{validation}: is of other classes than {test}")
     names = list(measures) or [*ViewStore.open(store).measures, CONFIDENCE]
     numbers: list[tuple] = []
     comparing = study(
@@ -503,20 +335,15 @@ def main(
         columns=["measure", "label", "quantity", "value", "low", "high", "p"],
     )
     table["p_holm"] = holm(table["p"].to_numpy())
-    drawn = figure(table, views)
     wide = readable(table, views)
-    text = markdown(wide)
-    write_figures(out, {"measures": drawn}, {"table": wide}, overwrite=True)
+    text = markdown(wide.columns, wide.to_numpy().tolist())
+    text += "\n\\* p < 0.05 after Holm's correction.\n"
+    out.mkdir(parents=True, exist_ok=True)
     with new_file(out / "measures.csv", True) as part:
         table.to_csv(part, index=False)
     with new_file(out / "measures.md", True) as part:
         part.write_text(text, encoding="utf-8")
-    to_png(drawn, out / "measures.png")
     print(text, end="")
-    console.print(
-        f"{out}: measures.md, table.csv, table.tex, measures.csv and the figure measures.png are"
-        " written"
-    )
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from scipy.fft import irfft, irfft2, rfft, rfft2
 
 from nextview_lab.data.measures import MEASURES as BUILT_IN
 from nextview_lab.data.measures import Measure, MeasuredView
-from nextview_lab.thesis.saliency import saliency_of
 from nextview_lab.thesis.surfaces import MeshView
 
 CURVATURES = 32
@@ -250,20 +249,6 @@ def fused_descriptor(view: MeasuredView) -> float:
     return float(
         (4 * variance + min(bits(counts / n) / 8, 1) + max(vollath, 0) / squares) / 3
     )
-
-
-@rated("mesh", "Lee et al. 2005")
-def mesh_saliency(view: MeshView) -> float:
-    """Saliency of the visible surface, integrated over it.
-
-    Lee et al. 2005, Secord et al. 2011, Dutagaci et al. 2010; thesis, section 3.4.4. Lee sums over
-    the visible vertices; as meshes have many vertices here and few there, each counts by the area
-    around it instead.
-
-    Returns:
-        Object radii; 0 on a sphere, or where nothing is seen.
-    """
-    return float((saliency_of(view.surface)[view.pixels[0]] * view.seen_area).sum())
 
 
 @rated("depth", "Polonsky et al. 2005")

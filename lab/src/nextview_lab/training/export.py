@@ -32,8 +32,6 @@ from nextview_lab.data.splits import deduplicate
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import extras
 from nextview_lab.training.architectures import (
-    LiteNet,
-    ResNet,
     map_network,
     recogniser_network,
 )
@@ -295,10 +293,11 @@ def export_recogniser(
             f"{folders[0]} and the others have no validation object of {store} in common"
         )
 
-    networks = [
-        run_network(each, recipe, views)
-        for each, recipe in zip(folders, recipes, strict=True)
-    ]
+    networks = []
+    for each, recipe in zip(folders, recipes, strict=True):
+        azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
+        network = recogniser_network(recipe, len(views.classes), azimuths)
+        networks.append(load_run(network, each))
     shipped = ShippedRecogniser(networks).eval()
 
     card = ModelCard(
@@ -326,25 +325,6 @@ def export_recogniser(
     scores = partial(recogniser_scores, labels=views.labels[judging])
     made = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
     return _export(made, out, bits, track)
-
-
-def run_network(
-    run: Path,
-    recipe: RecogniserRecipe,
-    views: ViewStore,
-) -> ResNet | LiteNet:
-    """Load the recogniser of a finished run.
-
-    Args:
-        run: folder of the run.
-        recipe: of the run.
-        views: view store of the training.
-
-    Returns:
-        The network, in evaluation mode.
-    """
-    azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
-    return load_run(recogniser_network(recipe, len(views.classes), azimuths), run)
 
 
 def export_map(

@@ -33,7 +33,6 @@ from nextview.recognition.map_names import in_order
 from nextview.runtime import open_onnx
 from nextview.types import Float, Float32, Floats
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.scene_views import scenes_of
 from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
 from nextview_lab.training.export import export_onnx
@@ -158,7 +157,6 @@ def walk(
             policy,
             recipe.max_views - 1,
             rng,
-            VISIBILITY in recipe.inputs,
         ):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
@@ -536,23 +534,17 @@ def _load(
     everything = np.arange(len(table))
     if validation is None:
         # few objects have one fold each
-        folds = min(folds, len(np.unique(_shapes(table), axis=0)))
-        validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
+        folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
+        validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
         validating = [np.arange(len(other))]
-        learning = [everything[~np.isin(_targets(table), _targets(other))]]
+        learning = [everything[~np.isin(table.names, other.names)]]
         validated_on = f"{len(other)} others"
     rng = np.random.default_rng([recipe.seed, 1])
-    scenes = scenes_of(table)
-    others = scenes if validation is None else scenes_of(other)
-    learned = [
-        ReplayTable.select(table, part, rng, variants, scenes) for part in learning
-    ]
-    validated = [
-        ReplayTable.select(other, part, rng, variants, others) for part in validating
-    ]
+    learned = [ReplayTable.select(table, part, rng, variants) for part in learning]
+    validated = [ReplayTable.select(other, part, rng, variants) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split"
     if sensed:
@@ -581,33 +573,18 @@ def _load(
     return _Data(learned, validated, objects, validated_on, about, rng)
 
 
-def _shapes(p: Predictions) -> Floats:
-    """Return rows that are equal for equal shapes, (N, ...).
-
-    Shapes are compared by their views, in scenes by their names.
-    """
-    if scenes_of(p) is None:
-        return p.depth_entropy
-    return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
-
-
-def _targets(p: Predictions) -> list[str]:
-    """Return the names of the objects, without their scenes."""
-    return [name.partition("@")[0] for name in p.names]
-
-
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     """Reject predictions that lack inputs of the policy."""
     lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
     if lacking:
-        known = ", ".join((*INPUTS, VISIBILITY, *in_order(p.maps)))
+        known = ", ".join((*INPUTS, *in_order(p.maps)))
         raise PredictionsError(
             f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}"
         )
 
-    if VISIBILITY in recipe.inputs and scenes_of(p) is None:
+    if VISIBILITY in recipe.inputs:
         raise PredictionsError(
-            f"{path}: contains no scenes, and without them everything is visible; choose other"
+            f"{path}: holds no visibility, as nothing stands around the objects; choose other"
             " --inputs"
         )
 

@@ -220,8 +220,7 @@ class GainRecipe:
 
     Attributes:
         inputs: inputs of the networks: belief, view, place, azimuth_bin and any maps of the
-            predictions; in scenes also visibility, the expected visible share of the object from
-            each view.
+            predictions.
         frame: origin of the azimuths: that of the camera, or azimuth bin 0 of the object, which
             needs a recogniser with azimuth bins.
         objective: value of a view: the belief in the true class after it, its logarithm, or whether

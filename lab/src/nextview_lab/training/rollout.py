@@ -15,7 +15,6 @@ from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 from nextview.types import Float, Index
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.scene_views import SceneSight, scenes_of, sight_of
 from nextview_lab.errors import PredictionsError
 from nextview_lab.training.card_fits import calibration_of
 from nextview_lab.training.fitting_set import for_fitting
@@ -26,15 +25,13 @@ OBJECTIVES = ("belief", "log-belief", "right")
 
 @dataclass(frozen=True)
 class ReplayTable:
-    """Outputs of held-out models for N objects, calibrated, and their scenes.
+    """Outputs of held-out models for N objects, calibrated.
 
     Attributes:
         data: the predictions.
-        scenes: scenes around the objects; None if they stand alone.
     """
 
     data: Predictions
-    scenes: SceneSight | None = None
 
     @classmethod
     def select(
@@ -43,7 +40,6 @@ class ReplayTable:
         kept: NDArray,
         rng: Generator,
         sensed: Sequence[Predictions] = (),
-        scenes: SceneSight | None = None,
     ) -> "ReplayTable":
         """Select some of the objects of predictions.
 
@@ -54,7 +50,6 @@ class ReplayTable:
             kept: indices of the objects.
             rng: source of all random numbers.
             sensed: predictions of the same objects through sensors.
-            scenes: scenes of the objects; None for those of the predictions.
 
         Returns:
             The table.
@@ -66,12 +61,7 @@ class ReplayTable:
             raise PredictionsError("no object is left to learn from")
         parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
         data = Predictions.joined(parts)
-        scenes = scenes or scenes_of(predictions)
-        data = replace(data, calibration=calibration_of(data, rng))
-        return cls(
-            data,
-            None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))),
-        )
+        return cls(replace(data, calibration=calibration_of(data, rng)))
 
 
 @dataclass(frozen=True)
@@ -96,7 +86,6 @@ def rollout(
     policy: Policy,
     n_views: int,
     rng: Generator,
-    visibility: bool = False,
 ) -> Iterator[DecisionState]:
     """Follow a policy once over every object from a random first view.
 
@@ -105,24 +94,14 @@ def rollout(
         policy: the policy.
         n_views: views of each episode.
         rng: source of all random numbers.
-        visibility: whether the policy needs the expected visibility.
 
     Yields:
         The state of all episodes after each view.
     """
     data = table.data
     sphere = table.data.sphere
-    everything = np.arange(len(table.data))
 
     starts = rng.integers(len(sphere), size=len(data))
-    if table.scenes is not None:
-        starts = np.where(
-            table.scenes.reachable,
-            rng.random(table.scenes.reachable.shape),
-            -1,
-        ).argmax(1)
-
-    constrain, visible = sight_of(table.scenes, everything)
     length = FixedLength(max_views=n_views)
     run = run_episodes(
         data.evidence,
@@ -132,8 +111,6 @@ def rollout(
         length,
         rng,
         data.calibration,
-        constrain,
-        visible,
     )
 
     visited = np.zeros((len(data), len(sphere)), bool)
@@ -156,9 +133,6 @@ def rollout(
             k,
             step.episodes,
             azimuth_bins,
-        )
-        state = constrain(
-            replace(state, visibility=visible(state) if visibility else None)
         )
         yield DecisionState(state, step.total, travel, step.seen)
 

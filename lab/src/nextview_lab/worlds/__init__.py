@@ -1,1 +1,1 @@
-"""Drawn worlds: scenes, rooms, tables and the cameras in them."""
+"""Drawn worlds: tables, floors, bins, shelves and rooms, and the cameras in them."""

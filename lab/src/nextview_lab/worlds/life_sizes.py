@@ -37,7 +37,6 @@ LIFE_SIZES = {
     "table": LifeSize("height", 0.70, 0.78),
     "toilet": LifeSize("height", 0.68, 0.82),
 }
-ON_TABLES = ("monitor",)
 
 
 def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:

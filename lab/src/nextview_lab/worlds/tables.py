@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError, UsageError
@@ -24,7 +25,6 @@ from nextview.sensing.frame import Frame
 from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import Sensor
 from nextview.types import Float, Floats
-from nextview_lab.worlds.scene import footprint, separation
 
 WIDEST_GAP = 0.10  # metres, largest gap between neighbours
 TABLE_SIDES = (1.5, 1.1)  # metres
@@ -34,6 +34,9 @@ FLOOR_SIDE = 8.0  # metres
 STEP_OUTWARDS = 0.005  # metres, step in which an object is moved outwards until it fits
 MOST_STEPS = 200
 PLACEMENTS_TRIED = 100
+# margin of every footprint, metres, so that thin sheets have an area
+FOOTPRINT_EDGE = 1e-3
+_AROUND = FOOTPRINT_EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 TABLE_REACH = 0.36  # metres, largest distance of an object from the centre of the table
 
 
@@ -136,6 +139,39 @@ def _free_place(
         if np.linalg.norm(place) < TABLE_REACH:
             return place
     raise UsageError("the things do not fit on the table: take fewer, or smaller ones")
+
+
+def footprint(vertices: Float) -> Float:
+    """Return the convex hull of points in the top view, counter-clockwise, (K, 2).
+
+    Points are (V, 3) or (V, 2).
+    """
+    around = (vertices[:, None, :2] + _AROUND).reshape(-1, 2)
+    return around[ConvexHull(around).vertices]
+
+
+def separation(a: Float, b: Float) -> float:
+    """Return the distance of two convex polygons along the best separating edge normal.
+
+    It is a lower bound of the distance between corners, and negative if the polygons overlap.
+
+    Args:
+        a: corners, counter-clockwise, (K, 2); two points are a line.
+        b: corners, counter-clockwise, (L, 2).
+
+    Returns:
+        The distance.
+    """
+    return max(_gap(a, b), _gap(b, a))
+
+
+def _gap(a: Float, b: Float) -> float:
+    edges = np.roll(a, -1, axis=0) - a
+    outward = (
+        np.stack([edges[:, 1], -edges[:, 0]], 1)
+        / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
+    )
+    return float(((b @ outward.T).min(0) - (a * outward).sum(1)).max())
 
 
 class TableCamera:

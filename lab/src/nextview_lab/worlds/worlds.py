@@ -22,7 +22,16 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import SENSORS, Sensor
 from nextview.types import Float, Float32, Index, Mask
-from nextview_lab.worlds.solids import Solid, moved, random_solid, tube
+from nextview_lab.worlds.solids import (
+    Solid,
+    extruded,
+    joined,
+    lump,
+    moved,
+    random_solid,
+    ring_points,
+    tube,
+)
 
 # label of support surfaces: table tops, floors, boards, the bottoms of bins
 SURFACE = -1
@@ -415,7 +424,7 @@ def _level(
         ground,
         shapes,
         rng,
-        _number(rng),
+        int(rng.choice([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24])),
         gap,
         float(rng.choice([0, 0.2, 0.4, 0.7])),
     )
@@ -438,7 +447,8 @@ def _table_top(
             at = side * (width / 2 + 0.02) * np.array([-np.sin(yaw), np.cos(yaw)])
             world.add(slab((length, 0.04, 0.08), at, rail, yaw), BACKGROUND)
     if not belt and rng.random() < 0.25:
-        world.add((_disc(max(length, width) / 2)), SURFACE)
+        disc = extruded([ring_points(max(length, width) / 2, 40)], 0.03)
+        world.add(moved(disc, by=(0, 0, -0.03)), SURFACE)
         width = length = max(length, width)
     else:
         world.add(
@@ -453,13 +463,6 @@ def _table_top(
             corner = Rotation.from_euler("z", yaw).apply([*corner, 0])[:2]
             world.add(slab((0.05, 0.05, height), corner, -0.03, yaw), BACKGROUND)
     return width / 2
-
-
-def _disc(radius: float) -> Solid:
-    """Return a round table top with its upper side at z = 0."""
-    from nextview_lab.worlds.solids import extruded, ring_points
-
-    return moved(extruded([ring_points(radius, 40)], 0.03), by=(0, 0, -0.03))
 
 
 def _behind(
@@ -491,8 +494,6 @@ def _behind(
 
 def _person(rng: Generator) -> Solid:
     """Return a standing or sitting figure made of capsules, on z = 0, metres."""
-    from nextview_lab.worlds.solids import joined, lump
-
     tall = rng.uniform(1.2, 1.9)
     head = lump(rng)
     parts = [
@@ -536,11 +537,6 @@ def _hands(world: World, rng: Generator) -> None:
         world.add(tube(finger, np.full(5, rng.uniform(0.008, 0.014))), BACKGROUND)
     arm = np.linspace(palm, palm + 0.8 * out, 6)
     world.add(tube(arm, np.full(6, rng.uniform(0.03, 0.06))), BACKGROUND)
-
-
-def _number(rng: Generator) -> int:
-    """Draw the number of objects: one, a few, or many."""
-    return int(rng.choice([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24]))
 
 
 def _fill(
