@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nextview.recognition.model_card import Symmetry
+from nextview.things.point_pairs import PointPairs
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.view_templates import ALL_AROUND, ViewTemplates, templates_of
 from nextview.types import Float, Float32, Index, Mask
@@ -71,6 +72,7 @@ class Library:
         )
         self.centres = self.caster.centres.astype(np.float64)
         self.radii = self.caster.radii.astype(np.float64)
+        self.pairs = PointPairs.of(self.templates)
         self.corners = np.stack(
             [
                 vertices[(vertices @ ALL_AROUND.T).argmax(0)]

@@ -10,17 +10,17 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.view import Segment, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
 from nextview.things.score import score
-from nextview.things.view_templates import SeenOutline
 from nextview.types import Float, Mask
 
 LIKELY_THINGS = 20  # things of which all orientations are tried
 ORIENTATIONS = 5  # of every other thing
 ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+OF_PAIRS = 30  # poses of every thing that pairs of points propose
+REGISTERED = 700
 LEAST_MATCH = (
     0.1  # of the best hypothesis of a segment, below which it shows none of the things
 )
@@ -67,23 +67,16 @@ def _of_segment(
 ) -> Hypotheses | None:
     """Propose what one segment may show."""
     mask = segment.mask
-    hiding = view.hiding(mask, HIDING_MARGIN)
-    unclear = hiding & False if segment.unclear is None else segment.unclear & ~hiding
-    camera = PinholeCamera.of(view.frame.intrinsics, mask.shape)
-    seen = SeenOutline.of(view.depth, mask, unclear, hiding, camera, view.camera)
-    if seen is None:
+    things, rotations, centres, _ = library.pairs.propose(view, mask, OF_PAIRS)
+    some = among[things]
+    found = Hypotheses.of(things[some], rotations[some], centres[some])
+    if not len(found):
         return None
-    given = library.templates.propose(seen, among)
-    if not len(given.things):
-        return None
-    likely = np.argsort(given.of_things)[:LIKELY_THINGS]
-    few = ORIENTATIONS_HIDDEN if seen.hidden else ORIENTATIONS
-    some = (given.ranks < few) | np.isin(given.things, likely)
-    found = Hypotheses.of(
-        given.things[some], given.rotations[some], given.centres[some]
-    )
     outline = Outline.of(mask)
-    found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
+    found = register(library, [view], found, (0.3,), 32, outline)
+    match = matched(library, view, found, mask, 32)
+    found = found[np.argsort(-match)[:REGISTERED]]
+    found = register(library, [view], found, (0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
     if match.max() < LEAST_MATCH:
         return None
