@@ -308,17 +308,18 @@ def _find_offset(posed: PosedViews) -> str:
         return compare(some.views, poses)
 
     few = _some(posed)
-    starts = np.stack(np.meshgrid(*[(-0.08, 0, 0.08)] * 3), -1).reshape(-1, 3)
-    start = min(starts, key=lambda offset: moved(few, offset).wrong)
+
+    def contradicted(offset: Float) -> float:
+        return moved(few, offset).wrong
+
+    starts = np.stack(np.meshgrid(*[(-0.08, 0.0, 0.08)] * 3), -1).reshape(-1, 3)
+    start = starts[int(np.argmin([contradicted(offset) for offset in starts]))]
+    simplex = start + 0.03 * np.eye(4, 3, -1)
     found = minimize(
-        lambda offset: moved(few, offset).wrong,
+        contradicted,
         start,
         method="Nelder-Mead",
-        options={
-            "maxfev": 120,
-            "initial_simplex": start + 0.03 * np.eye(4, 3, -1),
-            "xatol": 1e-3,
-        },
+        options={"maxfev": 120, "initial_simplex": simplex, "xatol": 1e-3},
     ).x
     large = np.linalg.norm(found) >= 0.02  # smaller ones are calibration errors
     if not large or not explains(

@@ -18,7 +18,7 @@ from nextview.sensing.facets import noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import find_plane, sample
 from nextview.sensing.registration import CAMERA_AIM, CAMERA_PLACE, tolerance_of
-from nextview.types import Float, Float32, Mask
+from nextview.types import Float, Float32, Index, Mask
 
 COLUMNS = 160  # of the image in which points are looked up, about
 # standard deviations of the error of two usual camera poses: rough, and sharp
@@ -212,7 +212,7 @@ def compare(
 
 
 def _looked_up(
-    view: SurfaceView, at: Float, z: Float, limit: Float
+    view: SurfaceView, at: Index, z: Float, limit: Float
 ) -> tuple[Mask, Mask]:
     """Return which points an image confirms, and which it contradicts.
 

@@ -38,7 +38,6 @@ from nextview.types import Float
 REFUSED = 0.01  # probability that a frame is right below which it is refused
 WARNED = 0.5  # the same, below which a warning is given
 TOLD = np.log(10)  # nats of a fact that is told
-OTHER_WORLD = 1e-3  # prior of a target, or of earlier frames, in another world
 RARE_FACT = np.log(1e-4)  # of what few right frames show
 IMPOSSIBLE = np.log(1e-6)  # of what no right frame shows
 WORLD_CHANGED = np.log(0.05)  # of a world in which nothing need agree any more
@@ -330,8 +329,6 @@ class Reading:
         agreement: nats of the agreement with the last frame.
         flatness: nats of the samples that lie on planes.
         mistake: that is undone; None for none.
-        sentence: of the mistake.
-        prior: probability of the mistake.
     """
 
     frame: Frame
@@ -343,8 +340,6 @@ class Reading:
     agreement: float = 0.0
     flatness: float = 0.0
     mistake: Mistake | None = None
-    sentence: str = ""
-    prior: float = 1.0
 
     def facts(self) -> list[Fact]:
         """Return what tells for and against this reading."""
@@ -452,29 +447,20 @@ class Reading:
         right = mistake.undone(PosedViews(views, self.poses))
         alone = np.stack([self.poses[0], right.poses[1]])
         plane = self.plane
-        changed = {
-            "mistake": mistake,
-            "sentence": mistake.sentence,
-            "prior": mistake.prior,
-        }
-        if mistake.scale > 1:
-            if plane is not None:
-                plane = replace(plane, offset=plane.offset / mistake.scale)
-            scale = 1 / mistake.scale
-            other = replace(
-                self, plane=plane, depths=scale * self.depths, scale=scale, **changed
-            )
-            return [other.agreeing(right.views, right.poses)]
-        if mistake.focal != 1 and plane is not None:
+        if plane is not None and mistake.scale > 1:
+            plane = replace(plane, offset=plane.offset / mistake.scale)
+        if plane is not None and mistake.focal != 1:
             normal = plane.normal * [mistake.focal, mistake.focal, 1]
             length = float(np.linalg.norm(normal))
             plane = Plane(normal / length, plane.offset / length)
+        other = replace(self, plane=plane, mistake=mistake)
+        if mistake.scale > 1:
+            scale = 1 / mistake.scale
+            other = replace(other, depths=scale * self.depths, scale=scale)
+            return [other.agreeing(right.views, right.poses)]
         tried = [alone, right.poses] if mistake.scale < 1 else [alone]
         return [
-            replace(self, plane=plane, poses=poses, **changed).agreeing(
-                right.views, poses
-            )
-            for poses in tried
+            replace(other, poses=poses).agreeing(right.views, poses) for poses in tried
         ]
 
     def agreeing(self, views: Sequence[SurfaceView], poses: Float) -> Reading:
@@ -541,62 +527,72 @@ def check_mistakes(seen: SegmentedFrame, known: KnownFrames) -> list[ViewWarning
     read = Reading(frame, known, plane, _depths(frame), poses)
     if known.frames:
         read = replace(read, agreement=agree(views, poses))
-    as_read = np.array([fact.nats for fact in read.facts()])
-
-    others = _of_other_worlds(read)
+    others = []
+    if known.target is not None:
+        words = "target and pose are of different worlds"
+        other = replace(read, known=replace(known, target=None))
+        others.append(replace(other, mistake=Mistake("world", words)))
+    if known.frames:
+        words = "the pose is of another world than the last one"
+        other = replace(read, known=replace(known, frames=()), agreement=0.0)
+        others.append(replace(other, mistake=Mistake("world", words)))
     stored = Stored(frame.intrinsics[0, 0], step=0.001 if frame.counted else 0.0)
+    of_focal_length = []
     for mistake in mistakes(stored):
         if mistake.name == "range":
-            others.append(
-                replace(
-                    read,
-                    # if all samples lie on a plane in one reading, and none in the other
-                    flatness=320.0 * flatter,
-                    sentence=mistake.sentence,
-                    prior=mistake.prior,
-                )
-            )
+            # nats if all samples lie on a plane in one reading, and none in the other
+            other = replace(read, flatness=320.0 * flatter, mistake=mistake)
+            others.append(other)
+        elif mistake.focal != 1:
+            of_focal_length += read.without(mistake, views if known.frames else ())
         elif mistake.prior and (frame.pose is not None or mistake.scale > 1):
             others += read.without(mistake, views if known.frames else ())
+
+    told = _told(read, others)
+    if told is not None:
+        right, warning = told
+        if right < REFUSED:
+            raise ObservationError(warning.message)
+        return [replace(warning, message=f"{warning.message}?")]
+    told = _told(read, of_focal_length)
+    if told is None:
+        return []
+    # the plane may be a ramp
+    return [ViewWarning("intrinsics", told[1].message, holds=False)]
+
+
+def _told(read: Reading, others: Sequence[Reading]) -> tuple[float, ViewWarning] | None:
+    """Return the probability that a frame is right, and what is said; None for nothing.
+
+    Args:
+        read: the frame as it was handed in.
+        others: readings with a mistake undone.
+    """
+    facts = read.facts()
+    as_read = np.array([fact.nats for fact in facts])
     gains = np.array([[fact.nats for fact in one.facts()] for one in others]) - as_read
-    nats = gains.sum(1) + np.log([one.prior for one in others])
+    undone = [one.mistake for one in others if one.mistake is not None]
+    nats = gains.sum(1) + np.log([mistake.prior for mistake in undone])
     right = 1 / (1 + np.exp(np.minimum(nats, 500)).sum())
     if right >= WARNED:
+        # few right frames show what this one does
         rare = (as_read <= RARE_FACT) & (gains > TOLD).any(0)
         if not rare.any():
-            return []
+            return None
         nats = np.where((gains[:, rare] > TOLD).any(1), nats, -np.inf)
 
     best = int(nats.argmax())
-    told = np.argsort(-gains[best])
-    told = told[gains[best, told] >= min(TOLD, gains[best].max())]
-    facts = [read.facts()[row] for row in told]
-    likely = [
-        others[row].sentence for row in np.flatnonzero(nats > nats[best] - np.log(3))
-    ]
-    named = dict.fromkeys(likely)  # each once
-    words = f"{', and '.join(fact.words for fact in facts)}: {'; or '.join(named)}"
-    if right < REFUSED:
-        raise ObservationError(words)
-    chosen = others[best].mistake
-    if chosen is not None and chosen.focal != 1:  # a ramp is no mistake
-        return [ViewWarning("intrinsics", f"{words}?", holds=False)]
-    return [ViewWarning(facts[0].warning, f"{words}?")]
-
-
-def _of_other_worlds(read: Reading) -> list[Reading]:
-    """Return the readings in which the pose has nothing to do with what is known."""
-    found = []
-    if read.known.target is not None:
-        words = "target and pose are of different worlds"
-        known = replace(read.known, target=None)
-        found.append(replace(read, known=known, sentence=words, prior=OTHER_WORLD))
-    if read.known.frames:
-        words = "the pose is of another world than the last one"
-        known = replace(read.known, frames=())
-        other = replace(read, known=known, agreement=0.0)
-        found.append(replace(other, sentence=words, prior=OTHER_WORLD))
-    return found
+    order = np.argsort(-gains[best])
+    told = order[gains[best, order] >= min(TOLD, gains[best].max())]
+    # each mistake once, and of focal lengths the likeliest
+    named: dict[str, str] = {}
+    for row in np.argsort(-nats, kind="stable"):
+        one = undone[row]
+        if nats[row] > nats[best] - np.log(3):
+            named.setdefault(one.sentence if one.focal == 1 else one.name, one.sentence)
+    words = ", and ".join(facts[row].words for row in told)
+    message = f"{words}: {'; or '.join(named.values())}"
+    return right, ViewWarning(facts[told[0]].warning, message)
 
 
 def _coincidence(difference: float, error: float) -> float:

@@ -254,7 +254,7 @@ def _of_focal_length(log_times: float, stored: Stored) -> Mistake:
         f" {'long' if wrong > 0 else 'short'} ({given:.0f} pixels, about {times * given:.0f} fit):"
         " are these the intrinsics of another camera or picture size?"
     )
-    return Mistake("focal length", sentence, prior=1e-5, focal=times)
+    return Mistake("focal length", sentence, prior=3e-3, focal=times)
 
 
 # Changes of camera-to-world poses, (N, 4, 4)

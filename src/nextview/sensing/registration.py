@@ -359,11 +359,12 @@ def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement 
     )
     distance = float(np.linalg.norm(np.median(surface.points, 0)))
     expected = float(np.hypot(CAMERA_PLACE, CAMERA_AIM * distance))
-    steps = list(
-        zip(OF_OBJECT, FARTHEST_MOTION * expected * np.array(FURTHER), strict=True)
-    )
+    steps = [
+        (reach, FARTHEST_MOTION * expected * further)
+        for reach, further in zip(OF_OBJECT, FURTHER, strict=True)
+    ]
     deviations = np.repeat([1e-9, expected], 3)
-    pairs = [pair for one in others for pair in permutations((one, surface))]
+    pairs = [pair for one in others for pair in permutations((one, surface), 2)]
 
     last = -earlier[-1].shift
     best = None
@@ -419,7 +420,8 @@ class CameraOffset:
     @property
     def noticed(self) -> bool:
         """True if the error exceeds its uncertainty; of exact cameras one in a thousand does."""
-        return deviations_of(self.motion, self.covariance) ** 2 > chdtri(6, 0.001)
+        squared = deviations_of(self.motion, self.covariance) ** 2
+        return bool(squared > chdtri(6, 0.001))
 
     @property
     def correction(self) -> Float:
@@ -458,8 +460,12 @@ def camera_offsets(moments: Sequence[Sequence[Frame]]) -> list[CameraOffset]:
         ]
     expected = FARTHEST_MOTION * CAMERA_PLACE
     deviations = np.repeat([FARTHEST_MOTION * CAMERA_AIM, expected], 3)
-    # three steps each, as a camera also turns
-    steps = np.repeat(np.stack([OF_CAMERA, expected * np.array(FURTHER)], 1), 3, axis=0)
+    # three times, as a camera also turns
+    steps = [
+        (reach, expected * further)
+        for reach, further in zip(OF_CAMERA, FURTHER, strict=True)
+        for _ in range(3)
+    ]
     fit = registered(pairs, np.zeros((len(names), 6)), deviations, steps)
     return [
         CameraOffset(
