@@ -200,7 +200,7 @@ def find_plane(
     samples: Samples,
     rng: Generator,
     up: Float | None = None,
-    above: Float | None = None,
+    upright: bool = False,
 ) -> Plane | None:
     """Find the plane with the most samples by RANSAC (Fischler and Bolles 1981).
 
@@ -208,10 +208,10 @@ def find_plane(
         samples: the samples.
         rng: source of all random numbers.
         up: normal of the plane, up to a small tilt, (3,); None for any plane.
-        above: point above the plane, such as the camera position, (3,); None for none.
+        upright: whether ``up`` lies in the plane instead, as in a wall.
 
     Returns:
-        The plane; None if no plane has enough samples.
+        The plane, with the camera above it; None if no plane has enough samples.
     """
     points = samples.points
     if len(points) < 10:
@@ -219,24 +219,27 @@ def find_plane(
     a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
     normals = np.cross(b - a, c - a)
     if up is not None:
-        # one point is enough if the normal is known; triples find slightly tilted planes
-        normals[::2] = up
+        # fewer points are enough if the normal is known; triples find slightly tilted planes
+        normals[::2] = np.cross(b - a, up)[::2] if upright else up
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 0] / length[length > 0, None]
     through = a[length > 0]
     offsets = -(normals * through).sum(1)
-    turn = np.where(
-        (normals @ samples.camera + offsets if up is None else normals @ up) < 0,
-        -1,
-        1,
-    )
+    over = normals @ samples.camera + offsets
+    level = up is not None and not upright
+    turn = np.where((normals @ up if level else over) < 0, -1, 1)
     normals = normals * turn[:, None]
     offsets = offsets * turn
-    fits = normals @ samples.camera + offsets > 0
-    if up is not None:
-        fits &= normals @ up > TILT
-    if above is not None:
-        fits &= normals @ above + offsets > np.median(samples.tolerance)
+    fits = over * turn > 0
+
+    def tilted(normals: Float) -> Float:
+        """Return the cosine of the tilt of planes against what is searched."""
+        if up is None:
+            return np.ones(normals.shape[:-1])
+        rise = normals @ up
+        return np.sqrt(np.maximum(1 - rise**2, 0)) if upright else rise
+
+    fits &= tilted(normals) > TILT
     normals = normals[fits]
     offsets = offsets[fits]
     if len(normals) == 0:
@@ -245,14 +248,13 @@ def find_plane(
     away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
     away += (offsets + normals @ samples.camera).astype(np.float32)
     count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
-    if up is not None:
-        # A strongly tilted plane is more likely to pass through objects than to support them.
-        count = count * (1 - (1 - normals @ up) / (1 - STEEPEST_SUPPORT))
+    # A strongly tilted plane is more likely to pass through objects than to support them.
+    count = count * (1 - (1 - tilted(normals)) / (1 - STEEPEST_SUPPORT))
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
-    level = up is None or plane.normal @ up > TILT
     least = LEAST_ALONE if up is None else LEAST_SUPPORT
-    return plane if level and plane.holds(samples).mean() > least else None
+    fits_well = tilted(plane.normal) > TILT and plane.holds(samples).mean() > least
+    return plane if fits_well else None
 
 
 def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
