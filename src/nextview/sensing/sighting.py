@@ -13,7 +13,6 @@ from nextview.errors import ObservationError
 from nextview.sensing.facets import SIZE, Facets, Noise, fit_facets
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import ObjectFrame, enclose
-from nextview.sensing.outliers import without_outliers
 from nextview.sensing.planes import Plane
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
@@ -101,8 +100,6 @@ def sighting_of(
         coarse,
         noise,
     )
-    if denoise and len(facets.planes):
-        facets = without_outliers(facets, noise, coarse)
     if len(facets.planes) * coarse**2 < FEWEST_OBJECT_PIXELS:
         raise ObservationError(TOO_LITTLE)
 
