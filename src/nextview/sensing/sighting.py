@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.errors import ObservationError
@@ -20,6 +21,8 @@ from nextview.types import Float, Mask
 FEWEST_OBJECT_PIXELS = 60  # least number of pixels of an object in a frame
 # frames with a smaller share of the largest number of pixels are not used to estimate the size
 LEAST_VIEW_PART = 0.1
+GROUP_GAP = 6  # pixels between isolated groups of facets
+LEAST_GROUP = 0.01  # share of all facets in an isolated group that counts
 MOST_HULL_POINTS = 3000  # approximate number of points for the convex hull
 TOO_LITTLE = "too little is seen of the object"
 
@@ -100,6 +103,8 @@ def sighting_of(
         coarse,
         noise,
     )
+    if denoise and len(facets.planes):
+        facets = facets.some(_in_large_groups(facets, noise, coarse))
     if len(facets.planes) * coarse**2 < FEWEST_OBJECT_PIXELS:
         raise ObservationError(TOO_LITTLE)
 
@@ -109,6 +114,27 @@ def sighting_of(
     with suppress(QhullError):  # coplanar points are used as they are
         points = points[ConvexHull(points).vertices]
     return Sighting(frame, noise, facets, mask, points, plane)
+
+
+def _in_large_groups(facets: Facets, noise: Noise, coarse: int) -> Mask:
+    """Return which facets are not in a small isolated group, (N,) bool.
+
+    A fragment of the background, or of an edge, would determine the radius of the object. Groups
+    are apart by some pixels, or by as much in depth.
+    """
+    depth = facets.points[:, 2]
+    step = GROUP_GAP * float(facets.pitch.mean())
+    step += float(np.median(4 * noise.at(depth) * depth)) / coarse
+    at = (
+        facets.rows // coarse // GROUP_GAP,
+        facets.columns // coarse // GROUP_GAP,
+        (np.log(depth / depth.min()) / step).astype(np.int64),
+    )
+    at = tuple(index - index.min() for index in at)
+    cells = np.zeros([int(index.max()) + 1 for index in at], bool)
+    cells[at] = True
+    group = ndimage.label(cells, np.ones((3, 3, 3)))[0][at]
+    return np.asarray(np.bincount(group)[group] >= LEAST_GROUP * len(group))
 
 
 def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
