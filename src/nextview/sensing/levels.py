@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from scipy import ndimage
@@ -97,16 +98,31 @@ def levels_of(
             most instance pixels.
         earlier: levels of earlier frames; used if they are not visible in this one.
     """
+
+    def load(level: SurfaceLevel, carriers: Sequence[SurfaceLevel | None]) -> int:
+        """Return the number of instance pixels that a level carries."""
+        pairs = zip(masks, carriers, strict=True)
+        return sum(int(mask.sum()) for mask, carrier in pairs if carrier is level)
+
     levels = _found(frame, surface & (frame.depth > 0), noise, up)
-    if up is None:
-        levels = _parallel(levels, frame, masks)
+    if up is None and levels:
+        alone = [[carrier_of(mask, frame, [one]) for mask in masks] for one in levels]
+        worth = [
+            (load(one, carriers), one.pixels.sum())
+            for one, carriers in zip(levels, alone, strict=True)
+        ]
+        first = levels[worth.index(max(worth))]
+        along = [one.plane.normal @ first.plane.normal > TILT for one in levels]
+        levels = list(compress(levels, along))
     none = np.zeros(frame.shape, bool)
     hidden = [
         replace(level, pixels=none)
         for level in earlier
         if not any(_same(level, other, frame) for other in levels)
     ]
-    return _by_load([*levels, *hidden], frame, masks)
+    every = [*levels, *hidden]
+    carriers = [carrier_of(mask, frame, every) for mask in masks]
+    return sorted(every, key=lambda one: -load(one, carriers))
 
 
 def carriers_of(
@@ -192,23 +208,13 @@ def _hangs(mask: Mask, frame: Frame, plane: Plane, away: float) -> bool:
     bottom = float(np.quantile(height[own], BOTTOM_SHARE))
     low = own & (height < bottom + BOTTOM_MARGIN * away)
     ring = ndimage.binary_dilation(low, iterations=RING_WIDTH) & ~mask[part]
-    if not ring.any() or _cut_by_picture(low, part, frame.shape):
+    border = np.ones(frame.shape, bool)
+    border[1:-1, 1:-1] = False
+    if not ring.any() or (low & border[part]).any():
         return False
     depth = frame.depth[part]
     behind = depth[ring] > (1 + SURFACE_STEP) * float(np.median(depth[low]))
     return bool(behind.mean() > HANGING_SHARE)
-
-
-def _cut_by_picture(
-    low: Mask, part: tuple[slice, slice], shape: tuple[int, int]
-) -> bool:
-    """Return True if pixels of a part of an image touch the image border."""
-    rows, columns = np.nonzero(low)
-    sides = ((rows, part[0].start, shape[0]), (columns, part[1].start, shape[1]))
-    for index, start, size in sides:
-        if index.min() + start == 0 or index.max() + start == size - 1:
-            return True
-    return False
 
 
 def _found(
@@ -314,47 +320,6 @@ def points_of(mask: Mask, frame: Frame) -> Float:
     rows, columns = np.nonzero(mask[part] & (frame.depth[part] > 0))
     few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
     return frame.positions(rows[few] + part[0].start, columns[few] + part[1].start)
-
-
-def _load(level: SurfaceLevel, frame: Frame, masks: Sequence[Mask]) -> int:
-    """Return the number of instance pixels that a level would carry on its own."""
-    return sum(
-        int(np.count_nonzero(mask))
-        for mask in masks
-        if carrier_of(mask, frame, [level])
-    )
-
-
-def _by_load(
-    levels: Sequence[SurfaceLevel],
-    frame: Frame,
-    masks: Sequence[Mask],
-) -> list[SurfaceLevel]:
-    """Sort levels by decreasing number of carried instance pixels."""
-    carriers = [carrier_of(mask, frame, levels) for mask in masks]
-    load = {
-        id(level): sum(
-            int(np.count_nonzero(mask))
-            for mask, carrier in zip(masks, carriers, strict=True)
-            if carrier is level
-        )
-        for level in levels
-    }
-    return sorted(levels, key=lambda level: -load[id(level)])
-
-
-def _parallel(
-    levels: Sequence[SurfaceLevel],
-    frame: Frame,
-    masks: Sequence[Mask],
-) -> list[SurfaceLevel]:
-    """Return the levels parallel to the one with the largest load, if up is not known."""
-    if not levels:
-        return []
-    first = max(
-        levels, key=lambda level: (_load(level, frame, masks), level.pixels.sum())
-    )
-    return [level for level in levels if level.plane.normal @ first.plane.normal > TILT]
 
 
 def _same(earlier: SurfaceLevel, level: SurfaceLevel, frame: Frame) -> bool:

@@ -79,35 +79,18 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     Returns:
         The pixels of the part, (H, W) bool.
     """
-    depth = frame.depth[part]
-    height = frame.along(plane.normal, plane.offset, part)
-    least = np.float32(PLANE_SHARE) * depth
-    high = (height > least) & (depth > 0)
-
+    z = frame.depth[part]
     # Noise moves a point along its ray, so the height error depends on the slope of the ray.
-    of_columns, of_rows = _rise(frame, plane, part)
-    steepest = float(np.abs(of_columns).max() + np.abs(of_rows).max())
-    most_noise = PLANE_NOISE * float(noise.sigmas.max(initial=0.0))
-    unsure = height < least + np.float32(most_noise * steepest) * depth**2
-    unsure &= high
-
-    rows, columns = np.divmod(np.flatnonzero(unsure), high.shape[1])
-    z = depth[rows, columns]
-    rise = np.abs(of_columns[columns] + of_rows[rows])
-    high[rows, columns] = height[rows, columns] > z * (
-        PLANE_NOISE * noise.at(z) * z * rise + PLANE_SHARE
-    )
-    return high
+    least = PLANE_NOISE * noise.at(z) * z * np.abs(_rise(frame, plane, part))
+    height = frame.along(plane.normal, plane.offset, part)
+    return np.asarray((z > 0) & (height > z * (least + PLANE_SHARE)))
 
 
-def _rise(frame: Frame, plane: Plane, part: Part) -> tuple[Float32, Float32]:
-    """Return by how much rays rise over a plane with depth: a term of each column, one of each row.
-
-    The rise of a pixel's ray is the sum of its two terms.
-    """
+def _rise(frame: Frame, plane: Plane, part: Part) -> Float32:
+    """Return by how much the ray of each pixel rises over a plane with depth."""
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
     x, y = frame.rays
-    return a * x[part[1]], b * y[part[0]] + c
+    return a * x[part[1]] + (b * y[part[0]] + c)[:, None]
 
 
 def inside_mask(
@@ -152,8 +135,7 @@ def _above_on_average(
     z = frame.depth[part]
     own = mask[part] & (z > 0)
     height = frame.along(plane.normal, plane.offset, part)
-    of_columns, of_rows = _rise(frame, plane, part)
-    deviation = noise.at(z) * z**2 * np.abs(of_columns + of_rows[:, None])
+    deviation = noise.at(z) * z**2 * np.abs(_rise(frame, plane, part))
 
     on_plane = np.abs(height) < PLANE_NOISE * deviation + PLANE_SHARE * z
     beside = ~mask[part] & (z > 0) & on_plane

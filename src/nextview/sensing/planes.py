@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
@@ -118,16 +117,8 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
 def _block_sums(values: Floats, side: int) -> Float:
     """Return sums over squares of pixels; incomplete squares are left out."""
     height, width = (n // side for n in values.shape)
-    of_rows = _sums_along(values[: height * side], side)
-    return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
-
-
-def _sums_along(values: Floats, side: int) -> Floats:
-    """Return sums over ``side`` consecutive rows each, faster than a reduction over an axis."""
-    sums = values[::side].copy()
-    for first in range(1, side):
-        sums += values[first::side]
-    return sums
+    blocks = values[: height * side, : width * side].reshape(height, side, width, side)
+    return np.asarray(blocks.sum(3).sum(1), np.float64)
 
 
 @dataclass(frozen=True)
@@ -152,16 +143,6 @@ class Plane:
     def holds(self, samples: Samples) -> Mask:
         """Return which samples are on the plane, (N,) bool."""
         return np.abs(self.height(samples.points)) < samples.tolerance
-
-    def extent(self, samples: Samples) -> Float:
-        """Return the samples, (M, 3), in the largest connected part of the plane."""
-        on = self.holds(samples)
-        if not on.any():
-            return samples.points[on]
-        grid = np.zeros((samples.rows.max() + 1, samples.columns.max() + 1), bool)
-        grid[samples.rows, samples.columns] = on
-        part = ndimage.label(grid)[0][samples.rows, samples.columns]
-        return samples.points[on & (part == np.bincount(part[on]).argmax())]
 
 
 def axes_along(plane: Plane) -> Float:
@@ -257,19 +238,18 @@ def find_plane(
     return plane if fits_well else None
 
 
-def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
+def refine_plane(plane: Plane, samples: Samples) -> Plane:
     """Fit a plane to the samples near it by least squares, three times.
 
     Args:
         plane: the plane.
         samples: the samples.
-        loose: multiple of the tolerance within which samples are used.
 
     Returns:
         The refined plane; the plane itself if fewer than ten samples are near.
     """
     points = samples.points
-    tolerance = loose * samples.tolerance
+    tolerance = samples.tolerance
     for _ in range(3):
         on = np.abs(plane.height(points)) < tolerance
         if on.sum() < 10:
@@ -310,24 +290,5 @@ def gain_as_range(
     )
     other = find_plane(nearer, deepcopy(rng), up)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
-    if other is None or other.holds(nearer).mean() <= usual:
-        return 0.0
-
-    # The two readings may find different planes of a room, so each plane is compared for both.
-    share = held = 0.0
-    for found, its_samples in ((plane, samples), (other, nearer)):
-        if found is None:
-            continue
-        on = found.holds(its_samples)
-        if not on.any():  # the plane was found with finer samples
-            continue
-        share = max(share, _share_held(samples, on, found.normal))
-        held = max(held, _share_held(nearer, on, found.normal))
-    return max(0.0, held - share)
-
-
-def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
-    """Return the share of all samples on the plane fitted to some of them, (N,) bool."""
-    middle = np.median(samples.points[on] @ normal)
-    plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
-    return float(refine_plane(plane, samples).holds(samples).mean())
+    held = 0.0 if other is None else float(other.holds(nearer).mean())
+    return max(0.0, held - usual)
