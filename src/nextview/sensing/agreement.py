@@ -85,8 +85,10 @@ class SurfaceView:
             usable &= mask
         else:
             usable &= farthest - nearest < 0.05 * depth  # no edges
-            if not whole:
-                usable &= _in_the_middle(depth)
+            third = [slice(size // 3, size - size // 3) for size in depth.shape]
+            middle = depth[tuple(third)]
+            if not whole and middle.any():  # nor the far background
+                usable &= depth < 1.5 * np.median(middle[middle > 0])
         points = small.positions_in_camera(*np.nonzero(usable))
         by_noise = tolerance_of(points[:, 2], noise, share=0.0)
 
@@ -231,15 +233,3 @@ def _looked_up(
     # Unless it is occluded, a point of the object must be inside the mask, even without depth.
     hidden = nearest < z - limit
     return agrees & on_object, np.where(on_object, looks_through, ~hidden)
-
-
-def _in_the_middle(depth: Float32) -> Mask:
-    """Return the centre of a depth image, (h, w), without the far background."""
-    height, width = depth.shape
-    middle = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
-    measured = middle[middle > 0]
-    inner = np.zeros(depth.shape, bool)
-    inner[height // 6 : height - height // 6, width // 6 : width - width // 6] = True
-    if len(measured) < 20:
-        return np.ones(depth.shape, bool)
-    return inner & (depth < 1.5 * np.median(measured))
