@@ -22,7 +22,6 @@ BESIDE = 20  # width of the margin around a mask in which the noise of the plane
 FEWEST_BESIDE = 100  # least number of pixels for that measurement
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
-BESIDE_POINTS = 200  # pixels at a border that are compared
 SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixels lie
 
 
@@ -157,46 +156,24 @@ def _local_mean(values: Float32, among: Mask) -> Float32:
     return np.asarray(total / np.maximum(share, np.float32(1e-6)))
 
 
-def touching(
-    frame: Frame,
-    one: Mask,
-    other: Mask,
-    gap: float = TOUCHING_GAP,
-    step: float = TOUCHING_STEP,
-) -> bool:
+def touching(frame: Frame, one: Mask, other: Mask) -> bool:
     """Return True if two objects touch in the image and in depth.
 
     Args:
         frame: of both masks.
         one: mask of one object, (H, W) bool.
         other: mask of the other.
-        gap: largest gap between them in the image, metres.
-        step: largest depth difference at their closest pixels, metres.
     """
-    part = within(one)
-    away_from_camera = frame.depth[part][one[part]]
-    if not away_from_camera.any():
+    depth = frame.depth
+    if not (depth[one] > 0).any():
         return False
-
     focal = float(frame.intrinsics[[0, 1], [0, 1]].mean())
-    reach = max(
-        2.0,
-        gap * focal / float(np.median(away_from_camera[away_from_camera > 0])),
-    )
+    away = float(np.median(depth[one & (depth > 0)]))
+    reach = max(2.0, TOUCHING_GAP * focal / away)
     near = within(one, int(reach) + 1)
-    if not other[near].any():
-        return False
-
-    away, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
-    beside = np.nonzero(other[near] & (away <= reach))
-    if not len(beside[0]):
-        return False
-
-    few = slice(None, None, max(1, len(beside[0]) // BESIDE_POINTS))
-    rows, columns = beside[0][few], beside[1][few]
-    depth = frame.depth[near]
-    own = depth[nearest[0][rows, columns], nearest[1][rows, columns]]
-    its = depth[rows, columns]
-    known = (own > 0) & (its > 0)
-    apart = np.abs(own - its)[known]
-    return bool(len(apart)) and float(np.median(apart)) < step
+    apart, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
+    beside = other[near] & (apart <= reach)
+    own = depth[near][tuple(nearest)][beside]
+    its = depth[near][beside]
+    step = np.abs(own - its)[(own > 0) & (its > 0)]
+    return len(step) > 0 and float(np.median(step)) < TOUCHING_STEP

@@ -15,23 +15,12 @@ from numpy.random import Generator
 from nextview.sensing.planes import Plane, Samples, find_plane, steep
 from nextview.types import Float, Index
 
-MOST_LINES = 6  # tested vertical planes, the largest first
 FEWEST_SAMPLES = 0.02  # least share of all samples on a wall
-# metres, least width of a wall that reaches one side of the image
-WIDE_WALL = 1.5
-WIDEST_OBJECT = 3.0  # metres, largest width of an object
-# least share of the image columns covered by a narrower wall that reaches both sides
-WIDE_SHARE = 0.8
 SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the image
 # largest number of samples behind a wall relative to those on it: flying pixels and open doors
 MOST_SAMPLES_BEHIND = 0.1
-OVER_CAMERA = 0.3  # metres, least height of a ceiling above the camera
 # cosine of the largest angle between parallel planes
 PARALLEL_WALLS = np.cos(np.radians(25.0))
-# largest distance of the camera behind a wall due to noise, relative to the distance of the samples
-CAMERA_BEHIND = 0.1
-# largest distance from a wall to a sample of an adjacent wall, relative to the sample's distance
-CORNER_GAP = 0.05
 # metres, least distance of an object in front of a wall
 NEAREST_TO_PLACE = 0.02
 
@@ -41,7 +30,6 @@ def find_walls(
     plane: Plane,
     rng: Generator,
     place: Float | None = None,
-    narrowest: float = WIDE_WALL,
 ) -> list[Plane]:
     """Find the walls in a frame, as planes whose normals point into the room.
 
@@ -50,7 +38,6 @@ def find_walls(
         plane: the support plane.
         rng: for drawing the tried lines.
         place: known position of the object, (3,), world, metres, which is in front of every wall.
-        narrowest: least width of a wall that reaches one side of the image, metres.
 
     Returns:
         The ceiling, if it is visible, and the walls, the one with most samples first. Empty if
@@ -66,7 +53,7 @@ def find_walls(
     if ceiling is not None:
         walls.append(ceiling)
         left = left[ceiling.height(samples.points[left]) > samples.tolerance[left]]
-    for _ in range(MOST_LINES):
+    for _ in range(6):
         some = np.zeros(len(samples.points), bool)
         some[left] = True
         upright = find_plane(samples.some(some), rng, up, upright=True)
@@ -85,9 +72,7 @@ def find_walls(
             upright,
             left[on],
             up,
-            walls,
             place,
-            narrowest,
         ) and not _hides_much(samples, upright, walls, on.sum()):
             walls.append(upright)
         left = left[~on]
@@ -98,7 +83,7 @@ def _ceiling(
     samples: Samples, up: Float, rng: Generator, place: Float | None
 ) -> Plane | None:
     """Find the level plane above the camera that reaches the top of the image."""
-    over = (samples.points - samples.camera) @ up > OVER_CAMERA
+    over = (samples.points - samples.camera) @ up > 0.3
     ceiling = find_plane(samples.some(over & ~steep(samples, up)), rng, -up)
     if ceiling is None:
         return None
@@ -118,15 +103,13 @@ def _is_wall(
     upright: Plane,
     on: Index,
     up: Float,
-    walls: Sequence[Plane],
     place: Float | None,
-    narrowest: float,
 ) -> bool:
     """Return True if a vertical plane is as wide as a wall and reaches the border of the image."""
     if place is not None and upright.height(place) < NEAREST_TO_PLACE:
         return False
     away = float(np.median(np.linalg.norm(samples.points[on] - samples.camera, axis=1)))
-    if upright.height(samples.camera) < -CAMERA_BEHIND * away:
+    if upright.height(samples.camera) < -0.1 * away:  # by more than noise explains
         return False
 
     first = samples.columns.min() + SIDE_CELLS
@@ -138,22 +121,10 @@ def _is_wall(
     width = float(np.ptp(along))
 
     from_side_to_side = (
-        at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
+        at_left and at_right and len(np.unique(columns)) >= 0.8 * (last - first)
     )
-    gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
-    met = [
-        wall for wall in walls if (np.abs(wall.height(samples.points[on])) < gap).any()
-    ]
-    corners = sum(abs(wall.normal @ up) < PARALLEL_WALLS for wall in met)
-    to_the_top = (
-        len(met) > corners  # reaches the ceiling
-        or samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
-    )
-    in_corner = to_the_top and corners > 0
-    between_walls = to_the_top and corners > 1
-    wide = width > narrowest or in_corner
-    at_side = wide and (at_left or at_right)
-    return bool(width > WIDEST_OBJECT or at_side or from_side_to_side or between_walls)
+    at_side = width > 0.5 and (at_left or at_right)
+    return bool(width > 3.0 or at_side or from_side_to_side)
 
 
 def _hides_much(

@@ -9,6 +9,7 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.planes import Plane, sample
+from nextview.sensing.registration import tolerance_of
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.walls import find_walls
@@ -23,7 +24,6 @@ OWN_RADIUS = 1.1  # object radii; surfaces within this distance of the centre ar
 FEWEST_NEAR_POINTS = 3  # least number of points near a position that is occupied
 # half the window of pixels around the line of sight to a position
 SIGHT_WINDOW = 2
-NARROWEST_WALL = 0.5  # metres, least visible extent of a wall
 WALL_TOLERANCE = 0.02  # metres, in addition to the noise
 BEHIND = 0.15  # metres; points farther behind a wall do not belong to it
 # largest share of points behind a wall, because of reflections or an open door
@@ -62,7 +62,7 @@ class Surroundings:
         rows, columns = _smooth_pixels(frame)
         points = frame.positions(rows, columns)
         depth = frame.depth[rows, columns].astype(np.float64)
-        tolerance = _tolerance(seen.noise, depth)
+        tolerance = tolerance_of(depth, seen.noise)
         walls = _walls(seen, around)
         return cls(frame, seen.noise, seen.plane, points, tolerance, walls)
 
@@ -150,9 +150,8 @@ class Surroundings:
             np.linalg.norm(surface - around.centre, axis=1) < OWN_RADIUS * around.radius
         )
         depth = np.where(blocked, measured, 1)
-        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + _tolerance(
-            self.noise,
-            depth,
+        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + tolerance_of(
+            depth, self.noise
         )
         return free, blocked & ~own & ~on_plane
 
@@ -193,11 +192,6 @@ def _height(points: Float, plane: Plane | None) -> Float:
     return np.full(len(points), np.inf) if plane is None else plane.height(points)
 
 
-def _tolerance(noise: Noise, depth: Float) -> Float:
-    """Return the uncertainty of measured depths, metres."""
-    return 3 * noise.at(depth) * depth**2 + 0.003 * depth
-
-
 def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     """Return rows and columns of a grid of pixels with valid depth, without edges."""
     height, width = frame.shape
@@ -228,7 +222,7 @@ def _walls(seen: Sighting | TableTop, around: ObjectFrame) -> tuple[Plane, ...]:
         up = around.axes[2]
         plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)
     rng = np.random.default_rng(0)
-    return tuple(find_walls(others, plane, rng, around.centre, NARROWEST_WALL))
+    return tuple(find_walls(others, plane, rng, around.centre))
 
 
 def _share_behind(away: Float, tolerance: Float) -> float:
