@@ -17,9 +17,6 @@ from nextview.sensing.mistakes import Mistake, PosedViews, Stored, mistakes
 from nextview.sensing.registration import CameraOffset, camera_offsets
 from nextview.types import Float, Index
 
-# largest number of frames compared with each other, evenly spread
-MOST_COMPARED_FRAMES = 60
-MOST_SEARCHED = 20  # the same in the search for two mistakes, or for an offset
 MOST_REFUSED = 0.1  # largest share of frames left out; a single one is always allowed
 # contradicted share of what frames show in common if their poses are inconsistent
 MUCH_CONTRADICTED = 0.3
@@ -118,7 +115,8 @@ def _evenly_spread(capture: Capture) -> list[int]:
     Those that were taken together stay together.
     """
     moments = capture.moments
-    most = max(1, MOST_COMPARED_FRAMES // len(capture.cameras))
+    # so many frames are compared with each other
+    most = max(1, 60 // len(capture.cameras))
     names = {frame.name for k in _spread(len(moments), most) for frame in moments[k]}
     if capture.stands:
         names |= {frame.name for frame in max(moments, key=len)}
@@ -259,7 +257,7 @@ def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
 
 def _some(posed: PosedViews) -> PosedViews:
     """Return frames among which a search is fast."""
-    rows = _spread(len(posed.views), MOST_SEARCHED)
+    rows = _spread(len(posed.views), 20)
     return PosedViews([posed.views[row] for row in rows], posed.poses[rows])
 
 

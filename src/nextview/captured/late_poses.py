@@ -13,8 +13,6 @@ import numpy as np
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.types import Float, Index, Mask
 
-MOST_LATE = 4  # largest total delay of several parts, frames
-MOST_PARTS = 3  # nested or consecutive
 FEWEST_JUDGED = 100  # judgements that tell something
 
 
@@ -94,7 +92,7 @@ def find_late(views: Sequence[SurfaceView], indices: Index, poses: Float) -> Ind
     before = delayed.agreement(as_read, as_read)
     least = max(FEWEST_JUDGED, 0.1 * before.contradicted.sum())
     late = as_read
-    for _ in range(MOST_PARTS):
+    for _ in range(3):  # parts, nested or consecutive
         further = _best_part(delayed, late, least)
         if not further.any():
             break
@@ -132,7 +130,7 @@ def _best_part(delayed: _Delayed, late: Index, least: float) -> Index:
     before = delayed.agreement(late, late).contradicted
     for frames in (1, -1, 2, -2):
         later = late + frames
-        if np.abs(later).max() > MOST_LATE:
+        if np.abs(later).max() > 4:  # frames, by several parts together
             continue
         # A frame without a later pose explains nothing.
         usable = delayed.has_pose(later)

@@ -23,8 +23,6 @@ from nextview.types import Float, Float32, Index, Mask
 COLUMNS = 160  # of the image in which points are looked up, about
 # standard deviations of the error of two usual camera poses: rough, and sharp
 DEVIATIONS = 2.4, 0.7
-OBJECT_POINTS = 200  # points of each frame that are projected into the others
-WHOLE_POINTS = 500  # the same where the whole image is compared
 CONFIRMED = 2.0  # nats of a surface that two frames see in the same place
 CONTRADICTED = -4.0  # nats of a surface that one frame sees through
 
@@ -98,7 +96,7 @@ class SurfaceView:
             plane = find_plane(sample(small, small.depth > 0, noise), rng)
             if plane is not None:
                 standing = plane.height(points) > 0.012 * points[:, 2] + by_noise
-        most = WHOLE_POINTS if whole else OBJECT_POINTS
+        most = 500 if whole else 200  # points that are projected into other frames
         if standing.any() and not standing.all():
             most //= 2
         kinds = (np.flatnonzero(standing), np.flatnonzero(~standing))

@@ -36,7 +36,6 @@ from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
 REFUSED = 0.01  # probability that a frame is right below which it is refused
-WARNED = 0.5  # the same, below which a warning is given
 TOLD = np.log(10)  # nats of a fact that is told
 RARE_FACT = np.log(1e-4)  # of what few right frames show
 IMPOSSIBLE = np.log(1e-6)  # of what no right frame shows
@@ -574,7 +573,7 @@ def _told(read: Reading, others: Sequence[Reading]) -> tuple[float, ViewWarning]
     undone = [one.mistake for one in others if one.mistake is not None]
     nats = gains.sum(1) + np.log([mistake.prior for mistake in undone])
     right = 1 / (1 + np.exp(np.minimum(nats, 500)).sum())
-    if right >= WARNED:
+    if right >= 0.5:
         # few right frames show what this one does
         rare = (as_read <= RARE_FACT) & (gains > TOLD).any(0)
         if not rare.any():

@@ -32,21 +32,13 @@ from nextview.sensing.planes import (
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
-MOST_LEVELS = 6
-# share of all surface pixels below which the search for further levels ends
-LEAST_LEFT = 0.003
-OUTLINE_MARGIN = 0.05  # metres around the visible part of a surface that may be hidden
-INSTANCE_POINTS = 500  # sampled points of an instance
 # least share of an instance's points above its carrier
 MOST_INSIDE = 0.5
 # largest share of an instance's points below its bottom, due to noise
 BOTTOM_SHARE = 0.04
 # largest height of an instance's bottom above its carrier, relative to the distance
 BOTTOM_MARGIN = 0.02
-# largest relative depth step between neighbouring pixels of one surface, in addition to noise
-SURFACE_STEP = 0.04
 RING_WIDTH = 3  # pixels around the bottom of an instance that show the surface below it
-HANGING_SHARE = 0.8  # least share of these far behind an instance that hangs in the air
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +68,8 @@ class SurfaceLevel:
         """
         along = points @ self.axes.T
         outside = along @ self.sides[:, :2].T + self.sides[:, 2]
-        return np.asarray((outside <= OUTLINE_MARGIN).all(1))
+        # 5 cm around its visible part may be hidden
+        return np.asarray((outside <= 0.05).all(1))
 
 
 def levels_of(
@@ -213,8 +206,9 @@ def _hangs(mask: Mask, frame: Frame, plane: Plane, away: float) -> bool:
     if not ring.any() or (low & border[part]).any():
         return False
     depth = frame.depth[part]
-    behind = depth[ring] > (1 + SURFACE_STEP) * float(np.median(depth[low]))
-    return bool(behind.mean() > HANGING_SHARE)
+    # one surface has no such step between neighbouring pixels
+    behind = depth[ring] > 1.04 * float(np.median(depth[low]))
+    return bool(behind.mean() > 0.8)
 
 
 def _found(
@@ -238,7 +232,7 @@ def _found(
     apart = frame.depth * (3 * noise.at(frame.depth) * frame.depth + 0.003)
     left = surface
     found: list[SurfaceLevel] = []
-    for _ in range(MOST_LEVELS):
+    for _ in range(6):  # levels at most
         samples = sample(frame, left, noise)
         if up is not None:
             samples = samples.some(~steep(samples, up))
@@ -256,7 +250,8 @@ def _found(
             found.append(SurfaceLevel(plane, axes_along(plane), sides, tolerance, on))
 
         left = left & (height > 2 * apart)
-        if np.count_nonzero(left) < LEAST_LEFT * np.count_nonzero(surface):
+        # too little is left for another level
+        if np.count_nonzero(left) < 0.003 * np.count_nonzero(surface):
             break
     return found
 
@@ -318,7 +313,7 @@ def points_of(mask: Mask, frame: Frame) -> Float:
     """Sample points of a mask, (H, W) bool, as (N, 3), world, metres."""
     part = within(mask)
     rows, columns = np.nonzero(mask[part] & (frame.depth[part] > 0))
-    few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
+    few = slice(None, None, max(1, len(rows) // 500))
     return frame.positions(rows[few] + part[0].start, columns[few] + part[1].start)
 
 

@@ -12,16 +12,11 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Float32, Mask
 
-# height above a plane, relative to the distance, from which a pixel at a mask's edge is not on it
-STANDS = 0.02
 # A point is on a plane if its height is at most so many deviations of its noise, and this share of
 # its distance.
 PLANE_NOISE = 4.0
 PLANE_SHARE = 0.003
 BESIDE = 20  # width of the margin around a mask in which the noise of the plane is measured, pixels
-FEWEST_BESIDE = 100  # least number of pixels for that measurement
-TOUCHING_GAP = 0.006  # metres between two things that touch, at most
-TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
 SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixels lie
 
 
@@ -109,7 +104,8 @@ def inside_mask(
     if plane is None:
         return trimmed(frame.depth, given, noise)
 
-    high = frame.along(plane.normal, plane.offset) > STANDS * frame.depth
+    # from such a height on a pixel at the edge of a mask is not on the plane
+    high = frame.along(plane.normal, plane.offset) > 0.02 * frame.depth
     mask = trimmed(frame.depth, given, noise, high)
     part = within(mask, BESIDE)
     above = mask.copy()
@@ -140,7 +136,7 @@ def _above_on_average(
     beside = ~mask[part] & (z > 0) & on_plane
     means = _local_mean(height, beside)[beside] / np.maximum(deviation[beside], 1e-9)
     ratio = 1.0  # deviation of the mean, relative to that of a pixel
-    if len(means) >= FEWEST_BESIDE:
+    if len(means) >= 100:  # pixels that measure it
         ratio = min(1.0, float(np.sqrt(np.mean(means**2))))
 
     least = PLANE_NOISE * ratio * deviation + PLANE_SHARE * z
@@ -169,11 +165,12 @@ def touching(frame: Frame, one: Mask, other: Mask) -> bool:
         return False
     focal = float(frame.intrinsics[[0, 1], [0, 1]].mean())
     away = float(np.median(depth[one & (depth > 0)]))
-    reach = max(2.0, TOUCHING_GAP * focal / away)
+    # 6 mm in the image, and 15 mm in depth, are no gap
+    reach = max(2.0, 0.006 * focal / away)
     near = within(one, int(reach) + 1)
     apart, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
     beside = other[near] & (apart <= reach)
     own = depth[near][tuple(nearest)][beside]
     its = depth[near][beside]
     step = np.abs(own - its)[(own > 0) & (its > 0)]
-    return len(step) > 0 and float(np.median(step)) < TOUCHING_STEP
+    return len(step) > 0 and float(np.median(step)) < 0.015

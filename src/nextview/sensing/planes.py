@@ -10,28 +10,18 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Floats, Index, Mask
 
-# hypotheses per search: with one point in ten on the plane, 0.8 of all searches find it
-TRIALS = 200
 # cosine of the largest tilt of a support plane, due to calibration errors
 TILT = np.cos(np.radians(12.0))
 # cosine of the tilt at which the weight of a plane is zero
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # least share of the samples on a support plane; more if gravity is not known
 LEAST_SUPPORT = 0.04
-LEAST_ALONE = 0.15
-BLOCKS_SAMPLED = (
-    1500  # approximate number of blocks of pixels in which planes are searched
-)
-LARGE_SIDE = 8  # pixels, side of a block from which only every second pixel is used
 STEEP_LAG = 2  # distance of two samples whose slope is measured
 # largest pose error, which displaces a known plane in a new frame
 POSE_SHIFT = 0.02  # metres
 POSE_TURN = np.radians(2.0)
 # distance from a visible plane, in tolerances, up to which few samples are off the plane
 TOLERANCES_ASIDE = 3.0
-STEEP_RISE = 0.7  # rise of a steep surface, relative to the distance
-# largest gain of precision by averaging a block, limited by errors of the lens
-MOST_ALONE = 4.0
 
 
 @dataclass(frozen=True)
@@ -78,10 +68,9 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
         The samples.
     """
     step = 1
-    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
-    if (
-        side >= LARGE_SIDE
-    ):  # every second pixel is enough, as errors of neighbours are correlated
+    # some 1500 blocks of pixels are enough
+    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / 1500)))
+    if side >= 8:  # every second pixel is enough, as neighbouring errors are correlated
         step = 2
         side //= step
     few = (slice(None, None, step), slice(None, None, step))
@@ -104,7 +93,8 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     ].T + pose[:3, 3]
     erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
     # square root of the number of independent errors
-    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
+    # largest gain of precision by averaging a block, limited by errors of the lens
+    alone = np.clip(np.sqrt(count) / erring_together, 1, 4.0)
     return Samples(
         points,
         3 * noise.at(z) * z**2 / alone + 0.003 * z,
@@ -171,7 +161,8 @@ def steep(samples: Samples, up: Float) -> Mask:
     lower = grid[samples.rows + STEEP_LAG, samples.columns]
     pairs = np.stack([np.arange(len(lower)), lower], 1)[lower >= 0]
     step = samples.points[pairs[:, 0]] - samples.points[pairs[:, 1]]
-    rising = np.abs(step @ up) > STEEP_RISE * np.linalg.norm(step, axis=1)
+    # some 45 degrees
+    rising = np.abs(step @ up) > 0.7 * np.linalg.norm(step, axis=1)
 
     upright[pairs[rising].ravel()] = True
     return upright
@@ -197,7 +188,8 @@ def find_plane(
     points = samples.points
     if len(points) < 10:
         return None
-    a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
+    # hypotheses per search: with one point in ten on the plane, 0.8 of all searches find it
+    a, b, c = points[rng.integers(len(points), size=(3, 200))]
     normals = np.cross(b - a, c - a)
     if up is not None:
         # fewer points are enough if the normal is known; triples find slightly tilted planes
@@ -233,7 +225,7 @@ def find_plane(
     count = count * (1 - (1 - tilted(normals)) / (1 - STEEPEST_SUPPORT))
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
-    least = LEAST_ALONE if up is None else LEAST_SUPPORT
+    least = 0.15 if up is None else LEAST_SUPPORT
     fits_well = tilted(plane.normal) > TILT and plane.holds(samples).mean() > least
     return plane if fits_well else None
 

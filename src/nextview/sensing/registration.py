@@ -34,7 +34,6 @@ CAMERA_AIM = 0.006  # radians, standard deviation of the viewing direction
 # standard deviations beyond which a motion is not a calibration error
 FARTHEST_MOTION = 5.0
 DEPTH_SHARE = 0.003  # relative error of the depth, in addition to the noise
-PLANE_ERROR = 0.002  # error of the points of a large plane, relative to the distance
 FEWEST_PULLS = 20  # least number of pairs of points
 # standard deviations at which the weight of a distance is a quarter, in each step. Of the many
 # points of a whole frame those that agree best may decide, and wrong pairs, at edges, are many too.
@@ -47,8 +46,6 @@ FURTHER = (
     0.0,
     0.0,
 )  # additional tolerance, as a share of the farthest motion
-# a shift is corrected from this length on, relative to the distance from the camera
-LEAST_MENDED = 0.006
 
 
 def tolerance_of(depth: Float, noise: Noise, share: float = DEPTH_SHARE) -> Float:
@@ -141,7 +138,8 @@ class Surface:
             frame,
             points,
             normals,
-            np.where(flat, PLANE_ERROR * z, deviations),
+            # error of the points of a large plane, relative to the distance
+            np.where(flat, 0.002 * z, deviations),
             flat,
             cKDTree(facets.rays[:, :2]),
             1.5 * float(facets.pitch.mean()),
@@ -317,7 +315,8 @@ class Displacement:
     @property
     def mended(self) -> bool:
         """True if the shift exceeds the noise of the frames and is to be corrected."""
-        large = float(np.linalg.norm(self.shift)) > LEAST_MENDED * self.distance
+        # relative to the distance from the camera
+        large = float(np.linalg.norm(self.shift)) > 0.006 * self.distance
         return large and (
             self.lasting or deviations_of(self.shift, self.covariance) > 3.0
         )

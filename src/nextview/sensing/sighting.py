@@ -19,11 +19,7 @@ from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
 FEWEST_OBJECT_PIXELS = 60  # least number of pixels of an object in a frame
-# frames with a smaller share of the largest number of pixels are not used to estimate the size
-LEAST_VIEW_PART = 0.1
 GROUP_GAP = 6  # pixels between isolated groups of facets
-LEAST_GROUP = 0.01  # share of all facets in an isolated group that counts
-MOST_HULL_POINTS = 3000  # approximate number of points for the convex hull
 TOO_LITTLE = "too little is seen of the object"
 
 
@@ -109,7 +105,8 @@ def sighting_of(
         raise ObservationError(TOO_LITTLE)
 
     pose = frame.camera_to_world
-    few = slice(None, None, max(1, len(facets.planes) // MOST_HULL_POINTS))
+    # for the convex hull
+    few = slice(None, None, max(1, len(facets.planes) // 3000))
     points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
     with suppress(QhullError):  # coplanar points are used as they are
         points = points[ConvexHull(points).vertices]
@@ -134,7 +131,8 @@ def _in_large_groups(facets: Facets, noise: Noise, coarse: int) -> Mask:
     cells = np.zeros([int(index.max()) + 1 for index in at], bool)
     cells[at] = True
     group = ndimage.label(cells, np.ones((3, 3, 3)))[0][at]
-    return np.asarray(np.bincount(group)[group] >= LEAST_GROUP * len(group))
+    # one facet in a hundred
+    return np.asarray(np.bincount(group)[group] >= 0.01 * len(group))
 
 
 def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
@@ -148,7 +146,8 @@ def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         ObservationError: the visible part of the object has no extent.
     """
     shown = np.array([np.count_nonzero(sighting.mask) for sighting in sightings])
-    enough = shown >= LEAST_VIEW_PART * shown.max()
+    # frames that show little of the object say nothing of its size
+    enough = shown >= 0.1 * shown.max()
     pairs = zip(sightings, enough, strict=True)
     points = np.concatenate([sighting.hull for sighting, counts in pairs if counts])
 

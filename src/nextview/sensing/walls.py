@@ -19,8 +19,6 @@ FEWEST_SAMPLES = 0.02  # least share of all samples on a wall
 SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the image
 # largest number of samples behind a wall relative to those on it: flying pixels and open doors
 MOST_SAMPLES_BEHIND = 0.1
-# cosine of the largest angle between parallel planes
-PARALLEL_WALLS = np.cos(np.radians(25.0))
 # metres, least distance of an object in front of a wall
 NEAREST_TO_PLACE = 0.02
 
@@ -139,6 +137,6 @@ def _hides_much(
     """
     behind = upright.height(samples.points) < -2 * samples.tolerance
     for wall in walls:
-        if abs(wall.normal @ upright.normal) < PARALLEL_WALLS:
+        if abs(wall.normal @ upright.normal) < np.cos(np.radians(25.0)):
             behind &= np.abs(wall.height(samples.points)) > samples.tolerance
     return bool(behind.sum() > MOST_SAMPLES_BEHIND * many)

@@ -67,8 +67,6 @@ FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres
 would be a thousand times as large.
 """
-# an object so many times as large in all frames as in any single frame is inconsistent
-MUCH_LARGER = 1.5
 
 
 @runtime_checkable
@@ -737,7 +735,8 @@ class Session:
         if (
             len(object.sightings) == 1
             or alone >= self.distance
-            or together < MUCH_LARGER * alone
+            # much larger than in any single frame
+            or together < 1.5 * alone
         ):
             return
 

@@ -15,19 +15,12 @@ from nextview.sensing.tabletop import TableTop
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask
 
-MOST_SURROUNDING_POINTS = 6000  # sampled points per frame
-# relative depth step of an edge, where sensors measure points between the surfaces
-JUMP = 0.03
 # metres, tolerance for points on the support plane, in addition to the noise
 NEAR_SUPPORT = 0.02
 OWN_RADIUS = 1.1  # object radii; surfaces within this distance of the centre are the object's own
-FEWEST_NEAR_POINTS = 3  # least number of points near a position that is occupied
 # half the window of pixels around the line of sight to a position
 SIGHT_WINDOW = 2
-WALL_TOLERANCE = 0.02  # metres, in addition to the noise
 BEHIND = 0.15  # metres; points farther behind a wall do not belong to it
-# largest share of points behind a wall, because of reflections or an open door
-MOST_POINTS_BEHIND = 0.03
 
 
 @dataclass(frozen=True)
@@ -106,14 +99,16 @@ class Surroundings:
         kept &= _height(self.points, self.plane) > NEAR_SUPPORT + self.tolerance
 
         apart = np.linalg.norm(places[:, None] - self.points[kept][None], axis=2)
-        return (apart < clearance).sum(1) >= FEWEST_NEAR_POINTS
+        # three points: an occupied position
+        return (apart < clearance).sum(1) >= 3
 
     def shows_behind(self, wall: Plane) -> bool:
         """Return True if the camera was behind another frame's wall, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
         return (
-            _share_behind(wall.height(self.points), self.tolerance) > MOST_POINTS_BEHIND
+            # largest share of points behind a wall, because of reflections or an open door
+            _share_behind(wall.height(self.points), self.tolerance) > 0.03
         )
 
     def look_at(
@@ -195,7 +190,7 @@ def _height(points: Float, plane: Plane | None) -> Float:
 def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     """Return rows and columns of a grid of pixels with valid depth, without edges."""
     height, width = frame.shape
-    step = max(1, int(np.sqrt(height * width / MOST_SURROUNDING_POINTS)))
+    step = max(1, int(np.sqrt(height * width / 6000)))
     rows, columns = np.nonzero(frame.depth[step // 2 :: step, step // 2 :: step])
     rows = step // 2 + step * rows
     columns = step // 2 + step * columns
@@ -207,7 +202,8 @@ def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
             np.clip(rows + down, 0, height - 1),
             np.clip(columns + right, 0, width - 1),
         ]
-        smooth &= (beside > 0) & (np.abs(beside - depth) < JUMP * depth)
+        # at larger steps sensors measure points between the surfaces
+        smooth &= (beside > 0) & (np.abs(beside - depth) < 0.03 * depth)
     return rows[smooth], columns[smooth]
 
 
@@ -227,8 +223,4 @@ def _walls(seen: Sighting | TableTop, around: ObjectFrame) -> tuple[Plane, ...]:
 
 def _share_behind(away: Float, tolerance: Float) -> float:
     """Return the share of points behind a wall, from distances, (N,), and tolerances."""
-    return (
-        float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean())
-        if len(away)
-        else 0.0
-    )
+    return float((away < -(BEHIND + 0.02 + tolerance)).mean()) if len(away) else 0.0
