@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from operator import lt
 
 import numpy as np
 from scipy import ndimage
@@ -111,7 +112,7 @@ def levels_of(
     hidden = [
         replace(level, pixels=none)
         for level in earlier
-        if not any(_same(level, other, frame) for other in levels)
+        if not any(lt(*apart_from(level.plane, other, frame)) for other in levels)
     ]
     every = [*levels, *hidden]
     carriers = [carrier_of(mask, frame, every) for mask in masks]
@@ -315,12 +316,6 @@ def points_of(mask: Mask, frame: Frame) -> Float:
     rows, columns = np.nonzero(mask[part] & (frame.depth[part] > 0))
     few = slice(None, None, max(1, len(rows) // 500))
     return frame.positions(rows[few] + part[0].start, columns[few] + part[1].start)
-
-
-def _same(earlier: SurfaceLevel, level: SurfaceLevel, frame: Frame) -> bool:
-    """Return True if a level of an earlier frame is a level of this frame."""
-    apart, reach = apart_from(earlier.plane, level, frame)
-    return apart < reach
 
 
 def apart_from(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, float]:

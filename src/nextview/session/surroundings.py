@@ -106,10 +106,9 @@ class Surroundings:
         """Return True if the camera was behind another frame's wall, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
-        return (
-            # largest share of points behind a wall, because of reflections or an open door
-            _share_behind(wall.height(self.points), self.tolerance) > 0.03
-        )
+        behind = wall.height(self.points) < -(BEHIND + 0.02 + self.tolerance)
+        # some are, because of reflections or an open door
+        return int(behind.sum()) > 0.03 * len(behind)
 
     def look_at(
         self,
@@ -219,8 +218,3 @@ def _walls(seen: Sighting | TableTop, around: ObjectFrame) -> tuple[Plane, ...]:
         plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)
     rng = np.random.default_rng(0)
     return tuple(find_walls(others, plane, rng, around.centre))
-
-
-def _share_behind(away: Float, tolerance: Float) -> float:
-    """Return the share of points behind a wall, from distances, (N,), and tolerances."""
-    return float((away < -(BEHIND + 0.02 + tolerance)).mean()) if len(away) else 0.0
