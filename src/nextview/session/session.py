@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from itertools import pairwise
@@ -667,7 +668,7 @@ class Session:
         known = [one.frame for one in object.sightings[self._before :]]
         number = repeated(frame, known, any_mask=True)
         if number is None:
-            object.add(frame)
+            self._find(object, frame)
         else:
             object.add_again(frame, self._before + number)
         self._refuse_disagreement(object)
@@ -678,6 +679,42 @@ class Session:
             frame.camera_to_world,
             object,
         )
+
+    def _find(self, object: ObservedObject, frame: Frame) -> None:
+        """Find an object in a frame, with what touches it if that is more like a known class.
+
+        No scan tells where an object of a class ends.
+        """
+        before = object.state
+        object.add(frame)
+        recogniser = self.models.recogniser
+        if isinstance(recogniser, JudgesTogether) or recogniser.novelty is None:
+            return
+        if frame.mask is not None or object.known is not None:
+            return
+        alone = self._judged(object)
+        if alone.familiarity >= 1:
+            return
+        whole = copy(object)
+        whole.state = before
+        whole.alone = True
+        with suppress(ObservationError):
+            whole.add(frame)
+            result = self._judged(whole)
+            if not result.unknown and result.familiarity > alone.familiarity:
+                object.state = whole.state
+
+    def _judged(self, object: ObservedObject) -> Recognition:
+        """Return what all frames say of an object of which the last view is not taken yet."""
+        observations = object.observations[self._before :]
+        every = range(len(observations))
+        evidence = self._evidence(observations, every, object.warnings)
+        directions = [self._snapped(direction_of(seen.pose)) for seen in observations]
+        episodes = self._begin(self.view)
+        for k in every:
+            episodes.take(evidence[k], directions[k][None])
+        views = self._views(episodes.steps, observations, every)
+        return self._recognition([views[k] for k in every], object)
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Reject frames whose object is as large as the camera distance only in combination.
