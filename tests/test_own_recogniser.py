@@ -193,9 +193,6 @@ WRONG = {
     "a word for a pose": poses("here"),
     "a pose that scales": poses(PoseCandidate("a", 0, 2 * np.eye(4), 1.0)),
     "a pose of no class": poses(PoseCandidate("a", 5, np.eye(4), 1.0)),
-    "displacements of no views": poses(
-        PoseCandidate("a", 0, np.eye(4), 1.0, displacements=np.zeros(3))
-    ),
 }
 
 
