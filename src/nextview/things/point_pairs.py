@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.sensing.view import View
-from nextview.things.view_templates import ViewTemplates, rank_within
-from nextview.types import Float, Floats, Index, Mask
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 THING_POINTS = 80  # of each thing
 DRAWN_POINTS = 1500  # of each thing, from which these are chosen
@@ -47,38 +46,41 @@ class PointPairs:
     normals: Float
     keys: Index
     first: NDArray[np.int32]
-    turns: NDArray[np.float32]
+    turns: Float32
 
     @classmethod
-    def of(cls, templates: ViewTemplates) -> PointPairs:
-        """Return the pairs of points that can be seen of things."""
+    def of(cls, points: Float32, normals: Float32) -> PointPairs:
+        """Return the pairs of points that are spread over T things.
+
+        Args:
+            points: that can be seen of each, relative to its centre, (T, P, 3) float32, metres.
+            normals: their unit normals, (T, P, 3) float32.
+        """
         rng = np.random.default_rng(0)
-        points, normals, keys, first, turns = [], [], [], [], []
-        for thing in range(len(templates.points)):
-            seen = templates.points[thing].reshape(-1, 3).astype(np.float64)
-            facing = templates.normals[thing].reshape(-1, 3).astype(np.float64)
-            drawn = rng.choice(len(seen), min(DRAWN_POINTS, len(seen)), replace=False)
-            some = drawn[spread(seen[drawn], THING_POINTS)]
-            points.append(seen[some])
-            normals.append(facing[some])
-            one, two = np.nonzero(~np.eye(len(some), dtype=bool))
-            own = keys_of(seen[some], facing[some], one, two)
-            keys.append(own)
-            first.append((one + thing * THING_POINTS).astype(np.int32))
-            turns.append(turns_of(seen[some], facing[some], one, two))
+        drawn = rng.integers(points.shape[1], size=(len(points), DRAWN_POINTS))
+        row = np.arange(len(points))[:, None]
+        some = np.take_along_axis(
+            drawn, spread(points[row, drawn], THING_POINTS), axis=1
+        )
+        own = points[row, some].astype(np.float64)
+        facing = normals[row, some].astype(np.float64)
+        one, two = np.nonzero(~np.eye(THING_POINTS, dtype=bool))
+        keys, turns = [], []
+        for at, away in zip(own, facing, strict=True):
+            keys.append(keys_of(at, away, one, two))
+            turns.append(turns_of(at, away, one, two).astype(np.float32))
+        first = (one + THING_POINTS * row).astype(np.int32)
         every = np.concatenate(keys)
         order = np.argsort(every, kind="stable")
         return cls(
-            np.stack(points),
-            np.stack(normals),
+            own,
+            facing,
             every[order],
-            np.concatenate(first)[order],
-            np.concatenate(turns)[order].astype(np.float32),
+            first.ravel()[order],
+            np.concatenate(turns)[order],
         )
 
-    def propose(
-        self, view: View, mask: Mask, most: int
-    ) -> tuple[Index, Float, Float, Float]:
+    def propose(self, view: View, mask: Mask, most: int) -> tuple[Index, Float, Float]:
         """Propose poses of things that a segment may show a part of.
 
         Args:
@@ -88,14 +90,13 @@ class PointPairs:
 
         Returns:
             M poses: the number of the thing, (M,) int64; its rotation from the axes of its scan to
-            the world, (M, 3, 3); its centre in the world, (M, 3), metres; and the votes, (M,).
+            the world, (M, 3, 3); and its centre in the world, (M, 3), metres.
         """
         points, normals = oriented(view, mask)
-        none = np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
         if len(points) < FEWEST:
-            return none
+            return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
         found: list[tuple[Index, Index, Index]] = []
-        for reference in spread(points, REFERENCES):
+        for reference in spread(points[None], REFERENCES)[0]:
             two = np.flatnonzero(
                 np.linalg.norm(points - points[reference], axis=1) > DISTANCE_STEP
             )
@@ -132,7 +133,7 @@ class PointPairs:
         centres = points[references] - np.einsum(
             "nij,nj->ni", rotations, self.points[things, own]
         )
-        return things, rotations, centres, values[order]
+        return things, rotations, centres
 
 
 def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
@@ -144,7 +145,7 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
         return np.zeros((0, 3)), np.zeros((0, 3))
     rng = np.random.default_rng(0)
     drawn = rng.permutation(cells)[: 4 * SEEN_POINTS]
-    drawn = drawn[spread(view.points(drawn), SEEN_POINTS)]
+    drawn = drawn[spread(view.points(drawn)[None], SEEN_POINTS)[0]]
     line, column = np.divmod(drawn, own.shape[1])
     middle = float(np.median(grid.depth.ravel()[drawn]))
     reach = int(np.clip(round(PATCH / middle / grid.pitch), 2, 8))
@@ -167,14 +168,24 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
     return mean[kept], normals[kept]
 
 
-def spread(points: Float, count: int) -> Index:
-    """Return the numbers of points that lie far from each other, (count,) or all."""
-    chosen = [0]
-    far = np.linalg.norm(points - points[0], axis=1)
-    for _ in range(min(count, len(points)) - 1):
-        chosen.append(int(far.argmax()))
-        far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen, np.int64)
+def spread(points: Floats, count: int) -> Index:
+    """Return the numbers of points of each set that lie far from each other.
+
+    Args:
+        points: T sets of points, (T, P, 3).
+        count: number of points that are chosen of each.
+
+    Returns:
+        Numbers, (T, count) int64, or all if there are fewer.
+    """
+    row = np.arange(len(points))
+    chosen = [np.zeros(len(points), np.int64)]
+    far = np.full(points.shape[:2], np.inf)
+    for _ in range(min(count, points.shape[1]) - 1):
+        off = points - points[row, chosen[-1]][:, None]
+        far = np.minimum(far, np.einsum("tpi,tpi->tp", off, off))
+        chosen.append(far.argmax(1))
+    return np.stack(chosen, 1)
 
 
 def keys_of(points: Float, normals: Float, one: Index, two: Index) -> Index:
@@ -206,3 +217,12 @@ def turns_of(points: Float, normals: Float, one: Index, two: Index) -> Float:
     """Return the turn of the second point of each pair about the normal of the first, radians."""
     way = np.einsum("nij,nj->ni", frames(normals)[one], points[two] - points[one])
     return np.arctan2(way[:, 2], way[:, 1])
+
+
+def rank_within(things: Index) -> Index:
+    """Return the number of earlier equal elements of each element, (N,) int64."""
+    order = np.argsort(things, kind="stable")
+    first = np.searchsorted(things[order], things[order])
+    rank = np.empty(len(things), np.int64)
+    rank[order] = np.arange(len(things)) - first
+    return rank
