@@ -48,18 +48,22 @@ def propose(
     Returns:
         Some hypotheses for each segment; None for none.
     """
+    instances = Outline.of((view.labels > 0) & ~view.surface)
     found = []
     for mask in segments:
-        one = _of_segment(library, view, mask, among)
+        one = _of_segment(library, view, mask, instances, among)
         if one is not None:
             found.append(one)
     return Hypotheses.joined(found) if found else None
 
 
 def _of_segment(
-    library: Library, view: View, mask: Mask, among: Mask
+    library: Library, view: View, mask: Mask, instances: Outline, among: Mask
 ) -> Hypotheses | None:
-    """Propose what one segment may show."""
+    """Propose what one segment, (H, W) bool, may show.
+
+    A thing may go on in other instances, so at last it is drawn into these, too.
+    """
     found = Hypotheses.of(*library.visible.pairs.propose(view, mask, PROPOSED))
     found = found[np.flatnonzero(among[found.things])]
     if not len(found):
@@ -73,10 +77,11 @@ def _of_segment(
     if match.max() < LEAST_MATCH:
         return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
-    found = register(library, [view], found, (0.15, 0.1, 0.08, 0.06, 0.05, 0.04), 96)
+    closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
+    found = register(library, [view], found, closer, 96, instances)
     totals = _totals(library, view, found, COARSEST)
     found = best(library, found, totals, SCORED, SCORED_OF_ONE)
-    found = register(library, [view], found, (0.03, 0.03, 0.02), 128)
+    found = register(library, [view], found, (0.03, 0.03, 0.02), 128, instances)
     totals = _totals(library, view, found, COARSER)
     gains = np.flatnonzero(totals > 0)
     if not len(gains):
