@@ -18,10 +18,10 @@ PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats cou
 TOTAL_ERROR = 0.01  # of what a hypothesis explains: error by its pose and scan
 # log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
 # explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.05, 12.3, 0.5, 32.8
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
 LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
-LIKELY = 0.5  # belief below which an object is unknown
+LIKELY = 0.4  # belief below which an object is unknown
 SYMMETRIC = 1e9  # information about a turn that changes nothing, 1/radians^2
 LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
