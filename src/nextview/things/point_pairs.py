@@ -24,7 +24,7 @@ DISTANCE_STEP = 0.008  # metres
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
-COMMONEST = 600  # pairs of the things that are alike, above which they tell nothing
+MOST_ALIKE = 600  # pairs of the things that one pair of a view votes for, at most
 FEWEST_VOTES = 3  # of a pose that is proposed
 PATCH = 0.009  # metres, half the side of the patch around a point that gives its normal
 FEWEST = 12  # points of such a patch
@@ -103,10 +103,14 @@ class PointPairs:
             one = np.full(len(two), reference)
             keys = keys_of(points, normals, one, two)
             start = np.searchsorted(self.keys, keys)
-            lengths = np.searchsorted(self.keys, keys, "right") - start
-            lengths[lengths > COMMONEST] = 0
-            pairs = np.repeat(start - np.cumsum(lengths) + lengths, lengths)
-            pairs += np.arange(len(pairs))
+            every = np.searchsorted(self.keys, keys, "right") - start
+            lengths = np.minimum(every, MOST_ALIKE)
+            pairs = np.arange(lengths.sum()) - np.repeat(
+                np.cumsum(lengths) - lengths, lengths
+            )
+            # of too many pairs that are alike, some of all of them
+            pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
+            pairs += np.repeat(start, lengths)
             turn = np.repeat(turns_of(points, normals, one, two), lengths)
             turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
             bins = np.rint(turn).astype(np.int64) % TURNS

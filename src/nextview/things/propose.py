@@ -81,7 +81,8 @@ def _of_segment(
     found = register(library, [view], found, closer, 96, instances)
     totals = _totals(library, view, found, COARSEST)
     found = best(library, found, totals, SCORED, SCORED_OF_ONE)
-    found = register(library, [view], found, (0.03, 0.03, 0.02), 128, instances)
+    found = register(library, [view], found, (0.03, 0.03), 128, instances)
+    found = register(library, [view], found, (0.02,), 128)
     totals = _totals(library, view, found, COARSER)
     gains = np.flatnonzero(totals > 0)
     if not len(gains):
