@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -77,6 +78,14 @@ class Library:
                 for vertices in (one.vertices - one.centre for one in surfaces)
             ]
         )
+
+    @cached_property
+    def half_turns(self) -> Float:
+        """Half turns about the principal axes of each thing, (T, 3, 3, 3)."""
+        points = self.visible.points.reshape(len(self), -1, 3).astype(np.float64)
+        points -= points.mean(1, keepdims=True)
+        axes = np.linalg.eigh(points.swapaxes(1, 2) @ points)[1].swapaxes(1, 2)
+        return 2 * axes[..., :, None] * axes[..., None, :] - np.eye(3)
 
     def for_cameras(self, place: float, aim: float) -> Library:
         """Return the library for cameras with another accuracy of their poses.
@@ -204,10 +213,11 @@ class Hypotheses:
         return replace(self[rows], sizes=sizes.reshape(-1, 3))
 
     def lookalikes(self, library: Library) -> Hypotheses:
-        """Return the poses in which these look nearly the same, each turned about its centroid."""
+        """Return poses in which these may look nearly the same, turned about their centroids."""
         turned = [self[:0]]
         for row, thing in enumerate(self.things):
-            turns = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
+            near = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
+            turns = np.concatenate([near, library.half_turns[thing]])
             some = self[np.full(len(turns), row)]
             arm = library.caster.surfaces[thing].centroid - library.centres[thing]
             rotations = some.rotations @ turns

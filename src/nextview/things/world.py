@@ -218,7 +218,7 @@ class World:
         new = self.hypotheses[rows].lookalikes(self.library)
         if not len(new):
             return self
-        new = register(self.library, self.views, new, (0.1, 0.06, 0.03), 96)
+        new = register(self.library, self.views, new, (0.2, 0.15, 0.1, 0.06, 0.03), 96)
         some = best(self.library, new, self._coarse_totals(new), 3 * len(rows), 3)
         return self.with_hypotheses(some).chosen()
 
