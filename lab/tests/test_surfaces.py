@@ -147,6 +147,16 @@ def test_further_views_keep_to_the_ground(ycb, small_table):
     assert sorted(names) == ["banana", "cracker_box", "mug"]
 
 
+def test_depth_along_the_rays_is_refused(ycb, bin_of_things):
+    camera = LabelledCamera(bin_of_things, sensor="none")
+    frame = camera.frame(looking_at((0, 0, TABLE), elevation=60))
+    x, y = frame.rays
+    along = frame.depth * np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
+    scene = Scene(ycb, segmentation=camera.truth)
+    with pytest.raises(ObservationError, match=r"range"):
+        scene.update(frame.with_depth(along.astype(np.float32)))
+
+
 @pytest.mark.parametrize("surface", [np.ones((4, 4), bool), np.ones((48, 64), int)])
 def test_a_surface_of_another_form_is_refused(surface):
     intrinsics = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
