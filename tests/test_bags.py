@@ -13,7 +13,6 @@ from ros_messages import (
     DEPTH,
     SHAPE,
     K,
-    at,
     compressed_message,
     header,
     image_message,
@@ -243,27 +242,3 @@ def test_no_pose_is_made_up_in_a_gap_of_tf():
     np.testing.assert_allclose(
         tree.pose("tool", "base_link", 2.0), tool_at(2.0), atol=1e-9
     )
-
-
-@pytest.mark.parametrize("mcap", [True, False])
-def test_a_compressed_file_of_a_bag_expands_within_limits(mcap, tmp_path, monkeypatch):
-    """Noise shrinks to no hundredth; images of one distance do, and fill no disk."""
-    said = [*tf_of_an_arm(), *images_at([1.0, 2.0])]
-    bag = write_bag(tmp_path / "bag", said, mcap, compressed="file")
-    plain = write_bag(tmp_path / "plain", said, mcap)
-    assert not [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
-    for one, other in zip(
-        read_capture(bag).frames, read_capture(plain).frames, strict=True
-    ):
-        np.testing.assert_array_equal(one.read().depth, other.read().depth)
-
-    monkeypatch.setattr(bag_reader, "LARGEST_BAG_CHUNK", 2**16)
-    assert len(read_capture(bag).frames) == 2
-    flat = image_message(
-        np.full((480, 640), 700), "16UC1", header=header("optical", 0.0)
-    )
-    times = START + 0.1 * np.arange(40)
-    many = [(DEPTH, time, at(flat, time)) for time in times]
-    bomb = write_bag(tmp_path / "bomb", [*said, *many], mcap, compressed="file")
-    with pytest.raises(DatasetError):
-        read_capture(bomb)

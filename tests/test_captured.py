@@ -160,12 +160,6 @@ def late_from(first, frames, end=None):
     return change
 
 
-def two_lost(poses):
-    changed = late_from(7, 1)(poses)
-    changed[16:] = late_from(16, 2)(poses)[16:]
-    return changed
-
-
 def moved(x, y, z):
     """Poses of a place beside the camera, in all frames the same, metres in the camera's axes."""
     step = np.eye(4)
@@ -187,10 +181,6 @@ PARTS = {
     "one pose lost": (
         late_from(12, -1),
         "from frame 00001. to 00002. the poses are one frame early",
-    ),
-    "an image lost twice": (
-        two_lost,
-        "from frame 000007 to .* one frame late.* and from frame 0000.* 2 frames late",
     ),
     "bumped": (bumped, "the frames from 000012 on contradict those before"),
 }

@@ -121,20 +121,6 @@ def expected(divergence, belief, things) -> ExpectedViews:
     )
 
 
-@pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
-def test_information_has_the_known_limits_and_is_between_them(belief):
-    divergence = np.zeros((3, 2, 2))
-    divergence[1] = 4.0 * (1 - np.eye(2))
-    divergence[2] = 4000.0 * (1 - np.eye(2))
-    found = expected(divergence, belief, (0, 1))
-    entropy = -sum(p * np.log(p) for p in belief)
-    kept = np.exp(-1)  # a quarter of the divergence
-    between = -sum(p * np.log(p + kept * (1 - p)) for p in belief)
-    np.testing.assert_allclose(found.information(), [0, between, entropy], atol=1e-12)
-    np.testing.assert_allclose(found.entropy(), entropy)
-    np.testing.assert_allclose(found.gain(0)[2], -np.log(belief[0]))
-
-
 def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
     far = 4000.0 * (1 - np.eye(2))[None]
     found = expected(far, (0.5, 0.5), (3, 3))

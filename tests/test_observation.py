@@ -67,12 +67,6 @@ def test_a_view_shows_something_from_so_many_pixels_on(size):
 # Refusing
 
 
-FAR = POSE.copy()
-FAR[0, 3] = 1500.0
-NOISY = VIEW.depth * 450
-NOISY[np.nonzero(NOISY)[0][:3], np.nonzero(NOISY)[1][:3]] = 7
-
-
 images = npst.arrays(
     st.sampled_from([np.float32, np.float64, np.uint16, np.int8]),
     npst.array_shapes(min_dims=2, max_dims=2, max_side=20),

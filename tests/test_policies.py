@@ -132,48 +132,6 @@ def test_random_is_uniform_over_free_views(policy):
     assert chisquare(drawn[free]).pvalue > 1e-3
 
 
-@settings(deadline=None, max_examples=20)
-@given(spheres, st.sampled_from(["global", "local"]), st.integers(0, 2**32))
-def test_spread_is_the_free_view_farthest_from_all_visited(sphere, scope, seed):
-    rng = np.random.default_rng(seed)
-    state = random_state(sphere, rng)
-    chosen = Spread(sphere, scope).next_views(state, rng)
-    for row, view in enumerate(state.current):
-        reachable = (
-            range(len(sphere)) if scope == "global" else sphere.windows[view].ravel()
-        )
-        seen = sphere.directions[state.visited[row]]
-        apart = {
-            v: np.arccos(np.clip(seen @ sphere.directions[v], -1, 1)).min()
-            for v in reachable
-        }
-        free = {v: arc for v, arc in apart.items() if not state.visited[row, v]}
-        if free:
-            assert free[chosen[row]] >= max(free.values()) - 1e-5
-
-
-# Tables
-
-
-@pytest.mark.parametrize("scope", ["global", "local"])
-def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(scope):
-    rng = np.random.default_rng(0)
-    values = rng.random((2, 5, 40))
-    state = random_state(SPHERE, rng)
-    chosen = ClassTable(SPHERE, values, scope).next_views(state, rng)
-    for row, view in enumerate(state.current):
-        reachable = range(40) if scope == "global" else SPHERE.windows[view].ravel()
-        of = {}
-        for other in reachable:
-            if not state.visited[row, other]:
-                steps = (other % 8 - view % 8) % 8
-                of[other] = values[
-                    state.belief[row].argmax(), view // 8, other // 8 * 8 + steps
-                ]
-        if of:
-            assert chosen[row] == max(of, key=of.get)
-
-
 # Maps
 
 HILLS = [

@@ -349,9 +349,6 @@ def mesh_of(told):
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-# The node, with stand-ins for ROS
-
-
 # What cannot be run here is at least well formed
 
 

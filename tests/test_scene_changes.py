@@ -9,7 +9,6 @@ from factories import SimulatedTable, TableCamera, camera_over, meshes_of, view
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 
 NAMES = ("cracker_box", "mustard_bottle", "tuna_fish_can", "scissors", "foam_brick")
@@ -110,28 +109,6 @@ def test_what_stands_still_is_not_said_to_move_because_of_an_arms_errors(ycb, th
         look = scene.update(camera.frame(view(degrees)))
         assert look.taken
         assert look.moved == look.gone == look.appeared == ()
-
-
-def test_things_on_a_belt_are_seen_in_the_frame_of_the_belt(ycb, three):
-    camera, scene = seen_once(ycb, three)
-    belt = np.eye(4)
-    start = camera.table
-    for number in (1, 2):
-        belt[0, 3] = number * 0.05
-        things = [replace(one, pose=belt @ one.pose) for one in start.things]
-        camera.change(SimulatedTable(tuple(things)))
-        frame = camera.frame(view(20 + 30 * number))
-        on_belt = np.linalg.inv(belt) @ frame.pose
-        look = scene.update(
-            Frame(frame.depth, frame.intrinsics, on_belt, pixel_centre=0.5)
-        )
-        assert look.taken
-        assert look.moved == look.gone == ()
-    for one in scene.objects:
-        true = next(thing for thing in camera.table.things if thing.name == one.name)
-        middle = np.append(true.vertices.mean(0), 1)
-        assert np.linalg.norm((belt @ one.pose - true.pose) @ middle) < 0.003
-    assert {one.name for one in scene.objects} == set(three)
 
 
 def test_a_camera_that_stands_still_needs_no_encoder_of_the_belt(ycb, three):

@@ -133,23 +133,6 @@ def test_symmetries_are_found_about_any_axis(seed, name):
         )  # the axis of what is made here is z
 
 
-def with_handle(size):
-    """A can with a handle so many metres wide."""
-    body = trimesh.creation.cylinder(0.04, 0.1, sections=64)
-    handle = trimesh.creation.box((size, 0.01, 0.06))
-    handle.apply_translation((0.04 + size / 2, 0, 0))
-    return trimesh.util.concatenate([body, handle])
-
-
-@pytest.mark.parametrize(("handle", "symmetric"), [(0.0003, True), (0.03, False)])
-def test_indistinguishable_rotations_are_symmetries_unless_a_handle_breaks_them(
-    handle, symmetric
-):
-    mesh = with_handle(handle)
-    found = find_symmetries(turned_about(mesh.vertices, mesh.faces, 3)[1])
-    assert any(one.order == 0 for one in found) == symmetric
-
-
 # Surfaces from frames
 
 

@@ -12,7 +12,7 @@ import nextview
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.folders import read_box, read_capture
 from nextview.data.samples import sample_mesh
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.viewsphere import ViewSphere
 from nextview_lab.data.writing import write_capture
 
 TWELVE = ViewSphere.named("12")
@@ -73,25 +73,6 @@ def test_the_object_is_found_without_a_box(captured, system):
 
 
 # The nearest view
-
-
-def test_every_request_gets_the_nearest_view_that_is_left(captured):
-    capture = read_capture(captured)
-    box = read_box(captured / "box.json")
-    camera = CapturedCamera(capture, box=box)
-    asked = look_at_origin(
-        np.radians([50, 30, 70, 10]), np.radians([130, 128, 131, 310])
-    )
-    left = dict(enumerate(capture.frames))
-    for pose in asked:
-        camera.observe(pose)
-
-        def cosine(i, pose=pose):
-            position = left[i].pose[:3, 3] - box.object_frame.centre
-            return position @ pose[:3, 3] / np.linalg.norm(position)
-
-        assert camera.taken[-1].frame.name == left.pop(max(left, key=cosine)).name
-    assert len(camera.taken) == 4
 
 
 def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from symmetric_parts import degrees_off, keyed, parts, toothed, turns_of
+from symmetric_parts import degrees_off, parts, turns_of
 
 from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry
@@ -12,7 +12,6 @@ from nextview.recognition.poses import PoseCandidate, turn_apart
 from nextview.teaching.symmetries import named_symmetries
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
-from nextview_lab.worlds.solids import extruded, joined, moved, ring_points
 
 PARTS = parts()
 NEAR = 3.0  # degrees by which an axis may be off
@@ -58,39 +57,6 @@ def test_a_detail_that_breaks_a_symmetry_leaves_a_near_symmetry():
         found = find_near_symmetries(surface)
         assert [one.order for one in found] == ([] if order is None else [order])
         assert all(abs(turn[:, 2] @ one.axis) > 0.999 for one in found)
-
-
-def wheel(outline, bore, width=14):
-    """A wheel with a hub, so that no half turn maps it to itself."""
-    hub = extruded([ring_points(1.7 * np.ptp(bore[:, 1]) / 2, 64), bore], width / 2)
-    return joined([extruded([outline, bore], width), moved(hub, by=(0, 0, width))])
-
-
-def flattened(radius, across):
-    """The outline of a bore with a flat on the side of +x."""
-    flat = np.arccos(across / radius)
-    angles = np.linspace(flat, 2 * np.pi - flat, 60)
-    return radius * np.c_[np.cos(angles), np.sin(angles)]
-
-
-@pytest.mark.parametrize("teeth", [12, 17, 20, 24])
-@pytest.mark.parametrize(
-    ("bore", "breaks"),
-    [
-        (ring_points(7, 48), False),
-        (keyed(7, 4.6, 2.1), True),
-        (flattened(7, 4.9), True),
-    ],
-    ids=["round", "keyway", "flat"],
-)
-def test_a_gear_has_the_order_of_its_teeth_or_none(teeth, bore, breaks):
-    surface, turn = placed(*wheel(toothed(teeth, teeth + 2, 4.5), bore), seed=teeth)
-    found = find_symmetries(surface)
-    assert [one.order for one in found] == ([] if breaks else [teeth])
-    # Where the detail is hidden, the poses that differ by the teeth look alike.
-    near = find_near_symmetries(surface)[0]
-    assert near.order == teeth
-    assert abs(turn[:, 2] @ near.axis) > 0.999
 
 
 def test_a_scan_that_is_off_by_a_hundredth_is_as_round_as_the_can():
