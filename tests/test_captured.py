@@ -129,7 +129,6 @@ def test_depth_that_is_too_large_is_named(nine, tmp_path):
     [
         *((layout, 9, 0, 0) for layout in ("BOP", "TUM RGB-D", "7-Scenes")),
         ("7-Scenes", 9, 0.004, 0.5),
-        ("7-Scenes", 5, 0.004, 0.5),
         ("7-Scenes", 2, 0, 0),
     ],
 )
@@ -204,7 +203,6 @@ def test_a_few_frames_with_the_poses_of_others_are_left_out_and_named(around, tm
 
 
 CAMERAS_WRONG = {
-    "offset along x": (lambda d: d, moved(0.1, 0, 0), 1.0, "beside its poses"),
     "offset": (lambda d: d, moved(0.08, 0.05, 0.04), 1.0, "hand-eye"),
     "mirrored": (
         lambda d: np.roll(np.fliplr(d), 4, axis=1),  # about the principal point

@@ -24,7 +24,6 @@ def meshes(root: Path, *places: str) -> Path:
     ("places", "entries"),
     [
         (["cup/1.off", "jar/1.off"], [("cup_1", "cup", ""), ("jar_1", "jar", "")]),
-        (["cup/a.off", "jar/b.off"], [("a", "cup", ""), ("b", "jar", "")]),
         (
             ["cup/test/b.off", "cup/train/a.off", "cup/val/c.off"],
             [("a", "cup", "train"), ("b", "cup", "test"), ("c", "cup", "val")],
@@ -41,7 +40,6 @@ def meshes(root: Path, *places: str) -> Path:
             ["bed/train/77/m.off", "bed/test/78/m.off"],
             [("77", "bed", "train"), ("78", "bed", "test")],
         ),
-        (["bed/old/a.off", "bed/b.off"], [("a", "bed", ""), ("b", "bed", "")]),
         (["train/a.off", "plane/b.off"], [("b", "plane", ""), ("a", "train", "")]),
         (
             ["cup/train/1.off", "cup/test/1.off", "jar/train/1.off"],

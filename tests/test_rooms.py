@@ -107,7 +107,7 @@ def test_objects_in_a_room_are_segmented_without_its_walls(walls, asked):
     assert (which == 0)[thing.sightings[0].mask].mean() > 0.95
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.003, 0.008])
+@pytest.mark.parametrize("sigma", [0.008])
 @pytest.mark.parametrize("walls", ROOMS)
 def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
     pose = pose_at(12, 20, 2.4, middle_of(CUPBOARD))
@@ -128,8 +128,8 @@ def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
 
 
 @pytest.mark.parametrize("asked", ["aim", "point"])
-@pytest.mark.parametrize("behind", [1.5, 3.0, 6.0])
-@pytest.mark.parametrize("elevation", [10, 25])
+@pytest.mark.parametrize("behind", [1.5, 6.0])
+@pytest.mark.parametrize("elevation", [10])
 def test_objects_far_behind_a_table_are_ignored(elevation, behind, asked):
     mug = box((0.08, 0.08, 0.1), (0.1, 0, 0.05))
     clutter = [

@@ -52,44 +52,6 @@ def test_a_ball_is_lit_by_a_headlight():
     assert (observation.image[observation.depth > 0] >= 255 * AMBIENT - 1).all()
 
 
-@pytest.mark.parametrize(
-    ("view", "towards", "row", "column"),
-    [
-        # From +x the camera looks along -x; its right is +y.
-        (0, (0, 1, 0), 0, 1),
-        (0, (0, -1, 0), 0, -1),
-        (0, (0, 0, 1), -1, 0),
-        # From +y it looks along -y; its right is -x.
-        (2, (1, 0, 0), 0, -1),
-        (4, (0, 1, 0), 0, -1),
-        (6, (1, 0, 0), 0, 1),
-        # From 72 degrees above +x, what lies towards the camera is low in the image, what lies
-        # beyond is high.
-        (32, (1, 0, 0), 1, 0),
-        (32, (-1, 0, 0), -1, 0),
-    ],
-)
-def test_a_bump_appears_on_the_side_derived_by_hand(view, towards, row, column):
-    # keeps the bounding box around the origin
-    stay = trimesh.creation.icosphere(radius=0.1)
-    ends = [
-        stay.copy().apply_translation(p)
-        for p in np.vstack([np.eye(3), -np.eye(3)]) * 1.5
-    ]
-    body = trimesh.creation.icosphere(subdivisions=3, radius=0.8)
-    bump = trimesh.creation.icosphere(subdivisions=3, radius=0.5).apply_translation(
-        np.array(towards) * 0.8
-    )
-    pose = SPHERE.poses[view]
-    with_bump = SimulatedCamera(meshed(body, *ends, bump), 96).observe(pose).depth
-    without = SimulatedCamera(meshed(body, *ends), 96).observe(pose).depth
-    # (row, column) from the middle
-    found = np.mean(np.nonzero(np.abs(with_bump - without) > 1e-3), axis=1) / 96 - 0.5
-    for place, expected in zip(found, (row, column), strict=True):
-        assert np.sign(place) == expected if expected else abs(place) < 0.01
-    assert np.hypot(*found) > 0.05
-
-
 @pytest.mark.parametrize("view", [0, 5, 19, 33])
 @pytest.mark.parametrize("mesh", [TABLE, CHAIR], ids=["table", "chair"])
 def test_points_lie_on_the_surface_and_are_visible(mesh, view):

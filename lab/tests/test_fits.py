@@ -100,38 +100,6 @@ def test_promises_are_kept_as_often_as_promised():
     assert broken <= 60 * delta + 3 * np.sqrt(60 * delta * (1 - delta))
 
 
-# What may be fitted to
-
-
-def test_a_shape_that_was_copied_counts_once():
-    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
-    # The first object nine times more, under other names and a little otherwise recognised.
-    rows = np.array([*range(60), *[0] * 9])
-    arrays = {
-        name: getattr(p, name)[rows]
-        for name in ("labels", "splits", "conflicting", "depth_entropy")
-    }
-    names, maps = (
-        (*p.names, *(f"copy{i}" for i in range(9))),
-        {"lem": p.maps["lem"][rows]},
-    )
-    many = replace(
-        p,
-        **arrays,
-        logits=p.logits[rows] + (np.arange(69) >= 60)[:, None, None],
-        maps=maps,
-        names=names,
-    )
-    once = many.deduplicate()
-    assert once.names == p.names
-    np.testing.assert_array_equal(once.logits, p.logits)
-    relabelled = replace(
-        many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3]
-    )
-    # which of two labels is right is not for us
-    assert relabelled.deduplicate().names == (*p.names, "copy8")
-
-
 # The stages
 
 

@@ -3,36 +3,6 @@ import pytest
 from scipy import stats
 
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.data import metrics
-
-
-def test_ratios_and_class_means_agree_with_plain_loops():
-    rng = np.random.default_rng(0)
-    top, bottom, labels = (
-        rng.random((12, 2)),
-        rng.integers(0, 3, (12, 2)).astype(float),
-        rng.integers(0, 3, 12),
-    )
-    draws = rng.integers(12, size=(5, 12))
-    weights = np.stack([np.bincount(draw, minlength=12) for draw in draws]).astype(
-        float
-    )
-    ratio, mean = (
-        metrics.ratio(top, bottom, weights),
-        metrics.class_mean(top, bottom, labels, weights),
-    )
-    for s, draw in enumerate(draws):
-        for m in range(2):
-            assert ratio[s, m] == pytest.approx(
-                top[draw, m].sum() / bottom[draw, m].sum()
-            )
-            each = [draw[labels[draw] == c] for c in range(3)]
-            parts = [
-                top[d, m].sum() / bottom[d, m].sum()
-                for d in each
-                if bottom[d, m].sum() > 0
-            ]
-            assert mean[s, m] == pytest.approx(np.mean(parts))
 
 
 @pytest.mark.parametrize("families", [8, 14, 40])

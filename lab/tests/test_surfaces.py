@@ -182,9 +182,7 @@ def middle_of(solids, number):
     return (vertices.min(0) + vertices.max(0)) / 2
 
 
-@pytest.mark.parametrize(
-    ("number", "name"), [(0, "mug"), (1, "banana"), (2, "tomato_soup_can")]
-)
+@pytest.mark.parametrize(("number", "name"), [(0, "mug"), (2, "tomato_soup_can")])
 def test_a_point_chooses_an_instance(ycb, bin_of_things, number, name):
     camera = LabelledCamera(bin_of_things)
     point = middle_of(bin_of_things, number)

@@ -30,7 +30,7 @@ from nextview_lab.thesis.measures import (
     view_area,
     visible_normals,
 )
-from nextview_lab.thesis.surfaces import Surface, view_of
+from nextview_lab.thesis.surfaces import view_of
 
 TWELVE = ViewSphere.named("12")
 DEPTH = [name for name, found in MEASURES.items() if found.needs == "depth"]
@@ -42,10 +42,6 @@ SEEN_FROM_3 = (1 - 1 / 3) / 2
 
 def mesh_of(found: trimesh.Trimesh) -> Mesh:
     return make_mesh(found.vertices, found.faces)
-
-
-def surface_of(found: trimesh.Trimesh) -> Surface:
-    return Surface(np.asarray(found.vertices), np.asarray(found.faces))
 
 
 BALL = mesh_of(trimesh.creation.icosphere(4))
@@ -178,40 +174,6 @@ def test_a_slanted_plane_tells_no_more_than_a_frontal_one(azimuth):
             MEASURES["depth_entropy"](slanted) > MEASURES["depth_entropy"](frontal) + 2
         )
     assert gradient_entropy(frontal) == pytest.approx(0, abs=1e-9)
-
-
-# Independent implementations
-
-
-@pytest.mark.parametrize(
-    "solid",
-    [
-        trimesh.creation.icosphere(2),
-        trimesh.creation.box([1, 2, 3]),
-        trimesh.creation.torus(1, 0.3),
-    ],
-    ids=["ball", "box", "torus"],
-)
-def test_trimesh_agrees(solid):
-    surface = surface_of(solid)
-    np.testing.assert_allclose(surface.areas, solid.area_faces)
-    np.testing.assert_allclose(surface.normals, solid.face_normals, atol=1e-9)
-    np.testing.assert_allclose(surface.angles, solid.face_angles, atol=1e-7)
-    place = np.zeros(len(solid.vertices), int)
-    place[solid.faces.ravel()] = surface.corners.ravel()
-    np.testing.assert_allclose(surface.deficits[place], solid.vertex_defects, atol=1e-6)
-    # Trimesh's has the sign of the edge, convex or not.
-    signed = np.where(solid.face_adjacency_convex, 1, -1) * solid.face_adjacency_angles
-    lengths = np.linalg.norm(
-        np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0], axis=1
-    )
-    assert surface.mean_of_faces.sum() == pytest.approx(
-        (np.abs(signed) * lengths).sum() / 2, rel=1e-4
-    )
-    if solid.is_convex:
-        assert surface.mean_of_faces.sum() == pytest.approx(
-            solid.integral_mean_curvature, rel=1e-4
-        )
 
 
 # What they must not depend on
