@@ -77,6 +77,14 @@ def write_off(path: Path, mesh: Mesh) -> Path:
     return path
 
 
+def write_scan(mesh: Mesh, folder: Path) -> Path:
+    """Write a mesh of known size as it was scanned, in metres: ``folder/NAME.ply``."""
+    path = folder / f"{mesh.name}.ply"
+    placed = mesh.vertices * mesh.metres + mesh.centre
+    trimesh.Trimesh(placed, mesh.faces, process=False).export(path)
+    return path
+
+
 def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) -> Path:
     """Chairs, monitors and tables of boxes, each stretched at random, as
     ``folder/CLASS/SPLIT/CLASS_K.off``.

@@ -67,12 +67,8 @@ def lengthened(values, axis):
 
 
 OF_EACH = {
-    "0-d": lambda values: values.ravel()[0],
     "one dimension less": lambda values: values[0],
-    "one dimension more": lambda values: values[None],
     "empty": lambda values: values[:0],
-    "complex": lambda values: values.astype(np.complex64),
-    "truth values": lambda values: values.astype(bool),
     "16-bit integers": lambda values: (
         values.astype(np.uint16) if values.dtype.kind == "f" else values / 1
     ),

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-import trimesh
-from factories import camera_over, view, without
+from factories import camera_over, view, without, write_scan
 from nextview_msgs.action import LookUntilSettled
 from nextview_ros.player import PlayerNode, RecordedFrames
 from rclpy.node import Node
@@ -50,14 +49,6 @@ from nextview.teaching.learn import learn
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-
-
-def write_scan(mesh, folder):
-    """Write the scan of a thing in metres; the path."""
-    path = folder / f"{mesh.name}.ply"
-    placed = mesh.vertices * mesh.metres + mesh.centre
-    trimesh.Trimesh(placed, mesh.faces, process=False).export(path)
-    return path
 
 
 @pytest.fixture(scope="module")
