@@ -26,7 +26,7 @@ from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.teaching import learn as learn_module
 from nextview.teaching import shown_views
 from nextview.teaching.learn import learn
-from nextview.things import view_templates
+from nextview.things import visible_points
 from nextview.things.memory import open_memory
 
 LONG = (
@@ -91,7 +91,7 @@ def few_episodes():
 def kept_templates():
     """Keep the templates of each memory for the whole run, not only while they are in use."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(view_templates, "_IN_USE", {})
+        patched.setattr(visible_points, "_IN_USE", {})
         yield
 
 

@@ -13,7 +13,7 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.surface import SurfaceCaster
-from nextview.things.view_templates import ViewTemplates
+from nextview.things.visible_points import VisiblePoints
 
 COUNTS = (1, 2, 5)
 
@@ -37,7 +37,7 @@ def with_each_count(monkeypatch, answer):
     return found
 
 
-def test_networks_and_templates_answer_alike_with_any_number(monkeypatch, ycb):
+def test_networks_and_points_answer_alike_with_any_number(monkeypatch, ycb):
     camera = SimulatedCamera(sample_mesh("chair"))
     seen = [camera.observe(pose) for pose in ViewSphere.named("40").poses[:3]]
     said = with_each_count(monkeypatch, lambda: NetworkRecogniser()(seen))
@@ -47,10 +47,10 @@ def test_networks_and_templates_answer_alike_with_any_number(monkeypatch, ycb):
 
     surfaces = ycb.models.recogniser.library.caster.surfaces
     few = SurfaceCaster(surfaces[5:8])
-    drawn = with_each_count(monkeypatch, lambda: ViewTemplates(few, 0))
+    drawn = with_each_count(monkeypatch, lambda: VisiblePoints(few, 0))
     for one in drawn[1:]:
-        np.testing.assert_array_equal(one.offsets, drawn[0].offsets)
-        np.testing.assert_array_equal(one.pictures.depth, drawn[0].pictures.depth)
+        np.testing.assert_array_equal(one.points, drawn[0].points)
+        np.testing.assert_array_equal(one.normals, drawn[0].normals)
 
 
 def test_a_scene_answers_alike_with_any_number(monkeypatch, ycb):

@@ -204,6 +204,23 @@ def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
 # Extent
 
 
+@pytest.mark.parametrize("flying", [4, 40])
+def test_flying_pixels_do_not_affect_the_size(flying):
+    ball = trimesh.creation.icosphere(3, 0.04).apply_translation((0, 0, 0.04))
+    clean = frame([ball, TABLE], pose_at(35, 0, 0.6, (0, 0, 0.04)), mask_of=0)
+    rows, columns = np.nonzero(clean.mask)
+    rng = np.random.default_rng(2)
+    chosen = rng.choice(len(rows), flying, replace=False)
+    depth = clean.depth.copy()
+    depth[rows[chosen], columns[chosen]] += rng.uniform(0.03, 0.4, flying)
+    radii = []
+    for seen in (clean, clean.with_depth(depth)):
+        thing = ObservedObject()
+        thing.add(seen)
+        radii.append(thing.object_frame.radius)
+    assert radii[1] == pytest.approx(radii[0], rel=0.03)
+
+
 @pytest.mark.parametrize("azimuth", [-60, -45, -30])
 def test_an_object_in_a_corner_is_not_part_of_the_walls(azimuth):
     corner = [

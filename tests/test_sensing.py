@@ -26,8 +26,7 @@ from nextview.sensing import (
     check_views,
 )
 from nextview.sensing.facets import fit_facets
-from nextview.sensing.frame_mistakes import check_mistakes
-from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.known_frames import KnownFrames, check_mistakes
 from nextview.sensing.resampling import look_again, virtual_pose
 from nextview.sensing.segmented_frame import without_surfaces
 

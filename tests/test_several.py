@@ -51,6 +51,11 @@ def test_memories_take_precedence_and_shared_names_are_distinguished(several, kn
     assert twice.classes[4] == "block (theirs)"
 
 
+def test_the_accuracy_of_the_cameras_is_that_of_all_memories(several):
+    library = several.for_cameras(0.001, 0.002).library
+    assert library.camera == (0.002, 0.001)
+
+
 @pytest.mark.parametrize("name", ["mug", "block"])
 def test_a_thing_is_named_with_its_pose(system, meshes, name):  # noqa: F811
     result = system.recognise(meshes[name], seed=2)

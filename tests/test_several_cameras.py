@@ -43,8 +43,8 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.sensing import Frame, ObservedObject
-from nextview.sensing.camera_offsets import camera_offsets
 from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.registration import camera_offsets
 from nextview.simulation.sensor import SENSORS
 
 ROOT = Path(__file__).parents[1]

@@ -1,38 +1,26 @@
 """Check captured frames: leave out unusable ones, and reject wrong poses."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.optimize import minimize
 
 from nextview.captured.frames import Capture, CapturedFrame
-from nextview.captured.late_poses import Shift, find_shifts
+from nextview.captured.late_poses import FEWEST_JUDGED, explains, find_late
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import Agreement, SurfaceView, compare, surface_view
-from nextview.sensing.camera_offsets import CameraOffset, camera_offsets
+from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import Frame
-from nextview.sensing.mistakes import (
-    LEAST_EXPLAINED,
-    PosedViews,
-    Stored,
-    find_fitted,
-    find_mistake,
-    fitted_mistakes,
-)
+from nextview.sensing.known_frames import in_one_place
+from nextview.sensing.mistakes import Mistake, PosedViews, Stored, mistakes
+from nextview.sensing.registration import CameraOffset, camera_offsets
+from nextview.types import Float, Index
 
-# largest number of frames compared with each other, evenly spread
-MOST_COMPARED_FRAMES = 60
 MOST_REFUSED = 0.1  # largest share of frames left out; a single one is always allowed
-# A frame contradicts the others if more than this share of its points is contradicted, ...
-MUCH_CONTRADICTED = 0.5
-# ... or more than this share, if that is also this multiple of the usual share.
-UNUSUALLY_CONTRADICTED = 0.3
-TIMES_USUAL = 4.0
-# contradicted share of the points above the plane if all frames are inconsistent
-CONTRADICTED_IN_ALL = 0.3
-FEWEST_TO_BLAME = 5  # least number of frames for single ones to be left out
-NAMED_FRAMES = 3  # frames named in a message; the others are counted
-COMPARED_MOMENTS = 6  # moments of several cameras that are registered: a second each
+# contradicted share of what frames show in common if their poses are inconsistent
+MUCH_CONTRADICTED = 0.3
+TIMES_USUAL = 4.0  # of the usual share, from which on a single frame is wrong
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
     "TUM RGB-D": "this layout, 5000 per metre",
@@ -62,26 +50,32 @@ def check_capture(
             one rigid scene; the message names the likely mistake.
     """
     refused = dict(capture.unreadable)
-    compared, frames = _read_some(capture, masked, refused)
-    refuse_many(capture, refused, len(capture.frames) + len(capture.unreadable))
+    frames = {}
+    for i in _evenly_spread(capture):
+        captured = capture.frames[i]
+        try:
+            frame = _read(captured, masked)
+        except (DatasetError, ObservationError) as error:
+            refused[captured.name] = str(error)
+        else:
+            if frame is not None:
+                frames[i] = frame
+    total = len(capture.frames) + len(capture.unreadable)
+    refuse_many(capture, refused, total)
 
     if capture.object_is_world:  # then only the masked pixels are static
-        with_mask = [i for i, frame in enumerate(frames) if frame.mask is not None]
-        compared = compared[with_mask]
-        frames = [frames[i] for i in with_mask]
-    if (
-        capture.stands
-    ):  # the scene may have changed, except between frames taken together
+        frames = {i: frame for i, frame in frames.items() if frame.mask is not None}
+    if capture.stands:
+        # the scene may have changed, except between frames taken together
         together = {frame.name for frame in max(capture.moments, key=len)}
-        kept = [
-            i for i, row in enumerate(compared) if capture.frames[row].name in together
-        ]
-        compared = compared[kept]
-        frames = [frames[i] for i in kept]
+        frames = {
+            i: frame
+            for i, frame in frames.items()
+            if capture.frames[i].name in together
+        }
     if len(frames) > 1:
-        refused |= _contradicting(capture, compared, frames)
-        refuse_many(capture, refused, len(capture.frames) + len(capture.unreadable))
-
+        refused |= _contradicting(capture, np.array(list(frames)), [*frames.values()])
+        refuse_many(capture, refused, total)
     usable = tuple(frame for frame in capture.frames if frame.name not in refused)
     return replace(capture, frames=usable), refused
 
@@ -107,37 +101,12 @@ def summary(refused: Mapping[str, str]) -> str:
     reasons = list(refused.values())
     commonest = max(reasons, key=reasons.count)
     names = [name for name, reason in refused.items() if reason == commonest]
-    listed = ", ".join(names[:NAMED_FRAMES])
-    if len(names) > NAMED_FRAMES:
-        listed += f" and {len(names) - NAMED_FRAMES} more"
+    listed = ", ".join(names[:3])
+    if len(names) > 3:
+        listed += f" and {len(names) - 3} more"
     others = len(refused) - len(names)
-    return f"{listed}: {commonest}" + (
-        f"; {others} for other reasons" if others else ""
-    )
-
-
-def _read_some(
-    capture: Capture,
-    masked: bool,
-    refused: dict[str, str],
-) -> tuple[np.ndarray, list[Frame]]:
-    """Read evenly spread frames; unreadable ones are added to ``refused``."""
-    spread = _evenly_spread(capture)
-    indices = []
-    frames = []
-
-    for i in spread:
-        captured = capture.frames[i]
-        try:
-            frame = _read(captured, masked)
-        except (DatasetError, ObservationError) as error:
-            refused[captured.name] = str(error)
-        else:
-            if frame is not None:
-                indices.append(i)
-                frames.append(frame)
-
-    return np.array(indices, int), frames
+    more = f"; {others} for other reasons" if others else ""
+    return f"{listed}: {commonest}{more}"
 
 
 def _evenly_spread(capture: Capture) -> list[int]:
@@ -146,14 +115,17 @@ def _evenly_spread(capture: Capture) -> list[int]:
     Those that were taken together stay together.
     """
     moments = capture.moments
-    most = max(1, MOST_COMPARED_FRAMES // len(capture.cameras))
-    few = np.unique(
-        np.linspace(0, len(moments) - 1, min(len(moments), most)).astype(int)
-    )
-    names = {frame.name for k in few for frame in moments[k]}
+    # so many frames are compared with each other
+    most = max(1, 60 // len(capture.cameras))
+    names = {frame.name for k in _spread(len(moments), most) for frame in moments[k]}
     if capture.stands:
         names |= {frame.name for frame in max(moments, key=len)}
     return [i for i, frame in enumerate(capture.frames) if frame.name in names]
+
+
+def _spread(count: int, most: int) -> Index:
+    """Return evenly spaced numbers below a count."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def _read(captured: CapturedFrame, masked: bool) -> Frame | None:
@@ -169,67 +141,90 @@ def _read(captured: CapturedFrame, masked: bool) -> Frame | None:
 
 def _contradicting(
     capture: Capture,
-    compared: np.ndarray,
-    frames: list[Frame],
+    compared: Index,
+    frames: Sequence[Frame],
 ) -> dict[str, str]:
     """Return frames that contradict the others, with reasons; DatasetError if they are many."""
     rng = np.random.default_rng(0)
-    views = [surface_view(frame, rng) for frame in frames]
+    views = [SurfaceView.of(frame, rng, whole=False) for frame in frames]
     poses = np.stack([frame.pose for frame in capture.frames])
-    posed = PosedViews(views, poses[compared], _stored(capture))
-    fitted = fitted_mistakes(float(capture.frames[0].intrinsics[0, 0]))
-
-    mistake = find_mistake(posed) or find_fitted(posed, fitted["focal length"])
-    if mistake is not None:
-        raise _disagree(capture, mistake.sentence)
+    posed = PosedViews(views, poses[compared])
+    found = _find_mistake(posed, _stored(capture, frames))
+    if found is not None:
+        raise _disagree(capture, found.sentence)
 
     most = max(1, int(MOST_REFUSED * len(frames)))
-    shifts = find_shifts(views, compared, poses)
-    late = np.zeros(len(frames), bool)
-    for shift in shifts:
-        late[shift.first : shift.end] = True
-    if late.sum() > most:
+    late = find_late(views, compared, poses)
+    ends = [0, *(np.flatnonzero(np.diff(late)) + 1), len(late)]
+    parts = [(first, end) for first, end in pairwise(ends) if late[first]]
+    names = [capture.frames[i].name for i in compared]
+    if np.count_nonzero(late) > most:
         raise _disagree(
-            capture,
-            " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts),
+            capture, " and ".join(_in_words(late, names, *part) for part in parts)
         )
-    refused = _late_frames(capture, compared, shifts)
+    refused = {
+        capture.frames[i].name: f"its pose is {_frames_late(late[first])}"
+        for first, end in parts
+        for i in range(compared[first], compared[end - 1] + 1)
+    }
 
-    kept = np.flatnonzero(~late)
-    evidence = PoseEvidence.of([views[i] for i in kept], poses[compared[kept]])
-    blamed = _to_blame(evidence)
-    left = np.setdiff1d(np.arange(len(kept)), list(blamed))
-    most_blamed = most - int(late.sum()) if len(frames) >= FEWEST_TO_BLAME else 0
-    too_many = len(blamed) > most_blamed
-    too_many |= len(left) > 1 and _disagreeing(evidence, left)
+    kept = np.flatnonzero(late == 0)
+    agreements = [
+        compare(some, posed.poses[kept])
+        for some in (
+            [views[i] for i in kept],
+            [views[i].of_standing() for i in kept],
+        )
+    ]
+    blamed = _to_blame(agreements)
+    left = np.ones(len(kept), bool)
+    left[list(blamed)] = False
+    first, across = _break(agreements[1].among(left[:, None] & left))
+    standing = agreements[1].among(left[:, None] & left)
+    # a single frame is left out only where several others agree
+    too_many = len(blamed) > (most - (late != 0).sum() if len(frames) >= 5 else 0)
+    too_many |= max(_wrong(standing), across) > MUCH_CONTRADICTED
     if too_many or blamed:
-        offset = find_fitted(posed, fitted["offset"])
-        if offset is not None:
-            raise _disagree(capture, offset.sentence)
+        offset = _find_offset(posed)
+        if offset:
+            raise _disagree(capture, offset)
     if too_many:
-        raise _unexplained(capture, compared[kept], evidence)
-
+        wrong = max(one.wrong for one in agreements)
+        first, _ = _break(agreements[1])
+        hint = "are the poses of another recording, or did the object move in between?"
+        if len(capture.cameras) > 1:
+            hint = "is the pose of a camera that of another one, or in another world?"
+        elif first:
+            hint = (
+                f"the frames from {names[kept[first]]} on contradict those before: did the object"
+                " or the camera's base move there?"
+            )
+        raise DatasetError(
+            f"{capture.folder}: its frames do not agree about one rigid object ({wrong:.0%} of what"
+            " they show in common is contradicted), and no usual mistake explains it: "
+            + hint
+        )
     for i, share in blamed.items():
-        what = (
-            f"it contradicts the other frames ({1 - share:.0%} of what it shows with them): was its"
+        refused[names[kept[i]]] = (
+            f"it contradicts the other frames ({share:.0%} of what it shows with them): was its"
             " pose lost?"
         )
-        refused[capture.frames[compared[kept[i]]].name] = what
     return refused
 
 
-def _stored(capture: Capture) -> Stored:
+def _stored(capture: Capture, frames: Sequence[Frame]) -> Stored:
     """Return the storage conventions of a capture's layout."""
     of_bop = capture.layout == "BOP"
+    told_by = DEPTH_SOURCES.get(capture.layout, "in its files")
     return Stored(
+        focal_length=float(capture.frames[0].intrinsics[0, 0]),
+        median_depth=float(
+            np.median([np.median(frame.depth[frame.depth > 0]) for frame in frames])
+        ),
         to_world=not of_bop,
         unit=0.001 if of_bop else 1.0,
         step=capture.frames[0].scale,
-        step_told_by=(
-            "--depth-scale"
-            if capture.scale_given
-            else DEPTH_SOURCES.get(capture.layout, "in its files")
-        ),
+        step_told_by="--depth-scale" if capture.scale_given else told_by,
     )
 
 
@@ -239,157 +234,173 @@ def _disagree(capture: Capture, looks: str) -> DatasetError:
     return DatasetError(f"{capture.folder}: {problem}: {looks}")
 
 
-@dataclass(frozen=True)
-class PoseEvidence:
-    """Agreement of N frames.
+def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
+    """Return the mistake without which frames agree much better; single ones before pairs."""
+    as_read = compare(posed.views, posed.poses)
+    if as_read.judged > 0.25 * _judgeable(posed.views) and as_read.wrong < 0.05:
+        return (
+            None  # correct poses of a real camera leave half of this share contradicted
+        )
+    single = mistakes(stored)
+    found = _likeliest(posed, single, stored.median_depth)
+    if found is not None:
+        return found
+    pairs = (
+        one.with_another(other)
+        for one, other in combinations([one for one in single if one.combines], 2)
+        if one.name != other.name
+    )
+    few = _some(posed)
+    found = _likeliest(few, pairs, stored.median_depth)
+    return found and _likeliest(posed, [found], stored.median_depth)
 
-    Attributes:
-        all: of all points.
-        standing: of the points above the largest plane.
+
+def _some(posed: PosedViews) -> PosedViews:
+    """Return frames among which a search is fast."""
+    rows = _spread(len(posed.views), 20)
+    return PosedViews([posed.views[row] for row in rows], posed.poses[rows])
+
+
+def _likeliest(
+    posed: PosedViews, tried: Iterable[Mistake], middle: float
+) -> Mistake | None:
+    """Return the mistake whose correction explains most, if it explains enough.
+
+    Args:
+        posed: frames and poses as read.
+        tried: candidates.
+        middle: median depth of the frames, metres.
     """
+    before = compare(posed.views, posed.poses)
+    best = None
+    most = 0.0
+    for mistake in tried:
+        right = mistake.undone(posed)
+        if in_one_place(right.poses, middle):
+            continue
+        after = compare(right.views, right.poses)
+        # Usual calibration errors leave .12; for real frames with shuffled poses, no mistake leaves
+        # less than .8.
+        if after.judged < FEWEST_JUDGED or after.wrong > 0.25:
+            continue
+        # or the frames as read look past each other
+        past = before.judged < 0.25 * after.judged
+        past &= after.judged > 0.25 * _judgeable(posed.views)
+        if after.nats.sum() > most and (past or explains(before, after)):
+            most = float(after.nats.sum())
+            best = mistake
+    return best
 
-    all: Agreement
-    standing: Agreement
 
-    @classmethod
-    def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "PoseEvidence":
-        """Compare frames with given poses.
-
-        Args:
-            views: surfaces of the frames.
-            poses: camera-to-world, (N, 4, 4).
-
-        Returns:
-            The evidence.
-        """
-        standing = [view.some(view.standing) for view in views]
-        return cls(compare(views, poses), compare(standing, poses))
+def _judgeable(views: Sequence[SurfaceView]) -> float:
+    """Return the number of judgements if all frames saw all points, with both tolerances."""
+    return 2.0 * sum(len(view.points) for view in views) * (len(views) - 1)
 
 
-def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
-    """Return frames that contradict the others most, worst first, with confirmed shares."""
-    kept = np.ones(len(evidence.all.confirmed), bool)
+def _find_offset(posed: PosedViews) -> str:
+    """Find the constant offset of the camera without which frames agree; "" for none."""
+
+    def moved(some: PosedViews, offset: Float) -> Agreement:
+        poses = some.poses.copy()
+        poses[:, :3, 3] += poses[:, :3, :3] @ offset
+        return compare(some.views, poses)
+
+    few = _some(posed)
+
+    def contradicted(offset: Float) -> float:
+        return moved(few, offset).wrong
+
+    starts = np.stack(np.meshgrid(*[(-0.08, 0.0, 0.08)] * 3), -1).reshape(-1, 3)
+    start = starts[int(np.argmin([contradicted(offset) for offset in starts]))]
+    simplex = start + 0.03 * np.eye(4, 3, -1)
+    found = minimize(
+        contradicted,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": 120, "initial_simplex": simplex, "xatol": 1e-3},
+    ).x
+    large = np.linalg.norm(found) >= 0.02  # smaller ones are calibration errors
+    if not large or not explains(
+        compare(posed.views, posed.poses), moved(posed, found)
+    ):
+        return ""
+    where = ", ".join(f"{value:+.2f}" for value in found)
+    return (
+        f"the camera stands some {100 * np.linalg.norm(found):.0f} cm beside its poses, the same"
+        f" way in all frames ({where} m along its axes x right, y down, z forward): is the hand-eye"
+        " calibration missing or wrong?"
+    )
+
+
+def _wrong(agreement: Agreement) -> float:
+    """Return the contradicted share of some frames; 0 if too little was judged."""
+    return agreement.wrong if agreement.judged >= FEWEST_JUDGED else 0.0
+
+
+def _to_blame(agreements: Sequence[Agreement]) -> dict[int, float]:
+    """Return frames that contradict the others most, worst first, with contradicted shares.
+
+    Args:
+        agreements: of all points, and of those above the largest plane.
+    """
+    kept = np.ones(len(agreements[0].confirmed), bool)
     blamed: dict[int, float] = {}
     while kept.sum() > 1:
         pairs = kept[:, None] & kept
-        share = np.minimum(
-            _enough_judged(evidence.all.among(pairs)),
-            _enough_judged(evidence.standing.among(pairs)),
+        own = np.eye(len(kept), dtype=bool)
+        wrong = np.array(
+            [
+                max(
+                    _wrong(one.among(pairs & (row[:, None] | row)))
+                    for one in agreements
+                )
+                for row in own
+            ]
         )
-        share = np.where(kept, share, 1.0)
-
-        usual = float(np.median(1 - share[kept]))
-        limit = np.clip(TIMES_USUAL * usual, UNUSUALLY_CONTRADICTED, MUCH_CONTRADICTED)
-        worst = int(share.argmin())
-        if 1 - share[worst] <= limit:
+        usual = float(np.median(wrong[kept]))
+        worst = int(wrong.argmax())
+        if wrong[worst] <= np.clip(TIMES_USUAL * usual, MUCH_CONTRADICTED, 0.5):
             break
-        blamed[worst] = float(share[worst])
+        blamed[worst] = float(wrong[worst])
         kept[worst] = False
     return blamed
 
 
-def _enough_judged(agreement: Agreement) -> np.ndarray:
-    """Return the confirmed share of each frame, (N,); 1 if too few points were judged."""
-    share, judged = agreement.of_each()
-    return np.where(judged >= LEAST_EXPLAINED, share, 1.0)
-
-
-def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
-    """Return True if the remaining frames contradict each other about the object.
-
-    Either all of them do, or those from some frame on contradict the earlier ones.
-    """
-    standing = evidence.standing.of_frames(left)
-    if standing.judged >= LEAST_EXPLAINED and 1 - standing.share > CONTRADICTED_IN_ALL:
-        return True
-    first = _break(standing)
-    return first > 0 and 1 - _across(standing, first).share > CONTRADICTED_IN_ALL
-
-
-def _unexplained(
-    capture: Capture,
-    compared: np.ndarray,
-    evidence: PoseEvidence,
-) -> DatasetError:
-    """Return the error for contradictions that no usual mistake explains."""
-    contradicted = 1 - min(evidence.all.share, evidence.standing.share)
-    problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "
-    problem += "show in common is contradicted), and no usual mistake explains it"
-    hint = "are the poses of another recording, or did the object move in between?"
-    first = _break(evidence.standing)
-    if len(capture.cameras) > 1:
-        hint = "is the pose of a camera that of another one, or in another world?"
-    elif first:
-        name = capture.frames[compared[first]].name
-        hint = (
-            f"the frames from {name} on contradict those before: did the object or the camera's"
-            " base move there?"
-        )
-    return DatasetError(f"{capture.folder}: {problem}: {hint}")
-
-
-def _break(agreement: Agreement) -> int:
-    """Return the first frame that disagrees with those before; 0 if there is none."""
+def _break(agreement: Agreement) -> tuple[int, float]:
+    """Return the first frame that disagrees with those before, and how much; 0 for none."""
     count = len(agreement.confirmed)
-    best = 0
+    best = 0, 0.0
     largest = 0.0
     for first in range(2, count - 1):
         later = np.arange(count) >= first
-        across = _across(agreement, first)
+        across = agreement.among(later[:, None] != later)
         within = agreement.among(later[:, None] == later)
-        if min(across.judged, within.judged) < LEAST_EXPLAINED:
+        if min(across.judged, within.judged) < FEWEST_JUDGED:
             continue
-
-        wrong_across = 1 - across.share
-        wrong_within = 1 - within.share
-        if (
-            wrong_across > TIMES_USUAL * wrong_within
-            and wrong_across - wrong_within > largest
-        ):
-            largest = wrong_across - wrong_within
-            best = first
+        more = across.wrong - within.wrong
+        if across.wrong > TIMES_USUAL * within.wrong and more > largest:
+            largest = more
+            best = first, across.wrong
     return best
 
 
-def _across(agreement: Agreement, first: int) -> Agreement:
-    """Return the agreement of the frames from one on with the earlier ones."""
-    later = np.arange(len(agreement.confirmed)) >= first
-    return agreement.among(later[:, None] != later)
-
-
-def _late_frames(
-    capture: Capture,
-    compared: np.ndarray,
-    shifts: Sequence[Shift],
-) -> dict[str, str]:
-    """Return frames that have the poses of other frames, and why they are left out."""
-    refused = {}
-    for shift in shifts:
-        reason = f"its pose is {_frames_late(shift)}"
-        for i in range(compared[shift.first], compared[shift.end - 1] + 1):
-            refused[capture.frames[i].name] = reason
-    return refused
-
-
-def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str:
-    """Describe the frame from which, or up to which, poses are late."""
-    first = capture.frames[compared[shift.first]].name
-    last = capture.frames[compared[shift.end - 1]].name
-    late = f"the poses are {_frames_late(shift)}"
-    if shift.first == 0 and shift.end == len(compared):
-        return late
-    if shift.end < len(compared):
-        return f"from frame {first} to {last} {late}"
-    lost = "an image" if shift.frames > 0 else "a pose"
-    return f"from frame {first} on {late} (was {lost} lost there?)"
-
-
-def _frames_late(shift: Shift) -> str:
+def _frames_late(late: int) -> str:
     """Describe by how many frames poses are late."""
-    many = "one frame" if abs(shift.frames) == 1 else f"{abs(shift.frames)} frames"
-    if shift.frames > 0:
+    many = "one frame" if abs(late) == 1 else f"{abs(late)} frames"
+    if late > 0:
         return f"{many} late: each frame has the pose of an earlier one"
     return f"{many} early: each frame has the pose of a later one"
+
+
+def _in_words(late: Index, names: Sequence[str], first: int, end: int) -> str:
+    """Describe the frame from which, or up to which, poses are late."""
+    what = f"the poses are {_frames_late(late[first])}"
+    if first == 0 and end == len(late):
+        return what
+    if end < len(late):
+        return f"from frame {names[first]} to {names[end - 1]} {what}"
+    lost = "an image" if late[first] > 0 else "a pose"
+    return f"from frame {names[first]} on {what} (was {lost} lost there?)"
 
 
 def errors_of_cameras(capture: Capture) -> list[CameraOffset]:
@@ -406,10 +417,9 @@ def errors_of_cameras(capture: Capture) -> list[CameraOffset]:
         DatasetError: an image cannot be read.
     """
     moments = [frames for frames in capture.moments if len(frames) > 1]
-    few = np.linspace(0, len(moments) - 1, min(len(moments), COMPARED_MOMENTS))
     return camera_offsets(
         [
             [captured.read(masked=False) for captured in moments[k]]
-            for k in np.unique(few.astype(int))
+            for k in _spread(len(moments), 6)  # a second each
         ]
     )

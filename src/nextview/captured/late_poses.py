@@ -7,250 +7,150 @@ compared.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
-from nextview.sensing.mistakes import LEAST_EXPLAINED, explains, relative_change
 from nextview.types import Float, Index, Mask
 
-FRAME_SHIFTS = (1, -1, 2, -2)  # possible delays of the poses of a part, frames
-MOST_SHIFTED = 4  # largest total delay of several parts, frames
-# largest number of parts, nested or consecutive
-MOST_PARTS = 3
-LEAST_OF_ALL = 0.1  # least share of all contradictions that a further part explains
-SAME_EXPLAINED = (
-    1e-3  # least number of contradictions that a further frame in a part explains
-)
-# the first frames are taken as correct if the parts then still explain this share
-AS_GOOD = 0.5
+FEWEST_JUDGED = 100  # judgements that tell something
 
 
-@dataclass(frozen=True)
-class Shift:
-    """A range of the compared frames whose poses are late.
+def explains(before: Agreement, after: Agreement) -> bool:
+    """Return True if frames contradict each other much less once a mistake is undone.
 
-    Attributes:
-        first: the first of these frames.
-        end: the first frame after them; the number of frames if there is none.
-        frames: delay of their poses in frames; negative if they are early.
+    Args:
+        before: agreement as read.
+        after: the same without the mistake.
     """
+    explained = before.contradicted.sum() - after.contradicted.sum()
+    return bool(
+        explained >= max(FEWEST_JUDGED, 0.01 * before.judged)
+        and after.judged >= 0.5 * before.judged
+        and after.wrong <= 0.5 * before.wrong
+    )
 
-    first: int
-    end: int
-    frames: int
 
-
-@dataclass(frozen=True)
-class Shifted:
+class _Delayed:
     """Agreement of frames if some have the poses of their neighbours.
 
     Attributes:
-        views: N frames, with the compared points.
-        indices: of these frames in the capture, (N,).
+        indices: of the N compared frames in the capture, (N,).
         poses: of all frames, camera-to-world, (M, 4, 4).
     """
 
-    views: Sequence[SurfaceView]
-    indices: Index
-    poses: Float
-    _known: dict[tuple[int, int], Agreement] = field(default_factory=dict)
-
-    def agreement(self, late: Index, late_there: Index) -> Agreement:
-        """Return the agreement of frames with late poses or images.
-
-        Args:
-            late: delay of the pose of each frame, by row, in frames, (N,).
-            late_there: the same for the frames that it is compared with, by column, (N,).
-
-        Returns:
-            The agreement.
-        """
-        count = len(self.views)
-        confirmed = np.zeros((count, count))
-        contradicted = np.zeros((count, count))
-        for here in np.unique(late):
-            for there in np.unique(late_there):
-                pairs = np.ix_(late == here, late_there == there)
-                found = self._all_late(int(here), int(there))
-                confirmed[pairs] = found.confirmed[pairs]
-                contradicted[pairs] = found.contradicted[pairs]
-        return Agreement(confirmed, contradicted)
-
-    def poses_of(self, late: Index) -> Float:
-        """Return the correct poses, (N, 4, 4), if those of the capture are late."""
-        return self.poses[np.clip(self.indices + late, 0, len(self.poses) - 1)]
+    def __init__(
+        self, views: Sequence[SurfaceView], indices: Index, poses: Float
+    ) -> None:
+        self._views = [view.of_standing() for view in views]
+        self.indices = indices
+        self.poses = poses
+        self._known: dict[tuple[int, int], Agreement] = {}
 
     def has_pose(self, late: Index) -> Mask:
         """Return which frames still have a pose if those in the capture are late, (N,)."""
         where = self.indices + late
         return (where >= 0) & (where < len(self.poses))
 
-    def _all_late(self, here: int, there: int) -> Agreement:
-        """Return ``agreement`` with the same delay for all frames."""
-        if (here, there) not in self._known:
-            late = np.full(len(self.views), here)
-            late_there = np.full(len(self.views), there)
-            looked_up_with = self.poses_of(late_there)
-            found = compare(
-                self.views,
-                self.poses_of(late),
-                looked_up_with=looked_up_with,
-            )
-            usable = self.has_pose(late)[:, None] & self.has_pose(late_there)
-            self._known[here, there] = found.among(usable)
-        return self._known[here, there]
+    def agreement(self, late: Index, late_there: Index) -> Agreement:
+        """Return the agreement of frames with late poses; that of others is 0.
+
+        Args:
+            late: delay of the pose of each frame, by row, in frames, (N,).
+            late_there: the same for the frames that it is compared with, by column, (N,).
+        """
+        found = np.zeros((2, len(late), len(late)))
+        for here in np.unique(late):
+            for there in np.unique(late_there):
+                if (here, there) not in self._known:
+                    last = len(self.poses) - 1
+                    self._known[here, there] = compare(
+                        self._views,
+                        self.poses[np.clip(self.indices + here, 0, last)],
+                        self.poses[np.clip(self.indices + there, 0, last)],
+                    )
+                pairs = np.ix_(late == here, late_there == there)
+                known = self._known[here, there]
+                found[0][pairs] = known.confirmed[pairs]
+                found[1][pairs] = known.contradicted[pairs]
+        found *= self.has_pose(late)[:, None] & self.has_pose(late_there)
+        return Agreement(*found)
 
 
-def find_shifts(
-    views: Sequence[SurfaceView],
-    indices: Index,
-    poses: Float,
-) -> list[Shift]:
-    """Find ranges of a capture whose poses are late or early.
+def find_late(views: Sequence[SurfaceView], indices: Index, poses: Float) -> Index:
+    """Return by how many frames the pose of each frame is late, (N,); negative if it is early.
 
-    Ranges are added one by one, each where it explains most contradictions.
+    Parts are delayed one by one, each where it explains most.
 
     Args:
         views: N frames, in the order of the capture.
         indices: of these frames in the capture, (N,).
         poses: of all frames, camera-to-world, as read, (M, 4, 4).
-
-    Returns:
-        The ranges, ordered by their first frames, without overlap.
     """
-    standing = [view.some(view.standing) for view in views]
-    shifted = Shifted(standing, indices, poses)
+    delayed = _Delayed(views, indices, poses)
     as_read = np.zeros(len(views), np.int64)
-    contradicted = shifted.agreement(as_read, as_read).contradicted.sum()
-    least = max(LEAST_EXPLAINED, LEAST_OF_ALL * contradicted)
-    if contradicted < least:
-        return []
-
+    before = delayed.agreement(as_read, as_read)
+    least = max(FEWEST_JUDGED, 0.1 * before.contradicted.sum())
     late = as_read
-    for _ in range(MOST_PARTS):
-        found = _best_part(shifted, late, least)
-        if found is None:
+    for _ in range(3):  # parts, nested or consecutive
+        further = _best_part(delayed, late, least)
+        if not further.any():
             break
-        late = late.copy()
-        late[found.first : found.end] += found.frames
+        late = late + further
 
     # On a uniform path around an object only differences between delays are observable. Then the
     # first frames are taken as correct.
     others = late - late[1]
     others[0] = min(others[0], 0, key=abs)
-    if _explained(shifted, as_read, others) >= AS_GOOD * _explained(
-        shifted,
-        as_read,
-        late,
-    ):
-        late = others
-    return _parts(late) if _is_explained(shifted, as_read, late) else []
 
+    def changed(later: Index) -> tuple[Agreement, Agreement]:
+        """Return the agreement as read, and with other delays, of the frames that they concern."""
+        usable = delayed.has_pose(later)
+        pairs = (later != 0)[:, None] | (later != 0)
+        pairs &= usable[:, None] & usable
+        after = delayed.agreement(later, later)
+        return before.among(pairs), after.among(pairs)
 
-def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
-    """Return the range that explains most contradictions with later poses; or None."""
-    best = None
-    most_explained = least
-    for frames in FRAME_SHIFTS:
-        later = late + frames
-        if np.abs(later).max() > MOST_SHIFTED:
-            continue
-        explained = _explained_by_parts(shifted, late, later)
-        first, last = np.unravel_index(explained.argmax(), explained.shape)
-        if explained[first, last] >= most_explained:
-            most_explained = float(explained[first, last])
-            without_pose = np.flatnonzero(shifted.has_pose(later)[last + 1 :])
-            end = (
-                len(late)
-                if not len(without_pose)
-                else int(last) + 1 + int(without_pose[0])
-            )
-            best = Shift(int(first), end, frames)
-
-    return best
-
-
-def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
-    """Count the contradictions that are resolved by later poses, by first and last frame.
-
-    Frames without a later pose explain nothing.
-    """
-    before = shifted.agreement(late, late).contradicted
-    usable = shifted.has_pose(later)
-    inside = shifted.agreement(later, later).contradicted
-    leaving = shifted.agreement(later, late).contradicted
-    entering = shifted.agreement(late, later).contradicted
-
-    # A frame without a pose is left out of the range, and keeps its contradictions.
-    row = usable[:, None]
-    column = usable[None]
-    within_part = np.where(row & column, before - inside, 0)
-    from_part = np.where(row, before - leaving, 0)
-    into_part = np.where(column, before - entering, 0)
-
-    count = len(late)
-    found = np.full((count, count), -np.inf)
-    sums_within = _corner_sums(within_part)
-    sums_from = _corner_sums(from_part)
-    sums_into = _corner_sums(into_part)
-    for first in range(count):
-        for last in range(first, count):
-            part = slice(first, last + 1)
-            found[first, last] = (
-                _sum(sums_within, part, part)
-                + _sum(sums_from, part, slice(0, count))
-                - _sum(sums_from, part, part)
-                + _sum(sums_into, slice(0, count), part)
-                - _sum(sums_into, part, part)
-            )
-    # Of ranges that explain the same, the shortest is preferred.
-    length = np.arange(count)[None] - np.arange(count)[:, None]
-    found -= SAME_EXPLAINED * np.maximum(length, 0)
-    return found
-
-
-def _corner_sums(values: Float) -> Float:
-    """Return sums of (N, N) over all rows and columns before each element, (N + 1, N + 1)."""
-    return np.pad(values.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-
-
-def _sum(sums: Float, rows: slice, columns: slice) -> float:
-    """Return the sum over some rows and columns, from ``_corner_sums``."""
-    low = rows.start
-    high = rows.stop
-    left = columns.start
-    right = columns.stop
-    return float(
-        sums[high, right] - sums[low, right] - sums[high, left] + sums[low, left]
+    one, other = (
+        as_is.contradicted.sum() - after.contradicted.sum()
+        for as_is, after in map(changed, (late, others))
     )
+    if other >= 0.5 * one:
+        late = others
+    return late if explains(*changed(late)) else as_read
 
 
-def _explained(shifted: Shifted, late: Index, later: Index) -> float:
-    """Count the contradictions that are resolved by later poses."""
-    usable = shifted.has_pose(later)
-    pairs = usable[:, None] & usable
-    before = shifted.agreement(late, late).contradicted[pairs]
-    after = shifted.agreement(later, later).contradicted[pairs]
-    return float(before.sum() - after.sum())
-
-
-def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
-    """Return True if frames contradict each other much less with later poses."""
-    usable = shifted.has_pose(late)
-    changed = relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
-    changed &= usable[:, None] & usable
-    before = shifted.agreement(as_read, as_read).among(changed)
-    return explains(before, shifted.agreement(late, late).among(changed))
-
-
-def _parts(late: Index) -> list[Shift]:
-    """Return ranges of frames with the same delay, ignoring those without one."""
-    ends = [0, *(np.flatnonzero(np.diff(late)) + 1), len(late)]
-    found = []
-    for first, end in pairwise(ends):
-        if late[first]:
-            found.append(Shift(int(first), int(end), int(late[first])))
-    return found
+def _best_part(delayed: _Delayed, late: Index, least: float) -> Index:
+    """Return the further delay of each frame that explains most: of one part; 0 for none."""
+    count = len(late)
+    rows = np.arange(count)
+    first, end = np.triu_indices(count)
+    parts = (rows >= first[:, None]) & (rows <= end[:, None])
+    best = np.zeros(count, np.int64)
+    before = delayed.agreement(late, late).contradicted
+    for frames in (1, -1, 2, -2):
+        later = late + frames
+        if np.abs(later).max() > 4:  # frames, by several parts together
+            continue
+        # A frame without a later pose explains nothing.
+        usable = delayed.has_pose(later)
+        inside = parts & usable
+        within, leaving, entering = (
+            before - delayed.agreement(*pair).contradicted
+            for pair in ((later, later), (later, late), (late, later))
+        )
+        outside = ~inside
+        gain = (
+            np.einsum("ki,ij,kj->k", inside, within, inside, optimize=True)
+            + np.einsum("ki,ij,kj->k", inside, leaving, outside, optimize=True)
+            + np.einsum("ki,ij,kj->k", outside, entering, inside, optimize=True)
+        )
+        # Of parts that explain the same, the shortest is preferred.
+        gain -= 1e-3 * parts.sum(1)
+        part = int(gain.argmax())
+        if gain[part] >= least:
+            least = float(gain[part])
+            best = frames * parts[part]
+            if not usable[end[part] + 1 :].any():
+                best[end[part] + 1 :] = frames
+    return best

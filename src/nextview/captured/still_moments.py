@@ -8,10 +8,9 @@ from scipy import ndimage
 
 from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import NOISE_TOLERANCE
-from nextview.sensing.displacement import RELATIVE_DEPTH_ERROR
 from nextview.sensing.facets import noise_of
 from nextview.sensing.frame import Frame
+from nextview.sensing.registration import tolerance_of
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 
 Moment = tuple[CapturedFrame, ...]
@@ -76,8 +75,7 @@ def has_changed(before: Frame, after: Frame) -> bool:
     noise = noise_of(before)
     valid = (before.depth > 0) & (after.depth > 0)
     depth = np.minimum(before.depth, after.depth)
-    error = np.sqrt(2) * noise.at(depth) * depth**2
-    limit = NOISE_TOLERANCE * error + RELATIVE_DEPTH_ERROR * depth
+    limit = np.sqrt(2) * tolerance_of(depth, noise)
     changed = valid & (np.abs(after.depth - before.depth) > limit)
 
     # errors of neighbouring pixels are correlated

@@ -42,10 +42,6 @@ class PoseCandidate:
         symmetry: axes through its centroid, in the scan file's frame, about which the thing looks
             the same after a turn, each with ``axis`` and ``order``, 0 for any turn; None if they
             are not known.
-        displacements: by how much each view shows the thing beside this pose, because its camera
-            does not stand where it is said to, (V, 3) float64, metres, in the frame that the
-            candidate is given in. V counts the views in which something is seen, in their order;
-            views that show nothing have no row. (0, 3) where they are not known.
     """
 
     thing: str
@@ -58,7 +54,6 @@ class PoseCandidate:
     vertices: Float32 | None = None
     faces: NDArray[np.int32] | None = None
     symmetry: tuple[Any, ...] | None = None
-    displacements: Float = field(default_factory=lambda: np.zeros((0, 3)))
 
     def moved(self, by: Float) -> PoseCandidate:
         """The same in another frame.
@@ -66,8 +61,7 @@ class PoseCandidate:
         Args:
             by: from the frame that it is given in into the other one, (4, 4), metres.
         """
-        turned = self.displacements @ by[:3, :3].T
-        return replace(self, pose=by @ self.pose, displacements=turned)
+        return replace(self, pose=by @ self.pose)
 
     @property
     def place(self) -> Float:
@@ -258,8 +252,7 @@ def check_candidate(candidate: Any, classes: int) -> PoseCandidate:
         classes: number of classes.
 
     Raises:
-        ModelError: it is none, its pose is no rigid motion, its displacements are no vectors, or
-            its class is none of them.
+        ModelError: it is none, its pose is no rigid motion, or its class is none of them.
     """
     if not isinstance(candidate, PoseCandidate):
         raise ModelError(f"a pose is a PoseCandidate, not a {type(candidate).__name__}")
@@ -275,11 +268,6 @@ def check_candidate(candidate: Any, classes: int) -> PoseCandidate:
     if not rigid or np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
         raise ModelError(
             "a pose is not a rigid motion: a rotation and a place, in metres"
-        )
-    displacements = np.asarray(candidate.displacements, np.float64)
-    if displacements.shape[1:] != (3,) or not np.isfinite(displacements).all():
-        raise ModelError(
-            "the displacements of a pose are (views, 3) finite numbers, in metres"
         )
     if not 0 <= candidate.label < classes:
         raise ModelError(

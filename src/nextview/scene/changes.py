@@ -21,7 +21,7 @@ from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
 from nextview.things.score import OUTLIER, STEEPEST, Score, score, total
 from nextview.things.surface import Surface
-from nextview.things.view_templates import ALL_AROUND
+from nextview.things.visible_points import ALL_AROUND
 from nextview.things.world import (
     CLEAR_SHARE,
     EXPLAINED,
@@ -135,8 +135,8 @@ def _still(world: World, view: View) -> Changes | None:
         held = np.zeros(len(owner), np.int32)
         stride = view.stride
         nothing = before is world.views[-1] and all(
-            alike[one.mask[::stride, ::stride].ravel()].mean() > EXPLAINED
-            for one in view.instances()
+            alike[mask[::stride, ::stride].ravel()].mean() > EXPLAINED
+            for mask in view.instances()
         )
         view = view.seen_from(before.camera)
         return Changes(world, view, held, stand=tuple(numbers), nothing=nothing)
@@ -283,8 +283,8 @@ def _free(view: View, taken: Mask) -> Iterator[Float]:
         taken: pixels of its grid that things explain, (P,) bool.
     """
     stride = view.stride
-    for one in view.instances():
-        cells = np.flatnonzero(one.mask[::stride, ::stride])
+    for mask in view.instances():
+        cells = np.flatnonzero(mask[::stride, ::stride])
         if len(cells) and taken[cells].mean() < EXPLAINED:
             yield view.points(cells).mean(0)
 

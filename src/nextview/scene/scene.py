@@ -38,12 +38,15 @@ from nextview.scene.view_policies import (
 )
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.frame_mistakes import check_mistakes
-from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
+from nextview.sensing.known_frames import (
+    REPEATED,
+    KnownFrames,
+    check_mistakes,
+    check_sizes,
+    repeated,
+)
 from nextview.sensing.masks import inside_box
-from nextview.sensing.mistakes import focal_that_levels
 from nextview.sensing.object_frame import Box
-from nextview.sensing.plausibility import check_sizes
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view import View
@@ -578,10 +581,10 @@ class Scene:
         )
         warnings = tuple(check_mistakes(seen, self._known_frames))
         ground = None if earlier is None else earlier.plane
-        top = TableTop.of(seen, self.up, ground, inside, self._widest)
+        top = TableTop.of(seen, self.up, ground, inside, self._widest, warnings)
         carried = _carried(instances, top)
         view = View.of(frame, carried, inside, top.height, self._widest)
-        return replace(top, warnings=warnings), view
+        return top, view
 
     def _after(
         self, before: SceneState, top: TableTop, view: View
@@ -614,11 +617,9 @@ class Scene:
 
     def _why_wrong(self, top: TableTop) -> ViewWarning:
         """Say what is wrong with a frame in which most objects are not where they were."""
-        if self.up is not None:
-            mistake = focal_that_levels(top.frame, top.plane.normal, self.up)
-            if mistake is not None:
-                message = f"{NOT_WHERE_THEY_WERE}: {mistake.sentence}"
-                return ViewWarning("intrinsics", message)
+        for told in top.warnings:
+            if told.name == "intrinsics":
+                return replace(told, message=f"{NOT_WHERE_THEY_WERE}: {told.message}")
         return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {WRONG_POSE}")
 
     def _ruled(self, state: SceneState) -> SceneState:

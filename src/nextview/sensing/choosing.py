@@ -18,12 +18,6 @@ NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
 )
-NEAREST_POINT = (
-    0.01  # metres, least distance between the camera and a point on an object
-)
-POINTS_COMPARED = 1000  # sampled points of an instance
-# image widths from the optical axis at which pixels have the weight 1 / e
-AIM_SPREAD = 0.08
 
 
 def choose_instance(
@@ -85,7 +79,7 @@ def _at_point(seen: SegmentedFrame, point: Float) -> Mask:
     """Return the instance nearest to a point, (3,), world, metres, on its surface or inside it."""
     frame = seen.frame
     away = float(np.linalg.norm(point - frame.camera_to_world[:3, 3]))
-    if away < NEAREST_POINT:
+    if away < 0.01:  # metres: nothing is seen so near
         raise ObservationError(
             f"the object's point is {away:.2g} m from the camera: of the world?"
         )
@@ -102,7 +96,7 @@ def _distance(mask: Mask, frame: Frame, point: Float) -> float:
     It is 0 behind the visible surface, down to a depth equal to the width of the instance.
     """
     rows, columns = np.nonzero(mask & (frame.depth > 0))
-    few = slice(None, None, max(1, len(rows) // POINTS_COMPARED))
+    few = slice(None, None, max(1, len(rows) // 1000))
     points = frame.positions(rows[few], columns[few])
     nearest = float(np.linalg.norm(points - point, axis=1).min())
 
@@ -157,7 +151,8 @@ def _weight(mask: Mask, frame: Frame) -> float:
     rows, columns = np.nonzero(mask)
     column, row = frame.intrinsics[:2, 2]
     away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]
-    return float(len(rows) * np.exp(-((away / AIM_SPREAD) ** 2)))
+    # at 0.08 image widths from the optical axis pixels have the weight 1 / e
+    return float(len(rows) * np.exp(-((away / 0.08) ** 2)))
 
 
 def _of_size(seen: SegmentedFrame) -> list[Mask]:

@@ -19,17 +19,8 @@ from nextview.sensing.frame import Frame
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 SIZE = 224  # side of the observation images, the input size of the bundled networks
-# largest deviation of a window from its plane, in standard deviations of the noise
-CLOSE_ENOUGH = 1.5
-# largest error of the slope (tangent) due to noise: six degrees of the normal
-STEEPEST_ERROR = 0.1
 LEAST_NOISE = 2e-4  # relative noise of depth assumed for noise-free frames
-# slope towards the ray beyond which neighbouring pixels belong to two surfaces
-STEEPEST_FACET = np.tan(np.radians(85.0))
-BINS = 4  # ranges of depth in which the noise is measured, with equally many pixels
 ROWS_MEASURED = 20  # approximate number of image rows used to measure it
-# distances of the compared pixels, as the errors of neighbours are often correlated
-LAGS = (1, 2, 4, 6)
 
 
 @dataclass(frozen=True)
@@ -73,7 +64,7 @@ def estimate_noise(depth: Float32, usable: Mask) -> Noise:
     q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
     found = []
 
-    for lag in LAGS:
+    for lag in (1, 2, 4, 6):  # pixels, as the errors of neighbours are often correlated
         second = (
             np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :])
             if q.shape[1] > 2 * lag
@@ -89,7 +80,8 @@ def estimate_noise(depth: Float32, usable: Mask) -> Noise:
     typical = np.array([_sigma(second) for _, second, _ in found])
     grain = found[int((typical >= 0.7 * typical.max()).argmax())][0]
     _, second, at = found[-1]
-    parts = np.array_split(np.argsort(at), min(BINS, len(at)))
+    # four ranges of depth with equally many pixels
+    parts = np.array_split(np.argsort(at), min(4, len(at)))
     depths = np.array([np.median(at[part]) for part in parts], np.float64)
 
     return Noise(depths, np.array([_sigma(second[part]) for part in parts]), grain)
@@ -153,7 +145,8 @@ def drop_flying(depth: Float32, usable: Mask, noise: float, pitch: float) -> Mas
     Returns:
         The remaining pixels, (H, W) bool.
     """
-    tolerance = 5 * noise * depth**2 + STEEPEST_FACET * pitch * depth
+    steep = np.tan(np.radians(85.0))  # neighbours beyond belong to two surfaces
+    tolerance = 5 * noise * depth**2 + steep * pitch * depth
     return usable & (count_beside(depth, tolerance) >= 3)
 
 
@@ -335,7 +328,8 @@ def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[in
     """
     # noise of depth in units of the pixel spacing on the surface
     per_pixel = noise / inverse / pitch.mean()
-    side = np.sqrt(np.sqrt(12) * grain * per_pixel / STEEPEST_ERROR)
+    # noise may turn the normal by six degrees
+    side = np.sqrt(np.sqrt(12) * grain * per_pixel / 0.1)
     small = int(np.clip(np.ceil((side - 1) / 2), 1, 8))
     return 2 * small, small
 
@@ -414,7 +408,7 @@ def _choose(
             4 if radius == radii[-1] else 0.3 * (2 * radius + 1) ** 2,
         )
         guess = windows[rows[left] * w + columns[left]]
-        good = guess[:, 3] < (CLOSE_ENOUGH * noise) ** 2
+        good = guess[:, 3] < (1.5 * noise) ** 2
         # NaN: holes accept any plane
         good &= ~(np.abs(_deviation(guess, here[left], own[left])) > 3 * noise)
         found[left[good]] = guess[good, :3]

@@ -9,15 +9,6 @@ import numpy as np
 from nextview.types import Float32, Index, Mask
 
 LONGEST_PERIOD = 8  # pixels, largest period of the gaps
-# least number of gaps per measured pixel
-FEWEST_GAPS = 0.01
-# least share of gaps that are followed by another one after one period
-SAME_STEP = 0.35
-# least ratio to the share for other distances, as random gaps have no period
-DISTINCT = 2.0
-# largest relative change of inverse depth between neighbouring pixels of one surface
-ONE_SURFACE = 0.015
-PASSES = 2  # first between measured pixels, then between filled rows or columns
 
 
 def fill_regular_gaps(depth: Float32) -> tuple[Float32, Index | None]:
@@ -42,7 +33,8 @@ def fill_regular_gaps(depth: Float32) -> tuple[Float32, Index | None]:
 
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=measured)
     source = np.arange(depth.size).reshape(depth.shape)
-    for _ in range(PASSES):
+    # first between measured pixels, then between filled rows or columns
+    for _ in range(2):
         _fill_once(inverse, source, period)
     filled = np.divide(1, inverse, out=np.zeros_like(depth), where=inverse > 0)
     return np.where(measured, depth, filled), source
@@ -67,12 +59,13 @@ def _period(measured: Mask) -> int:
     """Return the period of the gaps in columns; 0 if they are not periodic, or too few."""
     begins = measured[:, :-1] & ~measured[:, 1:]
     count = np.count_nonzero(begins)
-    if count < FEWEST_GAPS * np.count_nonzero(measured) or count == 0:
+    if count < 0.01 * np.count_nonzero(measured) or count == 0:
         return 0
     lags = [k for k in range(2, LONGEST_PERIOD + 1) if k < begins.shape[1]]
     again = [np.count_nonzero(begins[:, :-k] & begins[:, k:]) / count for k in lags]
     best = int(np.argmax(again)) if again else 0
-    regular = bool(again) and again[best] > max(SAME_STEP, DISTINCT * min(again))
+    # random gaps follow each other after all distances alike
+    regular = bool(again) and again[best] > max(0.35, 2 * min(again))
     return lags[best] if regular else 0
 
 
@@ -87,7 +80,7 @@ def _fill_once(inverse: Float32, source: Index, widest: int) -> None:
         other = inverse.ravel()[second]
         span = before + after
 
-        one_surface = np.abs(one - other) <= ONE_SURFACE * span * np.minimum(one, other)
+        one_surface = np.abs(one - other) <= 0.015 * span * np.minimum(one, other)
         # At equal distance the background is preferred, so that objects do not grow.
         nearer_first = (before < after) | ((before == after) & (one < other))
         on_plane = (one * after + other * before) / span

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
+from operator import lt
 
 import numpy as np
 from scipy import ndimage
@@ -31,21 +33,13 @@ from nextview.sensing.planes import (
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
-MOST_LEVELS = 6
-# share of all surface pixels below which the search for further levels ends
-LEAST_LEFT = 0.003
-OUTLINE_MARGIN = 0.05  # metres around the visible part of a surface that may be hidden
-INSTANCE_POINTS = 500  # sampled points of an instance
 # least share of an instance's points above its carrier
 MOST_INSIDE = 0.5
 # largest share of an instance's points below its bottom, due to noise
 BOTTOM_SHARE = 0.04
 # largest height of an instance's bottom above its carrier, relative to the distance
 BOTTOM_MARGIN = 0.02
-# largest relative depth step between neighbouring pixels of one surface, in addition to noise
-SURFACE_STEP = 0.04
 RING_WIDTH = 3  # pixels around the bottom of an instance that show the surface below it
-HANGING_SHARE = 0.8  # least share of these far behind an instance that hangs in the air
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +69,8 @@ class SurfaceLevel:
         """
         along = points @ self.axes.T
         outside = along @ self.sides[:, :2].T + self.sides[:, 2]
-        return np.asarray((outside <= OUTLINE_MARGIN).all(1))
+        # 5 cm around its visible part may be hidden
+        return np.asarray((outside <= 0.05).all(1))
 
 
 def levels_of(
@@ -97,16 +92,31 @@ def levels_of(
             most instance pixels.
         earlier: levels of earlier frames; used if they are not visible in this one.
     """
+
+    def load(level: SurfaceLevel, carriers: Sequence[SurfaceLevel | None]) -> int:
+        """Return the number of instance pixels that a level carries."""
+        pairs = zip(masks, carriers, strict=True)
+        return sum(int(mask.sum()) for mask, carrier in pairs if carrier is level)
+
     levels = _found(frame, surface & (frame.depth > 0), noise, up)
-    if up is None:
-        levels = _parallel(levels, frame, masks)
+    if up is None and levels:
+        alone = [[carrier_of(mask, frame, [one]) for mask in masks] for one in levels]
+        worth = [
+            (load(one, carriers), one.pixels.sum())
+            for one, carriers in zip(levels, alone, strict=True)
+        ]
+        first = levels[worth.index(max(worth))]
+        along = [one.plane.normal @ first.plane.normal > TILT for one in levels]
+        levels = list(compress(levels, along))
     none = np.zeros(frame.shape, bool)
     hidden = [
         replace(level, pixels=none)
         for level in earlier
-        if not any(_same(level, other, frame) for other in levels)
+        if not any(lt(*apart_from(level.plane, other, frame)) for other in levels)
     ]
-    return _by_load([*levels, *hidden], frame, masks)
+    every = [*levels, *hidden]
+    carriers = [carrier_of(mask, frame, every) for mask in masks]
+    return sorted(every, key=lambda one: -load(one, carriers))
 
 
 def carriers_of(
@@ -192,23 +202,14 @@ def _hangs(mask: Mask, frame: Frame, plane: Plane, away: float) -> bool:
     bottom = float(np.quantile(height[own], BOTTOM_SHARE))
     low = own & (height < bottom + BOTTOM_MARGIN * away)
     ring = ndimage.binary_dilation(low, iterations=RING_WIDTH) & ~mask[part]
-    if not ring.any() or _cut_by_picture(low, part, frame.shape):
+    border = np.ones(frame.shape, bool)
+    border[1:-1, 1:-1] = False
+    if not ring.any() or (low & border[part]).any():
         return False
     depth = frame.depth[part]
-    behind = depth[ring] > (1 + SURFACE_STEP) * float(np.median(depth[low]))
-    return bool(behind.mean() > HANGING_SHARE)
-
-
-def _cut_by_picture(
-    low: Mask, part: tuple[slice, slice], shape: tuple[int, int]
-) -> bool:
-    """Return True if pixels of a part of an image touch the image border."""
-    rows, columns = np.nonzero(low)
-    sides = ((rows, part[0].start, shape[0]), (columns, part[1].start, shape[1]))
-    for index, start, size in sides:
-        if index.min() + start == 0 or index.max() + start == size - 1:
-            return True
-    return False
+    # one surface has no such step between neighbouring pixels
+    behind = depth[ring] > 1.04 * float(np.median(depth[low]))
+    return bool(behind.mean() > 0.8)
 
 
 def _found(
@@ -232,7 +233,7 @@ def _found(
     apart = frame.depth * (3 * noise.at(frame.depth) * frame.depth + 0.003)
     left = surface
     found: list[SurfaceLevel] = []
-    for _ in range(MOST_LEVELS):
+    for _ in range(6):  # levels at most
         samples = sample(frame, left, noise)
         if up is not None:
             samples = samples.some(~steep(samples, up))
@@ -250,7 +251,8 @@ def _found(
             found.append(SurfaceLevel(plane, axes_along(plane), sides, tolerance, on))
 
         left = left & (height > 2 * apart)
-        if np.count_nonzero(left) < LEAST_LEFT * np.count_nonzero(surface):
+        # too little is left for another level
+        if np.count_nonzero(left) < 0.003 * np.count_nonzero(surface):
             break
     return found
 
@@ -312,55 +314,8 @@ def points_of(mask: Mask, frame: Frame) -> Float:
     """Sample points of a mask, (H, W) bool, as (N, 3), world, metres."""
     part = within(mask)
     rows, columns = np.nonzero(mask[part] & (frame.depth[part] > 0))
-    few = slice(None, None, max(1, len(rows) // INSTANCE_POINTS))
+    few = slice(None, None, max(1, len(rows) // 500))
     return frame.positions(rows[few] + part[0].start, columns[few] + part[1].start)
-
-
-def _load(level: SurfaceLevel, frame: Frame, masks: Sequence[Mask]) -> int:
-    """Return the number of instance pixels that a level would carry on its own."""
-    return sum(
-        int(np.count_nonzero(mask))
-        for mask in masks
-        if carrier_of(mask, frame, [level])
-    )
-
-
-def _by_load(
-    levels: Sequence[SurfaceLevel],
-    frame: Frame,
-    masks: Sequence[Mask],
-) -> list[SurfaceLevel]:
-    """Sort levels by decreasing number of carried instance pixels."""
-    carriers = [carrier_of(mask, frame, levels) for mask in masks]
-    load = {
-        id(level): sum(
-            int(np.count_nonzero(mask))
-            for mask, carrier in zip(masks, carriers, strict=True)
-            if carrier is level
-        )
-        for level in levels
-    }
-    return sorted(levels, key=lambda level: -load[id(level)])
-
-
-def _parallel(
-    levels: Sequence[SurfaceLevel],
-    frame: Frame,
-    masks: Sequence[Mask],
-) -> list[SurfaceLevel]:
-    """Return the levels parallel to the one with the largest load, if up is not known."""
-    if not levels:
-        return []
-    first = max(
-        levels, key=lambda level: (_load(level, frame, masks), level.pixels.sum())
-    )
-    return [level for level in levels if level.plane.normal @ first.plane.normal > TILT]
-
-
-def _same(earlier: SurfaceLevel, level: SurfaceLevel, frame: Frame) -> bool:
-    """Return True if a level of an earlier frame is a level of this frame."""
-    apart, reach = apart_from(earlier.plane, level, frame)
-    return apart < reach
 
 
 def apart_from(plane: Plane, level: SurfaceLevel, frame: Frame) -> tuple[float, float]:

@@ -11,9 +11,6 @@ EDGE_ERROR = 6  # pixels, largest error of a mask's edge
 # largest relative depth step between neighbouring pixels of one surface, in addition to THICK
 NEIGHBOUR_STEP = 0.01
 THICK = 0.004  # metres
-NOISE_STEP = (
-    2.5  # standard deviations, largest difference to the mean of the neighbours
-)
 SQUARE_WIDTH = 5  # pixels, side of the square of neighbours
 
 
@@ -41,7 +38,8 @@ def trimmed(depth: Float32, mask: Mask, noise: Noise, high: Mask | None = None) 
         return mask
     own = measured[part]
     z = depth[part].astype(np.float64)
-    step = np.maximum(NEIGHBOUR_STEP * z + THICK, NOISE_STEP * noise.at(z) * z**2)
+    # 2.5 standard deviations from the mean of the neighbours
+    step = np.maximum(NEIGHBOUR_STEP * z + THICK, 2.5 * noise.at(z) * z**2)
     whole = np.pad(mask[part] | holes_of(own) & (z == 0), 1)
     for width in range(EDGE_ERROR, 0, -1):
         inside = binary_erosion(whole, np.ones((3, 3), bool), width)[1:-1, 1:-1] & own

@@ -12,17 +12,11 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Float32, Mask
 
-# height above a plane, relative to the distance, from which a pixel at a mask's edge is not on it
-STANDS = 0.02
 # A point is on a plane if its height is at most so many deviations of its noise, and this share of
 # its distance.
 PLANE_NOISE = 4.0
 PLANE_SHARE = 0.003
 BESIDE = 20  # width of the margin around a mask in which the noise of the plane is measured, pixels
-FEWEST_BESIDE = 100  # least number of pixels for that measurement
-TOUCHING_GAP = 0.006  # metres between two things that touch, at most
-TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
-BESIDE_POINTS = 200  # pixels at a border that are compared
 SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixels lie
 
 
@@ -79,35 +73,18 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     Returns:
         The pixels of the part, (H, W) bool.
     """
-    depth = frame.depth[part]
-    height = frame.along(plane.normal, plane.offset, part)
-    least = np.float32(PLANE_SHARE) * depth
-    high = (height > least) & (depth > 0)
-
+    z = frame.depth[part]
     # Noise moves a point along its ray, so the height error depends on the slope of the ray.
-    of_columns, of_rows = _rise(frame, plane, part)
-    steepest = float(np.abs(of_columns).max() + np.abs(of_rows).max())
-    most_noise = PLANE_NOISE * float(noise.sigmas.max(initial=0.0))
-    unsure = height < least + np.float32(most_noise * steepest) * depth**2
-    unsure &= high
-
-    rows, columns = np.divmod(np.flatnonzero(unsure), high.shape[1])
-    z = depth[rows, columns]
-    rise = np.abs(of_columns[columns] + of_rows[rows])
-    high[rows, columns] = height[rows, columns] > z * (
-        PLANE_NOISE * noise.at(z) * z * rise + PLANE_SHARE
-    )
-    return high
+    least = PLANE_NOISE * noise.at(z) * z * np.abs(_rise(frame, plane, part))
+    height = frame.along(plane.normal, plane.offset, part)
+    return np.asarray((z > 0) & (height > z * (least + PLANE_SHARE)))
 
 
-def _rise(frame: Frame, plane: Plane, part: Part) -> tuple[Float32, Float32]:
-    """Return by how much rays rise over a plane with depth: a term of each column, one of each row.
-
-    The rise of a pixel's ray is the sum of its two terms.
-    """
+def _rise(frame: Frame, plane: Plane, part: Part) -> Float32:
+    """Return by how much the ray of each pixel rises over a plane with depth."""
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
     x, y = frame.rays
-    return a * x[part[1]], b * y[part[0]] + c
+    return a * x[part[1]] + (b * y[part[0]] + c)[:, None]
 
 
 def inside_mask(
@@ -127,7 +104,8 @@ def inside_mask(
     if plane is None:
         return trimmed(frame.depth, given, noise)
 
-    high = frame.along(plane.normal, plane.offset) > STANDS * frame.depth
+    # from such a height on a pixel at the edge of a mask is not on the plane
+    high = frame.along(plane.normal, plane.offset) > 0.02 * frame.depth
     mask = trimmed(frame.depth, given, noise, high)
     part = within(mask, BESIDE)
     above = mask.copy()
@@ -152,14 +130,13 @@ def _above_on_average(
     z = frame.depth[part]
     own = mask[part] & (z > 0)
     height = frame.along(plane.normal, plane.offset, part)
-    of_columns, of_rows = _rise(frame, plane, part)
-    deviation = noise.at(z) * z**2 * np.abs(of_columns + of_rows[:, None])
+    deviation = noise.at(z) * z**2 * np.abs(_rise(frame, plane, part))
 
     on_plane = np.abs(height) < PLANE_NOISE * deviation + PLANE_SHARE * z
     beside = ~mask[part] & (z > 0) & on_plane
     means = _local_mean(height, beside)[beside] / np.maximum(deviation[beside], 1e-9)
     ratio = 1.0  # deviation of the mean, relative to that of a pixel
-    if len(means) >= FEWEST_BESIDE:
+    if len(means) >= 100:  # pixels that measure it
         ratio = min(1.0, float(np.sqrt(np.mean(means**2))))
 
     least = PLANE_NOISE * ratio * deviation + PLANE_SHARE * z
@@ -175,46 +152,25 @@ def _local_mean(values: Float32, among: Mask) -> Float32:
     return np.asarray(total / np.maximum(share, np.float32(1e-6)))
 
 
-def touching(
-    frame: Frame,
-    one: Mask,
-    other: Mask,
-    gap: float = TOUCHING_GAP,
-    step: float = TOUCHING_STEP,
-) -> bool:
+def touching(frame: Frame, one: Mask, other: Mask) -> bool:
     """Return True if two objects touch in the image and in depth.
 
     Args:
         frame: of both masks.
         one: mask of one object, (H, W) bool.
         other: mask of the other.
-        gap: largest gap between them in the image, metres.
-        step: largest depth difference at their closest pixels, metres.
     """
-    part = within(one)
-    away_from_camera = frame.depth[part][one[part]]
-    if not away_from_camera.any():
+    depth = frame.depth
+    if not (depth[one] > 0).any():
         return False
-
     focal = float(frame.intrinsics[[0, 1], [0, 1]].mean())
-    reach = max(
-        2.0,
-        gap * focal / float(np.median(away_from_camera[away_from_camera > 0])),
-    )
+    away = float(np.median(depth[one & (depth > 0)]))
+    # 6 mm in the image, and 15 mm in depth, are no gap
+    reach = max(2.0, 0.006 * focal / away)
     near = within(one, int(reach) + 1)
-    if not other[near].any():
-        return False
-
-    away, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
-    beside = np.nonzero(other[near] & (away <= reach))
-    if not len(beside[0]):
-        return False
-
-    few = slice(None, None, max(1, len(beside[0]) // BESIDE_POINTS))
-    rows, columns = beside[0][few], beside[1][few]
-    depth = frame.depth[near]
-    own = depth[nearest[0][rows, columns], nearest[1][rows, columns]]
-    its = depth[rows, columns]
-    known = (own > 0) & (its > 0)
-    apart = np.abs(own - its)[known]
-    return bool(len(apart)) and float(np.median(apart)) < step
+    apart, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
+    beside = other[near] & (apart <= reach)
+    own = depth[near][tuple(nearest)][beside]
+    its = depth[near][beside]
+    step = np.abs(own - its)[(own > 0) & (its > 0)]
+    return len(step) > 0 and float(np.median(step)) < 0.015

@@ -12,12 +12,9 @@ from nextview.errors import ObservationError, UsageError
 from nextview.geometry.axes import three, upright_axes
 from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
-from nextview.sensing import plausibility
 from nextview.sensing.choosing import choose_instance
-from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.frame import Frame
-from nextview.sensing.frame_mistakes import check_mistakes
-from nextview.sensing.known_frames import REPEATED, KnownFrames
+from nextview.sensing.known_frames import REPEATED, KnownFrames, check_mistakes
 from nextview.sensing.masks import (
     SPHERE_MARGIN,
     above_plane,
@@ -27,6 +24,8 @@ from nextview.sensing.masks import (
 )
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.planes import Plane
+from nextview.sensing.plausibility import check_last_view, check_observation
+from nextview.sensing.registration import Displacement, displacement
 from nextview.sensing.resampling import observation_of
 from nextview.sensing.segmented_frame import (
     SegmentedFrame,
@@ -235,7 +234,13 @@ class ObservedObject:
             up = plane.normal
         after = self._known_by([*before.sightings, seen], up)
         warnings = self._warnings_of_view(after, -1, self._check(after, plane))
-        warnings += tuple(plausibility.check_place(displaced))
+        if displaced is not None and displaced.noticed:
+            message = (
+                f"this frame shows the object {1000 * np.linalg.norm(displaced.further):.0f} mm"
+                " beside where earlier ones do, which is allowed for: was it nudged, or does the"
+                " camera's pose err (hand-eye calibration, a late time stamp)?"
+            )
+            warnings += (ViewWarning("displaced", message, holds=False),)
         return replace(after, warnings=warnings)
 
     def _warnings_of_view(
@@ -244,15 +249,13 @@ class ObservedObject:
         """Return likely problems of a view in a state of the object, after some known ones."""
         observations = state.observations
         warnings = [*state.sightings[number].warnings]
-        warnings += plausibility.check_observation(observations[number])
+        warnings += check_observation(observations[number])
         warnings += more
         if not any(warning.holds for warning in warnings):
             last = range(len(observations))[number]
-            found = plausibility.check_last_view(observations[: last + 1])
+            found = check_last_view(observations[: last + 1])
             if found and self.known is None:  # pose errors are no contradiction
-                found = plausibility.check_last_view(
-                    self._without_displacements(state, last)
-                )
+                found = check_last_view(self._without_displacements(state, last))
             warnings += found
         return tuple(warnings)
 
@@ -399,15 +402,28 @@ class ObservedObject:
 
     def _check(self, after: ObjectState, plane: Plane | None) -> list[ViewWarning]:
         """Return likely problems of the size and the place of the object after a frame."""
-        before = self.state
+        before = self.state.frame
         assert after.frame is not None
+        radius = after.frame.radius
         warnings = []
-        if before.frame is not None:
-            radius = after.frame.radius
-            warnings += plausibility.check_size(radius, before.frame.radius)
+        # closer to ten times than to once as large
+        if before is not None and radius > np.sqrt(10) * before.radius:
+            message = (
+                f"the radius of the object grows from {before.radius:.2g} to {radius:.2g} m by this"
+                " frame: is its pose wrong, so that the support or a neighbour is taken for a part"
+                " of it?"
+            )
+            warnings.append(ViewWarning("size", message))
         if self.point is not None:
             aside = after.frame.axes[:2] @ (self.point - after.frame.centre)
-            warnings += plausibility.check_point(aside, after.frame.radius)
+            away = float(np.linalg.norm(aside))
+            if away > 3 * radius:
+                message = (
+                    f"the thing nearest to the point is {away:.2g} m away from it, of"
+                    f" {radius:.2g} m radius: is the point of another world, or what stands"
+                    " there out of view?"
+                )
+                warnings.append(ViewWarning("point", message))
         if self.support and plane is None and self.known is None:
             warnings.append(NO_PLANE)
         return warnings

@@ -5,34 +5,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Floats, Index, Mask
 
-# hypotheses per search: with one point in ten on the plane, 0.8 of all searches find it
-TRIALS = 200
 # cosine of the largest tilt of a support plane, due to calibration errors
 TILT = np.cos(np.radians(12.0))
 # cosine of the tilt at which the weight of a plane is zero
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # least share of the samples on a support plane; more if gravity is not known
 LEAST_SUPPORT = 0.04
-LEAST_ALONE = 0.15
-BLOCKS_SAMPLED = (
-    1500  # approximate number of blocks of pixels in which planes are searched
-)
-LARGE_SIDE = 8  # pixels, side of a block from which only every second pixel is used
 STEEP_LAG = 2  # distance of two samples whose slope is measured
 # largest pose error, which displaces a known plane in a new frame
 POSE_SHIFT = 0.02  # metres
 POSE_TURN = np.radians(2.0)
 # distance from a visible plane, in tolerances, up to which few samples are off the plane
 TOLERANCES_ASIDE = 3.0
-STEEP_RISE = 0.7  # rise of a steep surface, relative to the distance
-# largest gain of precision by averaging a block, limited by errors of the lens
-MOST_ALONE = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,10 +68,9 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
         The samples.
     """
     step = 1
-    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
-    if (
-        side >= LARGE_SIDE
-    ):  # every second pixel is enough, as errors of neighbours are correlated
+    # some 1500 blocks of pixels are enough
+    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / 1500)))
+    if side >= 8:  # every second pixel is enough, as neighbouring errors are correlated
         step = 2
         side //= step
     few = (slice(None, None, step), slice(None, None, step))
@@ -105,7 +93,8 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     ].T + pose[:3, 3]
     erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
     # square root of the number of independent errors
-    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
+    # largest gain of precision by averaging a block, limited by errors of the lens
+    alone = np.clip(np.sqrt(count) / erring_together, 1, 4.0)
     return Samples(
         points,
         3 * noise.at(z) * z**2 / alone + 0.003 * z,
@@ -118,16 +107,8 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
 def _block_sums(values: Floats, side: int) -> Float:
     """Return sums over squares of pixels; incomplete squares are left out."""
     height, width = (n // side for n in values.shape)
-    of_rows = _sums_along(values[: height * side], side)
-    return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
-
-
-def _sums_along(values: Floats, side: int) -> Floats:
-    """Return sums over ``side`` consecutive rows each, faster than a reduction over an axis."""
-    sums = values[::side].copy()
-    for first in range(1, side):
-        sums += values[first::side]
-    return sums
+    blocks = values[: height * side, : width * side].reshape(height, side, width, side)
+    return np.asarray(blocks.sum(3).sum(1), np.float64)
 
 
 @dataclass(frozen=True)
@@ -152,16 +133,6 @@ class Plane:
     def holds(self, samples: Samples) -> Mask:
         """Return which samples are on the plane, (N,) bool."""
         return np.abs(self.height(samples.points)) < samples.tolerance
-
-    def extent(self, samples: Samples) -> Float:
-        """Return the samples, (M, 3), in the largest connected part of the plane."""
-        on = self.holds(samples)
-        if not on.any():
-            return samples.points[on]
-        grid = np.zeros((samples.rows.max() + 1, samples.columns.max() + 1), bool)
-        grid[samples.rows, samples.columns] = on
-        part = ndimage.label(grid)[0][samples.rows, samples.columns]
-        return samples.points[on & (part == np.bincount(part[on]).argmax())]
 
 
 def axes_along(plane: Plane) -> Float:
@@ -190,7 +161,8 @@ def steep(samples: Samples, up: Float) -> Mask:
     lower = grid[samples.rows + STEEP_LAG, samples.columns]
     pairs = np.stack([np.arange(len(lower)), lower], 1)[lower >= 0]
     step = samples.points[pairs[:, 0]] - samples.points[pairs[:, 1]]
-    rising = np.abs(step @ up) > STEEP_RISE * np.linalg.norm(step, axis=1)
+    # some 45 degrees
+    rising = np.abs(step @ up) > 0.7 * np.linalg.norm(step, axis=1)
 
     upright[pairs[rising].ravel()] = True
     return upright
@@ -200,7 +172,7 @@ def find_plane(
     samples: Samples,
     rng: Generator,
     up: Float | None = None,
-    above: Float | None = None,
+    upright: bool = False,
 ) -> Plane | None:
     """Find the plane with the most samples by RANSAC (Fischler and Bolles 1981).
 
@@ -208,35 +180,39 @@ def find_plane(
         samples: the samples.
         rng: source of all random numbers.
         up: normal of the plane, up to a small tilt, (3,); None for any plane.
-        above: point above the plane, such as the camera position, (3,); None for none.
+        upright: whether ``up`` lies in the plane instead, as in a wall.
 
     Returns:
-        The plane; None if no plane has enough samples.
+        The plane, with the camera above it; None if no plane has enough samples.
     """
     points = samples.points
     if len(points) < 10:
         return None
-    a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
+    # hypotheses per search: with one point in ten on the plane, 0.8 of all searches find it
+    a, b, c = points[rng.integers(len(points), size=(3, 200))]
     normals = np.cross(b - a, c - a)
     if up is not None:
-        # one point is enough if the normal is known; triples find slightly tilted planes
-        normals[::2] = up
+        # fewer points are enough if the normal is known; triples find slightly tilted planes
+        normals[::2] = np.cross(b - a, up)[::2] if upright else up
     length = np.linalg.norm(normals, axis=1)
     normals = normals[length > 0] / length[length > 0, None]
     through = a[length > 0]
     offsets = -(normals * through).sum(1)
-    turn = np.where(
-        (normals @ samples.camera + offsets if up is None else normals @ up) < 0,
-        -1,
-        1,
-    )
+    over = normals @ samples.camera + offsets
+    level = up is not None and not upright
+    turn = np.where((normals @ up if level else over) < 0, -1, 1)
     normals = normals * turn[:, None]
     offsets = offsets * turn
-    fits = normals @ samples.camera + offsets > 0
-    if up is not None:
-        fits &= normals @ up > TILT
-    if above is not None:
-        fits &= normals @ above + offsets > np.median(samples.tolerance)
+    fits = over * turn > 0
+
+    def tilted(normals: Float) -> Float:
+        """Return the cosine of the tilt of planes against what is searched."""
+        if up is None:
+            return np.ones(normals.shape[:-1])
+        rise = normals @ up
+        return np.sqrt(np.maximum(1 - rise**2, 0)) if upright else rise
+
+    fits &= tilted(normals) > TILT
     normals = normals[fits]
     offsets = offsets[fits]
     if len(normals) == 0:
@@ -245,29 +221,27 @@ def find_plane(
     away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
     away += (offsets + normals @ samples.camera).astype(np.float32)
     count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
-    if up is not None:
-        # A strongly tilted plane is more likely to pass through objects than to support them.
-        count = count * (1 - (1 - normals @ up) / (1 - STEEPEST_SUPPORT))
+    # A strongly tilted plane is more likely to pass through objects than to support them.
+    count = count * (1 - (1 - tilted(normals)) / (1 - STEEPEST_SUPPORT))
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
-    level = up is None or plane.normal @ up > TILT
-    least = LEAST_ALONE if up is None else LEAST_SUPPORT
-    return plane if level and plane.holds(samples).mean() > least else None
+    least = 0.15 if up is None else LEAST_SUPPORT
+    fits_well = tilted(plane.normal) > TILT and plane.holds(samples).mean() > least
+    return plane if fits_well else None
 
 
-def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
+def refine_plane(plane: Plane, samples: Samples) -> Plane:
     """Fit a plane to the samples near it by least squares, three times.
 
     Args:
         plane: the plane.
         samples: the samples.
-        loose: multiple of the tolerance within which samples are used.
 
     Returns:
         The refined plane; the plane itself if fewer than ten samples are near.
     """
     points = samples.points
-    tolerance = loose * samples.tolerance
+    tolerance = samples.tolerance
     for _ in range(3):
         on = np.abs(plane.height(points)) < tolerance
         if on.sum() < 10:
@@ -308,24 +282,5 @@ def gain_as_range(
     )
     other = find_plane(nearer, deepcopy(rng), up)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
-    if other is None or other.holds(nearer).mean() <= usual:
-        return 0.0
-
-    # The two readings may find different planes of a room, so each plane is compared for both.
-    share = held = 0.0
-    for found, its_samples in ((plane, samples), (other, nearer)):
-        if found is None:
-            continue
-        on = found.holds(its_samples)
-        if not on.any():  # the plane was found with finer samples
-            continue
-        share = max(share, _share_held(samples, on, found.normal))
-        held = max(held, _share_held(nearer, on, found.normal))
-    return max(0.0, held - share)
-
-
-def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
-    """Return the share of all samples on the plane fitted to some of them, (N,) bool."""
-    middle = np.median(samples.points[on] @ normal)
-    plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
-    return float(refine_plane(plane, samples).holds(samples).mean())
+    held = 0.0 if other is None else float(other.holds(nearer).mean())
+    return max(0.0, held - usual)

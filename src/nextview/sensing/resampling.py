@@ -12,9 +12,6 @@ from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.sighting import Sighting
 from nextview.types import Float, Float32, Index
 
-# depth range of rendered facets, object radii; the object is between 2 and 4
-NEAREST_FACET = 0.5
-FARTHEST_FACET = 100.0
 # largest half width of a rendered sensor pixel, as a share of the image, to limit the run time
 WIDEST_FACET = 1 / 16
 # depth range of facets of one surface, object radii; of these the one nearest to a pixel is shown
@@ -98,7 +95,8 @@ def look_again(
     normals = facets.planes @ (radius * turn.T)
     offset = 1 + normals @ shift
     z = points[:, 2]
-    front = np.flatnonzero((z > NEAREST_FACET) & (z < FARTHEST_FACET))
+    # object radii; the object is between 2 and 4
+    front = np.flatnonzero((z > 0.5) & (z < 100))
     x, y = focal * points[front, :2].T / z[front] + size / 2
     # A facet is as wide as a sensor pixel, in pixels of this image, and slightly wider if it is
     # inclined. Half widths are limited to WIDEST_FACET, for sensors inside the object.

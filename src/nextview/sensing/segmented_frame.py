@@ -18,7 +18,6 @@ from nextview.sensing.levels import (
     levels_of,
     points_of,
 )
-from nextview.sensing.masks import inside_mask
 from nextview.sensing.planes import LEAST_SUPPORT, TILT, Plane, Samples, sample
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
@@ -123,20 +122,6 @@ class SegmentedFrame:
                 found = level
                 least = apart
         return found
-
-    def segments(self) -> list[Mask]:
-        """Return the masks of all supported objects, (H, W) bool, the largest first.
-
-        Background at their edges and pixels of their support are removed.
-        """
-        found = []
-        for mask, carrier in zip(self.masks, self.carriers, strict=True):
-            if carrier is None or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
-                continue
-            own = inside_mask(self.frame, mask, carrier.plane, self.noise)
-            if np.count_nonzero(own) >= FEWEST_OBJECT_PIXELS:
-                found.append(own)
-        return sorted(found, key=lambda mask: -np.count_nonzero(mask))
 
     def _off_the_axis(self, level: SurfaceLevel) -> float:
         """Return the distance from the image centre to the nearest pixel of a level, pixels."""

@@ -7,21 +7,19 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.errors import ObservationError
 from nextview.sensing.facets import SIZE, Facets, Noise, fit_facets
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import ObjectFrame, enclose
-from nextview.sensing.outliers import without_outliers
 from nextview.sensing.planes import Plane
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
 FEWEST_OBJECT_PIXELS = 60  # least number of pixels of an object in a frame
-# frames with a smaller share of the largest number of pixels are not used to estimate the size
-LEAST_VIEW_PART = 0.1
-MOST_HULL_POINTS = 3000  # approximate number of points for the convex hull
+GROUP_GAP = 6  # pixels between isolated groups of facets
 TOO_LITTLE = "too little is seen of the object"
 
 
@@ -102,16 +100,39 @@ def sighting_of(
         noise,
     )
     if denoise and len(facets.planes):
-        facets = without_outliers(facets, noise, coarse)
+        facets = facets.some(_in_large_groups(facets, noise, coarse))
     if len(facets.planes) * coarse**2 < FEWEST_OBJECT_PIXELS:
         raise ObservationError(TOO_LITTLE)
 
     pose = frame.camera_to_world
-    few = slice(None, None, max(1, len(facets.planes) // MOST_HULL_POINTS))
+    # for the convex hull
+    few = slice(None, None, max(1, len(facets.planes) // 3000))
     points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
     with suppress(QhullError):  # coplanar points are used as they are
         points = points[ConvexHull(points).vertices]
     return Sighting(frame, noise, facets, mask, points, plane)
+
+
+def _in_large_groups(facets: Facets, noise: Noise, coarse: int) -> Mask:
+    """Return which facets are not in a small isolated group, (N,) bool.
+
+    A fragment of the background, or of an edge, would determine the radius of the object. Groups
+    are apart by some pixels, or by as much in depth.
+    """
+    depth = facets.points[:, 2]
+    step = GROUP_GAP * float(facets.pitch.mean())
+    step += float(np.median(4 * noise.at(depth) * depth)) / coarse
+    at = (
+        facets.rows // coarse // GROUP_GAP,
+        facets.columns // coarse // GROUP_GAP,
+        (np.log(depth / depth.min()) / step).astype(np.int64),
+    )
+    at = tuple(index - index.min() for index in at)
+    cells = np.zeros([int(index.max()) + 1 for index in at], bool)
+    cells[at] = True
+    group = ndimage.label(cells, np.ones((3, 3, 3)))[0][at]
+    # one facet in a hundred
+    return np.asarray(np.bincount(group)[group] >= 0.01 * len(group))
 
 
 def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
@@ -125,7 +146,8 @@ def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         ObservationError: the visible part of the object has no extent.
     """
     shown = np.array([np.count_nonzero(sighting.mask) for sighting in sightings])
-    enough = shown >= LEAST_VIEW_PART * shown.max()
+    # frames that show little of the object say nothing of its size
+    enough = shown >= 0.1 * shown.max()
     pairs = zip(sightings, enough, strict=True)
     points = np.concatenate([sighting.hull for sighting, counts in pairs if counts])
 

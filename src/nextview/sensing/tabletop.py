@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from nextview.errors import ObservationError
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
-from nextview.sensing.masks import TOUCHING_GAP, above_plane
-from nextview.sensing.mistakes import focal_that_levels
-from nextview.sensing.planes import Plane, find_plane, sample
+from nextview.sensing.masks import above_plane
+from nextview.sensing.planes import Plane
 from nextview.sensing.segmented_frame import SegmentedFrame
-from nextview.sensing.sighting import Sighting, sighting_of
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Float32, Mask
 
@@ -63,6 +60,7 @@ class TableTop:
         earlier: Plane | None = None,
         among: Mask | None = None,
         widest: float | None = None,
+        warnings: tuple[ViewWarning, ...] = (),
     ) -> TableTop:
         """Find the ground of a frame, and the objects above it.
 
@@ -72,6 +70,7 @@ class TableTop:
             earlier: ground of an earlier frame, which is found again.
             among: search area, (H, W) bool; None for the whole frame.
             widest: diameter of the largest candidate object, metres; None for any.
+            warnings: about the frame.
 
         Raises:
             ObservationError: no surface is visible.
@@ -87,11 +86,12 @@ class TableTop:
         elif earlier is not None:
             plane = earlier
         else:
-            raise ObservationError(_without_support(seen, up))
+            told = next((one for one in warnings if not one.holds), None)
+            raise ObservationError(NO_SUPPORT if told is None else told.message)
 
         height, above = _heights(seen, plane)
         upright = plane.normal if up is None or frame.pose is None else up
-        return cls(seen, plane, upright, above, height, level is not None)
+        return cls(seen, plane, upright, above, height, level is not None, warnings)
 
     @property
     def frame(self) -> Frame:
@@ -111,74 +111,6 @@ class TableTop:
             if level.plane is not self.plane:
                 found |= level.pixels
         return found
-
-    def under(self, mask: Mask) -> Plane:
-        """Return the plane that supports an object.
-
-        Args:
-            mask: of the object, (H, W) bool.
-        """
-        level = self.seen.under(mask)
-        return self.plane if level is None else level.plane
-
-    def sighting(self, mask: Mask) -> Sighting:
-        """Return the sighting of an object in the frame.
-
-        Args:
-            mask: of the object, (H, W) bool.
-
-        Raises:
-            ObservationError: too little of it is visible.
-        """
-        sighting = sighting_of(self.frame, mask, self.under(mask), self.noise)
-        return replace(sighting, warnings=self.warnings)
-
-    def neighbours(
-        self,
-        masks: Sequence[Mask | None],
-        gap: float = TOUCHING_GAP,
-    ) -> list[tuple[int, int]]:
-        """Return the pairs of objects that are close enough in the image to touch.
-
-        Args:
-            masks: of the objects, (H, W) bool; None if not visible in the frame.
-            gap: largest gap between touching objects, metres.
-
-        Returns:
-            Their positions in ``masks``, the smaller one first.
-        """
-        shown = [row for row, mask in enumerate(masks) if mask is not None]
-        parts = np.array(
-            [
-                [(side.start, side.stop) for side in within(mask)]
-                for mask in masks
-                if mask is not None
-            ]
-        ).reshape(-1, 2, 2)
-
-        nearest = self.frame.depth[self.frame.depth > 0].min(initial=np.inf)
-        focal = float(self.frame.intrinsics[[0, 1], [0, 1]].max())
-        reach = max(2.0, gap * focal / nearest) + 1
-        low, high = parts[..., 0], parts[..., 1]
-        apart = np.maximum(low[:, None] - high, low - high[:, None]).max(-1)
-        pairs = np.argwhere(np.triu(apart <= reach, 1))
-        return [(shown[one], shown[other]) for one, other in pairs]
-
-
-def _without_support(seen: SegmentedFrame, up: Float | None) -> str:
-    """Say why no support plane is seen: a focal length with which one would be, or the pose."""
-    frame = seen.frame
-    if up is not None and frame.pose is not None:
-        samples = sample(frame, frame.depth > 0, seen.noise)
-        largest = find_plane(samples, np.random.default_rng(0))
-        if largest is not None:
-            wrong = focal_that_levels(frame, largest.normal, up)
-            if wrong is not None:
-                return (
-                    "no support plane is seen below the camera, and without this mistake there"
-                    f" would be one: {wrong.sentence}"
-                )
-    return NO_SUPPORT
 
 
 def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:

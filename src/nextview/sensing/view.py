@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from nextview.segmentation.instances import Instances
 from nextview.sensing.facets import LEAST_NOISE, Noise, noise_of
-from nextview.sensing.frame import Frame, one_stand, within
+from nextview.sensing.frame import Frame, one_stand
 from nextview.types import Float, Float32, Index, Mask
 
 GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
@@ -33,19 +33,6 @@ NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of o
 STEEPEST_SLOPE = 6.0  # depth over width of the steepest surface that is measured
 FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
 MOST_PARTED = 0.9  # share of an instance above which a piece is the instance
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """Pixels that may be one thing.
-
-    Attributes:
-        mask: its pixels, (H, W) bool.
-        unclear: pixels that may belong to it, too, (H, W) bool; None for none.
-    """
-
-    mask: Mask
-    unclear: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,80 +204,36 @@ class View:
         own = np.stack([grid.x[column] * z, grid.y[line] * z, z], 1)
         return own @ self.camera[:3, :3].T + self.camera[:3, 3]
 
-    def hiding(self, mask: Mask, margin: float) -> Mask:
-        """Return what is in front of a segment beside it, and the shadow of that, (H, W) bool.
-
-        Args:
-            mask: pixels of the segment, (H, W) bool.
-            margin: around the segment, its sizes.
-        """
-        step = self.stride
-        rows, columns = within(mask)
-        size = max(rows.stop - rows.start, columns.stop - columns.start)
-        rows, columns = within(mask, round(margin * size))
-        part = (
-            slice(rows.start, rows.stop, step),
-            slice(columns.start, columns.stop, step),
-        )
-        depth = self.depth[part]
-        own = mask[part] & (depth > 0)
-        nearest = ndimage.distance_transform_edt(
-            ~own, return_distances=False, return_indices=True
-        )
-        beside = depth[tuple(nearest)]
-        sigma = np.hypot(self.noise.at(beside) * beside**2, LEAST_ERROR * beside)
-        hiding = ~own & (depth > 0) & (depth < beside - 4 * sigma)
-        hiding &= ~self.surface[part]
-        if hiding.any():
-            measured = ndimage.distance_transform_edt(
-                (depth == 0) | own, return_distances=False, return_indices=True
-            )
-            hiding |= (depth == 0) & hiding[tuple(measured)]
-        every = np.zeros(mask.shape, bool)
-        large = np.repeat(np.repeat(hiding, step, 0), step, 1)
-        every[rows, columns] = large[
-            : rows.stop - rows.start, : columns.stop - columns.start
-        ]
-        return every & ~mask
-
     @cached_property
     def fewest(self) -> int:
         """Pixels of the smallest segment that is searched for things."""
         return FEWEST_PIXELS * self.stride**2 // 2
 
-    def instances(self) -> Iterator[Segment]:
-        """Return what is likely to be one thing each."""
-        for mask in _parts(self.labels, self.fewest):
-            yield Segment(mask)
+    def instances(self) -> Iterator[Mask]:
+        """Return what is likely to be one thing each, (H, W) bool."""
+        return _parts(self.labels, self.fewest)
 
-    def fragments(self) -> Iterator[Segment]:
+    def fragments(self) -> Iterator[Mask]:
         """Return the pieces of instances: a thing that was joined to its neighbour is one."""
-        for mask in _parts(self.pieces, 6 * self.fewest):
-            owner = int(np.bincount(self.labels[mask]).argmax())
-            whole = self.labels == owner if owner else mask
-            if (
-                np.count_nonzero(mask) <= MOST_PARTED * np.count_nonzero(whole)
-                or not owner
-            ):
-                yield Segment(mask, whole & ~mask)
+        return self._smaller(self.pieces)
 
-    def leftovers(self, shown: Mask) -> Iterator[Segment]:
-        """Return what is left of instances that were explained in part.
+    def leftovers(self, shown: Mask) -> Iterator[Mask]:
+        """Return what is left of instances that are explained in part.
 
         Args:
             shown: pixels that are explained, (H, W) bool.
         """
-        left = np.where(shown, 0, self.labels)
-        touching = self._touching() >= FEWEST_NEIGHBOURS
-        for mask in _parts(left, 6 * self.fewest):
-            number = self.labels[mask][0]
-            beside = touching[number].copy()
-            beside[[0, number]] = False
-            whole = np.count_nonzero(self.labels == number)
-            if np.count_nonzero(mask) <= MOST_PARTED * whole or beside.any():
-                yield Segment(mask, beside[left])
+        return self._smaller(np.where(shown, 0, self.labels))
 
-    def unions(self) -> Iterator[Segment]:
+    def _smaller(self, labels: NDArray[np.int32]) -> Iterator[Mask]:
+        """Return parts that are not a whole instance, and larger than a scrap."""
+        for mask in _parts(labels, 6 * self.fewest):
+            owner = int(np.bincount(self.labels[mask]).argmax())
+            whole = np.count_nonzero(self.labels == owner)
+            if not owner or np.count_nonzero(mask) <= MOST_PARTED * whole:
+                yield mask
+
+    def unions(self) -> Iterator[Mask]:
         """Return neighbouring instances as one: a thing that was cut in two or more is one.
 
         Those that touch each other most for their size are joined first, and so on: as many unions
@@ -312,7 +255,7 @@ class View:
             group[group == high] = low
             mask = np.isin(self.labels, np.flatnonzero(group == low))
             if np.count_nonzero(mask) >= self.fewest:
-                yield Segment(mask)
+                yield mask
 
     def _touching(self) -> Float:
         """Count the pixels along which each two instances touch, (N, N) float64."""

@@ -96,7 +96,6 @@ def draw_episode(
     stopping: Stopping,
     heading: str,
     posed: Triangles | None = None,
-    displaced: Float | None = None,
 ) -> Figure:
     """Draw a column for each view, and beside them the object and the camera path.
 
@@ -111,14 +110,11 @@ def draw_episode(
         heading: of the figure.
         posed: surface whose outline is drawn over the images, object frame, object radii; None for
             none.
-        displaced: displacement of that surface in each view, (views, 3); None for none.
 
     Returns:
         The figure.
     """
     caster = None if posed is None else RayCaster([posed])
-    if displaced is None:
-        displaced = np.zeros((len(views), 3))
     valued = any(view.values is not None for view in views)
     light = SoftLight([view.observation for view in views])
     path = np.array([view.direction for view in views])
@@ -187,7 +183,7 @@ def draw_episode(
             if title == rows[0][0]:
                 _draw_image(axis, view, k + 1, light)
                 if caster is not None:
-                    _draw_outline(axis, view, caster, displaced[k])
+                    _draw_outline(axis, view, caster)
             elif title == rows[1][0]:
                 _draw_belief(
                     axis,
@@ -274,9 +270,8 @@ def _draw_outline(
     axis: Axes,
     view: View,
     caster: RayCaster,
-    displacement: Float,
 ) -> None:
-    """Draw the outline of a displaced surface over the image of a view."""
+    """Draw the outline of a surface over the image of a view."""
     seen = view.observation
     height, width = axis.get_images()[0].get_size()
     shape = (int(height), int(width))
@@ -287,8 +282,7 @@ def _draw_outline(
     ).rays.reshape(-1, 3)
 
     along = rays @ seen.pose[:3, :3].T.astype(np.float32)
-    # Displacing the camera by the opposite vector is equivalent to displacing the surface.
-    depth, _ = caster.cast(seen.pose[:3, 3] - displacement, along)
+    depth, _ = caster.cast(seen.pose[:3, 3], along)
     shows = without_specks(np.isfinite(depth).reshape(shape))
     if shows.any() and not shows.all():
         drawn = axis.contour(shows, levels=[0.5], colors=[ACCENT], linewidths=1.3)

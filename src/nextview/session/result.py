@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +31,6 @@ from nextview.types import Float
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-logger = logging.getLogger(__name__)
 
 # no answer is confident if the p-value is below this multiple of the significance level
 SUSPICIOUS = 5.0
@@ -310,30 +308,6 @@ class Recognition:
         return in_metres / radius, found.faces
 
     @property
-    def _displacements(self) -> Float:
-        """Displacement of ``posed_surface`` in each view, (views, 3), object radii.
-
-        It comes from errors of the camera positions, in the object frame; 0 if it is not known.
-        """
-        displaced = np.zeros((len(self.views), 3))
-        radius = self.radius
-        if not self._candidates_of_answer or radius is None:
-            return displaced
-
-        known = self._likeliest_in_object_frame.displacements
-        seen = np.array([view.observation.seen for view in self.views])
-        if len(known) == seen.sum():
-            displaced[seen] = known / radius
-        elif len(known):
-            logger.warning(
-                "displacements of %d views are given with a pose, and %d views show something:"
-                " outlines are drawn without them",
-                len(known),
-                seen.sum(),
-            )
-        return displaced
-
-    @property
     def _likeliest_in_object_frame(self) -> PoseCandidate:
         """Likeliest pose among the things of the answer's class, in the object frame."""
         label = self._candidates_of_answer[0].label
@@ -510,7 +484,6 @@ class Recognition:
             self.stopping,
             heading,
             self.posed_surface,
-            self._displacements,
         )
         if path is not None:
             save_figure(figure, Path(path))

@@ -44,10 +44,7 @@ from nextview.segmentation.instances import Segmenter
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
 from nextview.sensing.observed_object import ObservedObject
-from nextview.sensing.plausibility import (
-    check_last_view,
-    check_observation,
-)
+from nextview.sensing.plausibility import check_last_view, check_observation
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, checked_limits, in_words
@@ -70,8 +67,6 @@ FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres
 would be a thousand times as large.
 """
-# an object so many times as large in all frames as in any single frame is inconsistent
-MUCH_LARGER = 1.5
 
 
 @runtime_checkable
@@ -619,26 +614,19 @@ class Session:
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
-            if not isinstance(seen, Sequence):
-                return self._update(seen)
-
-            episodes = copy(self._episodes)
-            views = list(self.views)
-            object = self.object
-            state = None if object is None else object.state
+            before = copy(self._episodes), list(self.views), self.object
+            state = None if self.object is None else self.object.state
             found = []
             try:
-                for one in seen:
+                for one in seen if isinstance(seen, Sequence) else (seen,):
                     if not self.done:
                         found.append(self._update(one))
             except BaseException:
-                self._episodes = episodes
-                self.views = views
-                self.object = object
-                if object is not None and state is not None:
-                    object.state = state
+                self._episodes, self.views, self.object = before
+                if self.object is not None and state is not None:
+                    self.object.state = state
                 raise
-        return tuple(found)
+        return tuple(found) if isinstance(seen, Sequence) else found[0]
 
     def _update(self, seen: Observation | Frame) -> View:
         """Process one view."""
@@ -677,25 +665,20 @@ class Session:
                 "frames were added to this object outside of the session; begin another one"
             )
 
-        before = object.state
-        try:
-            known = [one.frame for one in object.sightings[self._before :]]
-            number = repeated(frame, known, any_mask=True)
-            if number is None:
-                self._find(object, frame)
-            else:
-                object.add_again(frame, self._before + number)
-            self._refuse_disagreement(object)
-            self._check_distance(object)
-            return self._take(
-                object.observations[self._before :],
-                object.warnings,
-                frame.camera_to_world,
-                object,
-            )
-        except BaseException:
-            object.state = before
-            raise
+        known = [one.frame for one in object.sightings[self._before :]]
+        number = repeated(frame, known, any_mask=True)
+        if number is None:
+            self._find(object, frame)
+        else:
+            object.add_again(frame, self._before + number)
+        self._refuse_disagreement(object)
+        self._check_distance(object)
+        return self._take(
+            object.observations[self._before :],
+            object.warnings,
+            frame.camera_to_world,
+            object,
+        )
 
     def _find(self, object: ObservedObject, frame: Frame) -> None:
         """Find an object in a frame, with what touches it if that is more like a known class.
@@ -752,7 +735,8 @@ class Session:
         if (
             len(object.sightings) == 1
             or alone >= self.distance
-            or together < MUCH_LARGER * alone
+            # much larger than in any single frame
+            or together < 1.5 * alone
         ):
             return
 

@@ -9,25 +9,18 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.planes import Plane, sample
+from nextview.sensing.registration import tolerance_of
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask
 
-MOST_SURROUNDING_POINTS = 6000  # sampled points per frame
-# relative depth step of an edge, where sensors measure points between the surfaces
-JUMP = 0.03
 # metres, tolerance for points on the support plane, in addition to the noise
 NEAR_SUPPORT = 0.02
 OWN_RADIUS = 1.1  # object radii; surfaces within this distance of the centre are the object's own
-FEWEST_NEAR_POINTS = 3  # least number of points near a position that is occupied
 # half the window of pixels around the line of sight to a position
 SIGHT_WINDOW = 2
-NARROWEST_WALL = 0.5  # metres, least visible extent of a wall
-WALL_TOLERANCE = 0.02  # metres, in addition to the noise
 BEHIND = 0.15  # metres; points farther behind a wall do not belong to it
-# largest share of points behind a wall, because of reflections or an open door
-MOST_POINTS_BEHIND = 0.03
 
 
 @dataclass(frozen=True)
@@ -62,7 +55,7 @@ class Surroundings:
         rows, columns = _smooth_pixels(frame)
         points = frame.positions(rows, columns)
         depth = frame.depth[rows, columns].astype(np.float64)
-        tolerance = _tolerance(seen.noise, depth)
+        tolerance = tolerance_of(depth, seen.noise)
         walls = _walls(seen, around)
         return cls(frame, seen.noise, seen.plane, points, tolerance, walls)
 
@@ -106,15 +99,16 @@ class Surroundings:
         kept &= _height(self.points, self.plane) > NEAR_SUPPORT + self.tolerance
 
         apart = np.linalg.norm(places[:, None] - self.points[kept][None], axis=2)
-        return (apart < clearance).sum(1) >= FEWEST_NEAR_POINTS
+        # three points: an occupied position
+        return (apart < clearance).sum(1) >= 3
 
     def shows_behind(self, wall: Plane) -> bool:
         """Return True if the camera was behind another frame's wall, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
-        return (
-            _share_behind(wall.height(self.points), self.tolerance) > MOST_POINTS_BEHIND
-        )
+        behind = wall.height(self.points) < -(BEHIND + 0.02 + self.tolerance)
+        # some are, because of reflections or an open door
+        return int(behind.sum()) > 0.03 * len(behind)
 
     def look_at(
         self,
@@ -150,9 +144,8 @@ class Surroundings:
             np.linalg.norm(surface - around.centre, axis=1) < OWN_RADIUS * around.radius
         )
         depth = np.where(blocked, measured, 1)
-        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + _tolerance(
-            self.noise,
-            depth,
+        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + tolerance_of(
+            depth, self.noise
         )
         return free, blocked & ~own & ~on_plane
 
@@ -193,15 +186,10 @@ def _height(points: Float, plane: Plane | None) -> Float:
     return np.full(len(points), np.inf) if plane is None else plane.height(points)
 
 
-def _tolerance(noise: Noise, depth: Float) -> Float:
-    """Return the uncertainty of measured depths, metres."""
-    return 3 * noise.at(depth) * depth**2 + 0.003 * depth
-
-
 def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     """Return rows and columns of a grid of pixels with valid depth, without edges."""
     height, width = frame.shape
-    step = max(1, int(np.sqrt(height * width / MOST_SURROUNDING_POINTS)))
+    step = max(1, int(np.sqrt(height * width / 6000)))
     rows, columns = np.nonzero(frame.depth[step // 2 :: step, step // 2 :: step])
     rows = step // 2 + step * rows
     columns = step // 2 + step * columns
@@ -213,7 +201,8 @@ def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
             np.clip(rows + down, 0, height - 1),
             np.clip(columns + right, 0, width - 1),
         ]
-        smooth &= (beside > 0) & (np.abs(beside - depth) < JUMP * depth)
+        # at larger steps sensors measure points between the surfaces
+        smooth &= (beside > 0) & (np.abs(beside - depth) < 0.03 * depth)
     return rows[smooth], columns[smooth]
 
 
@@ -228,13 +217,4 @@ def _walls(seen: Sighting | TableTop, around: ObjectFrame) -> tuple[Plane, ...]:
         up = around.axes[2]
         plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)
     rng = np.random.default_rng(0)
-    return tuple(find_walls(others, plane, rng, around.centre, NARROWEST_WALL))
-
-
-def _share_behind(away: Float, tolerance: Float) -> float:
-    """Return the share of points behind a wall, from distances, (N,), and tolerances."""
-    return (
-        float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean())
-        if len(away)
-        else 0.0
-    )
+    return tuple(find_walls(others, plane, rng, around.centre))

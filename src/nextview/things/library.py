@@ -1,4 +1,4 @@
-"""Taught things as the explanation of a picture needs them: surfaces, templates, visible points."""
+"""Taught things as the explanation of a picture needs them: surfaces and visible points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.view_templates import ALL_AROUND, ViewTemplates, templates_of
+from nextview.things.visible_points import ALL_AROUND, VisiblePoints, visible_points
 from nextview.types import Float, Float32, Index, Mask
 
 # errors of the pose of a camera, radians and metres: a robot's, calibrated by hand
@@ -33,7 +33,7 @@ class Library:
         near: rotations about the centroid after which each thing looks nearly the same, by its
             name, (N, 3, 3) float64.
         caster: casts rays at their surfaces.
-        templates: their depth images from all directions.
+        visible: what cameras in all directions see of them.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
         radii: radius of each, (T,) float64, metres.
         corners: points of each that reach farthest, relative to its centre, (T, N, 3) float64,
@@ -49,7 +49,7 @@ class Library:
         threads: int = 1,
         directions: Float | None = None,
     ) -> None:
-        """Render the templates.
+        """Render what can be seen of the things.
 
         Args:
             surfaces: of the things, with their names.
@@ -64,10 +64,10 @@ class Library:
         self.near = near
         self.caster = SurfaceCaster(surfaces)
         self.camera = CAMERA_ERROR
-        self.templates: ViewTemplates = (
-            templates_of(self.caster, threads)
+        self.visible: VisiblePoints = (
+            visible_points(self.caster, threads)
             if directions is None
-            else ViewTemplates(self.caster, threads, directions)
+            else VisiblePoints(self.caster, threads, directions)
         )
         self.centres = self.caster.centres.astype(np.float64)
         self.radii = self.caster.radii.astype(np.float64)
@@ -112,10 +112,10 @@ class Library:
             unit normals, (M, count, 3) float32; and the area of the outline over that of a square
             around the sphere of the thing, (M,) float32.
         """
-        nearest = (towards @ self.templates.directions.T).argmax(1)
-        points = self.templates.points[things, nearest, :count]
-        normals = self.templates.normals[things, nearest, :count]
-        return points, normals, self.templates.fill[things, nearest]
+        nearest = (towards @ self.visible.directions.T).argmax(1)
+        points = self.visible.points[things, nearest, :count]
+        normals = self.visible.normals[things, nearest, :count]
+        return points, normals, self.visible.fill[things, nearest]
 
 
 def near_turns(near: Sequence[Symmetry], exact: Sequence[Symmetry]) -> Float:

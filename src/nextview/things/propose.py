@@ -1,7 +1,7 @@
 """Propose things and poses where a view shows something that is not explained.
 
-Templates give orientations of things whose outline and relief fit a segment. They are registered,
-and those that match best are kept for the score. Few points each are enough to reject most.
+Pairs of points give poses of things that fit a segment or a part of it. They are registered, and
+those that match best are scored. Few points of each are enough to reject most.
 """
 
 from __future__ import annotations
@@ -10,17 +10,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from nextview.geometry.pinhole import PinholeCamera
-from nextview.sensing.view import Segment, View
+from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
 from nextview.things.score import score
-from nextview.things.view_templates import SeenOutline
 from nextview.types import Float, Mask
 
-LIKELY_THINGS = 20  # things of which all orientations are tried
-ORIENTATIONS = 5  # of every other thing
-ORIENTATIONS_HIDDEN = 3  # the same where a part of the outline is hidden
+PROPOSED = 30  # poses of one thing that pairs of points propose, at most
+REGISTERED = 700  # poses that are registered after a first look, at most
 LEAST_MATCH = (
     0.1  # of the best hypothesis of a segment, below which it shows none of the things
 )
@@ -32,15 +29,12 @@ KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2
 SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
 COARSER, COARSEST = 2, 3  # grids on which they are rendered to choose among them
-HIDING_MARGIN = (
-    1.0  # sizes of the segment, within which something may hide a part of it
-)
 
 
 def propose(
     library: Library,
     view: View,
-    segments: Iterable[Segment],
+    segments: Iterable[Mask],
     among: Mask,
 ) -> Hypotheses | None:
     """Propose what segments of a view may show.
@@ -48,50 +42,46 @@ def propose(
     Args:
         library: the things.
         view: the view.
-        segments: of the view.
+        segments: pixels that may be one thing, (H, W) bool each.
         among: things that they may be, (T,) bool.
 
     Returns:
         Some hypotheses for each segment; None for none.
     """
+    instances = Outline.of((view.labels > 0) & ~view.surface)
     found = []
-    for segment in segments:
-        one = _of_segment(library, view, segment, among)
+    for mask in segments:
+        one = _of_segment(library, view, mask, instances, among)
         if one is not None:
             found.append(one)
     return Hypotheses.joined(found) if found else None
 
 
 def _of_segment(
-    library: Library, view: View, segment: Segment, among: Mask
+    library: Library, view: View, mask: Mask, instances: Outline, among: Mask
 ) -> Hypotheses | None:
-    """Propose what one segment may show."""
-    mask = segment.mask
-    hiding = view.hiding(mask, HIDING_MARGIN)
-    unclear = hiding & False if segment.unclear is None else segment.unclear & ~hiding
-    camera = PinholeCamera.of(view.frame.intrinsics, mask.shape)
-    seen = SeenOutline.of(view.depth, mask, unclear, hiding, camera, view.camera)
-    if seen is None:
+    """Propose what one segment, (H, W) bool, may show.
+
+    A thing may go on in other instances, so at last it is drawn into these, too.
+    """
+    found = Hypotheses.of(*library.visible.pairs.propose(view, mask, PROPOSED))
+    found = found[np.flatnonzero(among[found.things])]
+    if not len(found):
         return None
-    given = library.templates.propose(seen, among)
-    if not len(given.things):
-        return None
-    likely = np.argsort(given.of_things)[:LIKELY_THINGS]
-    few = ORIENTATIONS_HIDDEN if seen.hidden else ORIENTATIONS
-    some = (given.ranks < few) | np.isin(given.things, likely)
-    found = Hypotheses.of(
-        given.things[some], given.rotations[some], given.centres[some]
-    )
     outline = Outline.of(mask)
-    found = register(library, [view], found, (0.3, 0.2, 0.12), 48, outline)
+    found = register(library, [view], found, (0.3,), 32, outline)
+    match = matched(library, view, found, mask, 32)
+    found = found[np.argsort(-match)[:REGISTERED]]
+    found = register(library, [view], found, (0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
     if match.max() < LEAST_MATCH:
         return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
-    found = register(library, [view], found, (0.15, 0.1, 0.08, 0.06, 0.05, 0.04), 96)
+    closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
+    found = register(library, [view], found, closer, 96, instances)
     totals = _totals(library, view, found, COARSEST)
     found = best(library, found, totals, SCORED, SCORED_OF_ONE)
-    found = register(library, [view], found, (0.03, 0.03, 0.02), 128)
+    found = register(library, [view], found, (0.03, 0.03, 0.02), 128, instances)
     totals = _totals(library, view, found, COARSER)
     gains = np.flatnonzero(totals > 0)
     if not len(gains):

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
+from nextview.things.score import NOT_MEASURED, OUTLIER
 from nextview.types import Float, Float32, Floats, Mask
 
 LARGEST_TURN = 0.3  # radians in one step
@@ -25,6 +26,8 @@ LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a 
 DAMPING = 0.01  # weight of the present pose, points
 OUTLINE_STEP = 4  # pixels, to which the outline of a segment is told
 OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matches
+# of a point where nothing is measured, against one that is seen through, as in the score
+MISSING_WEIGHT = np.float32(NOT_MEASURED / OUTLIER)
 MATCHING_ERROR = 0.002  # metres, of a point on the right surface
 ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
 
@@ -281,11 +284,12 @@ def normal_equations(
     if outline is not None:
         ahead = seen.points[:, 2]
         through = seen.inside & (seen.depth > ahead + near) & beyond
+        missing = seen.inside & (seen.depth == 0) & beyond
         far = np.hypot(down, aside) + np.float32(1e-6)
         towards = np.stack([aside / far, down / far, np.zeros_like(far)], 1)
         focal = view.frame.pinhole.fx
         off = np.minimum(far * ahead / focal, 2 * near)
-        weight = np.where(through, np.float32(OUTLINE_WEIGHT), np.float32(0))
+        weight = np.float32(OUTLINE_WEIGHT) * (through + MISSING_WEIGHT * missing)
         slope = np.concatenate([cross(arm, towards), towards], 1)
         weighted = slope * weight[:, None]
         left = left + weighted @ slope.swapaxes(1, 2)

@@ -307,8 +307,8 @@ def _rendered(
     x = grid.x[columns].astype(np.float32)
     y = grid.y[lines].astype(np.float32)
     # a ray of a stretched thing, in its own axes
-    turn = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
-    turn = turn.astype(np.float32)[:, :, None]
+    axes = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
+    turn = axes.astype(np.float32)[:, :, None]
     across = x[..., None] * turn[:, 0]
     down = y[..., None] * turn[:, 1] + turn[:, 2]
     rays = (down[:, :, None] + across[:, None]).reshape(len(some), -1, 3)

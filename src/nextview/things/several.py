@@ -120,7 +120,8 @@ class SeveralRecognisers:
                 near[name] = memory.library.near[surface.name]
                 surfaces.append(replace(surface, name=name))
             first += len(memory.classes)
-        return Library(surfaces, symmetries, near)
+        aim, place = self.memories[0].library.camera
+        return Library(surfaces, symmetries, near).for_cameras(place, aim)
 
     def without(self, names: Collection[str]) -> SeveralRecognisers:
         """The same recogniser for an object that is none of some taught things.

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from nextview.geometry.ray_caster import embree_scene
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface
-from nextview.things.view_templates import spread_directions
+from nextview.things.visible_points import spread_directions
 from nextview.types import Float, Mask
 
 # relative to the diameter: facets of a circle with 16 corners, and the resolution of a camera at

@@ -8,7 +8,7 @@ explains its pixels a little, so that a name has to explain them better.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -174,17 +174,21 @@ class World:
             if last is not None and any(row[:-1]):
                 strange.ravel()[last.cells] = True
         for segments, share, most, known in (
-            (lambda _: view.instances(), SURE_SHARE, EXPLAINED, before),
-            (lambda _: view.unions(), CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
-            (lambda _: view.fragments(), CLEAR_SHARE, EXPLAINED, strange),
-            (view.leftovers, CLEAR_SHARE, EXPLAINED, strange),
+            (view.instances, SURE_SHARE, EXPLAINED, before),
+            (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
+            (view.fragments, CLEAR_SHARE, EXPLAINED, strange),
         ):
             shown = world.explained(share) | view.enlarged(known)
-            left = [one for one in segments(shown) if shown[one.mask].mean() < most]
-            new = propose(self.library, view, left, among)
-            if new is not None:
-                world = world.with_hypotheses(new).chosen()
+            left = [mask for mask in segments() if shown[mask].mean() < most]
+            world = world._with_proposals(left, among)
+        shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
+        world = world._with_proposals(view.leftovers(shown), among)
         return world.with_lookalikes().with_other_sizes().pruned()
+
+    def _with_proposals(self, segments: Iterable[Mask], among: Mask) -> World:
+        """Return the world with what segments of the last view may show."""
+        new = propose(self.library, self.views[-1], segments, among)
+        return self if new is None else self.with_hypotheses(new).chosen()
 
     def with_other_sizes(self) -> World:
         """Return the world with new or doubtful things in another size, that which fits best."""
@@ -642,9 +646,7 @@ def _seen_again(world: World, view: View) -> _Rows:
     """Return strangers after another view: those of before, and new ones."""
     stride = view.stride
     measured = view.grid().depth.ravel() > 0
-    masks = [
-        one.mask[::stride, ::stride].ravel() & measured for one in view.instances()
-    ]
+    masks = [mask[::stride, ::stride].ravel() & measured for mask in view.instances()]
     sizes = np.array([np.count_nonzero(mask) for mask in masks])
     expected = [_expected(world, row, view) for row in world.strangers]
     shared = np.array(

@@ -31,14 +31,12 @@ class Answer:
         belief: in each thing, (T,) float64.
         things: thing of each pose, the likeliest first, (M,) int64; empty without poses.
         poses: from the frames of the scan files to the object frame, (M, 4, 4) float64, metres.
-        cameras: displacement of each pose in each view, (M, V, 3) float64, metres.
         p_value: value of the test for unknown things, () float64; NaN if it is not known.
     """
 
     belief: Float
     things: Index
     poses: Float
-    cameras: Float
     p_value: Float
 
 
@@ -81,16 +79,10 @@ class KnownThings:
         """
         joint = self._together(observations)
         poses = [each for each in joint.poses if each.thing in self.names]
-        count = len(observations)
-        moved = np.zeros((len(poses), count, 3))
-        for row, each in enumerate(poses):
-            if len(each.displacements) == count:
-                moved[row] = each.displacements
         return Answer(
             belief=np.asarray(joint.belief, np.float64)[self._order],
             things=np.array([self.names.index(each.thing) for each in poses], np.int64),
             poses=np.array([each.pose for each in poses]).reshape(-1, 4, 4),
-            cameras=moved,
             p_value=np.array(np.nan if joint.p_value is None else joint.p_value),
         )
 

@@ -346,10 +346,6 @@ class Looking:
         if in_camera:
             frame = max(found.pixels)
             believed, really = self.cameras[frame]
-            pose = pose.copy()
-            shifts = found.candidates[0].displacements
-            if len(shifts) == len(found.pixels):
-                pose[:3, 3] += shifts[sorted(found.pixels).index(frame)]
             pose = np.linalg.inv(believed) @ pose
             true = np.linalg.inv(really) @ thing.pose
 

@@ -162,8 +162,7 @@ class ThingEpisode:
         assert radius is not None
         camera = scene.pose.copy()
         camera[:3, 3] *= radius
-        pose = found.poses[rows[0]].copy()
-        pose[:3, 3] += found.cameras[rows[0], sorted(seen).index(seen[-1])]
+        pose = found.poses[rows[0]]
 
         points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._sensed(seen[-1])[1]

@@ -1,0 +1,228 @@
+"""Propose things and poses from pairs of points with normals, where outlines say little.
+
+Two points of a surface and their normals have four numbers that no motion changes: a distance and
+three angles. Pairs of a view vote for the pairs of the taught things with the same numbers (Drost
+et al., "Model globally, match locally: efficient and robust 3D object recognition", 2010). A part
+of a thing is enough.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.sensing.view import View
+from nextview.types import Float, Float32, Floats, Index, Mask
+
+THING_POINTS = 80  # of each thing
+DRAWN_POINTS = 1500  # of each thing, from which these are chosen
+SEEN_POINTS = 100  # of a segment
+REFERENCES = 25  # of these, whose pairs are compared
+DISTANCE_STEP = 0.008  # metres
+ANGLE_STEP = np.radians(15)
+ANGLES = 13  # steps of an angle
+TURNS = 20  # steps of the turn about a normal
+COMMONEST = 600  # pairs of the things that are alike, above which they tell nothing
+FEWEST_VOTES = 3  # of a pose that is proposed
+PATCH = 0.009  # metres, half the side of the patch around a point that gives its normal
+FEWEST = 12  # points of such a patch
+
+
+@dataclass(frozen=True, eq=False)
+class PointPairs:
+    """All pairs of points of taught things, by their numbers.
+
+    Attributes:
+        points: of each thing, relative to its centre, (T, N, 3) float64, metres.
+        normals: their unit normals, (T, N, 3) float64.
+        keys: of each pair what no motion changes, rounded, in ascending order, (P,) int64.
+        first: number of its first point, counted over all things, (P,) int32.
+        turns: of its second point about the normal of the first one, radians, (P,) float32.
+    """
+
+    points: Float
+    normals: Float
+    keys: Index
+    first: NDArray[np.int32]
+    turns: Float32
+
+    @classmethod
+    def of(cls, points: Float32, normals: Float32) -> PointPairs:
+        """Return the pairs of points that are spread over T things.
+
+        Args:
+            points: that can be seen of each, relative to its centre, (T, P, 3) float32, metres.
+            normals: their unit normals, (T, P, 3) float32.
+        """
+        rng = np.random.default_rng(0)
+        drawn = rng.integers(points.shape[1], size=(len(points), DRAWN_POINTS))
+        row = np.arange(len(points))[:, None]
+        some = np.take_along_axis(
+            drawn, spread(points[row, drawn], THING_POINTS), axis=1
+        )
+        own = points[row, some].astype(np.float64)
+        facing = normals[row, some].astype(np.float64)
+        one, two = np.nonzero(~np.eye(THING_POINTS, dtype=bool))
+        keys, turns = [], []
+        for at, away in zip(own, facing, strict=True):
+            keys.append(keys_of(at, away, one, two))
+            turns.append(turns_of(at, away, one, two).astype(np.float32))
+        first = (one + THING_POINTS * row).astype(np.int32)
+        every = np.concatenate(keys)
+        order = np.argsort(every, kind="stable")
+        return cls(
+            own,
+            facing,
+            every[order],
+            first.ravel()[order],
+            np.concatenate(turns)[order],
+        )
+
+    def propose(self, view: View, mask: Mask, most: int) -> tuple[Index, Float, Float]:
+        """Propose poses of things that a segment may show a part of.
+
+        Args:
+            view: the view.
+            mask: pixels of the segment, (H, W) bool.
+            most: number of poses of one thing, at most.
+
+        Returns:
+            M poses: the number of the thing, (M,) int64; its rotation from the axes of its scan to
+            the world, (M, 3, 3); and its centre in the world, (M, 3), metres.
+        """
+        points, normals = oriented(view, mask)
+        if len(points) < FEWEST:
+            return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        found: list[tuple[Index, Index, Index]] = []
+        for reference in spread(points[None], REFERENCES)[0]:
+            two = np.flatnonzero(
+                np.linalg.norm(points - points[reference], axis=1) > DISTANCE_STEP
+            )
+            one = np.full(len(two), reference)
+            keys = keys_of(points, normals, one, two)
+            start = np.searchsorted(self.keys, keys)
+            lengths = np.searchsorted(self.keys, keys, "right") - start
+            lengths[lengths > COMMONEST] = 0
+            pairs = np.repeat(start - np.cumsum(lengths) + lengths, lengths)
+            pairs += np.arange(len(pairs))
+            turn = np.repeat(turns_of(points, normals, one, two), lengths)
+            turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
+            bins = np.rint(turn).astype(np.int64) % TURNS
+            votes = np.bincount(self.first[pairs] * TURNS + bins)
+            leading = np.flatnonzero(votes >= FEWEST_VOTES)
+            found.append((np.full(len(leading), reference), leading, votes[leading]))
+        references, places, values = (
+            np.concatenate(each) for each in zip(*found, strict=True)
+        )
+        things, places = np.divmod(places, THING_POINTS * TURNS)
+        order = np.argsort(-values, kind="stable")
+        order = order[rank_within(things[order]) < most]
+        things, references, places = things[order], references[order], places[order]
+        own, turn = np.divmod(places, TURNS)
+        to_scan = frames(self.normals[things, own])
+        to_view = frames(normals[references])
+        angle = turn * (2 * np.pi / TURNS)
+        about = np.zeros((len(order), 3, 3))
+        about[:, 0, 0] = 1
+        about[:, 1, 1] = about[:, 2, 2] = np.cos(angle)
+        about[:, 2, 1] = np.sin(angle)
+        about[:, 1, 2] = -np.sin(angle)
+        rotations = to_view.swapaxes(1, 2) @ about @ to_scan
+        centres = points[references] - np.einsum(
+            "nij,nj->ni", rotations, self.points[things, own]
+        )
+        return things, rotations, centres
+
+
+def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
+    """Return points of a segment and their normals towards the camera, (N, 3) each, world axes."""
+    grid, stride = view.grid(), view.stride
+    own = mask[::stride, ::stride] & (grid.depth > 0)
+    cells = np.flatnonzero(own)
+    if len(cells) < FEWEST:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    rng = np.random.default_rng(0)
+    drawn = rng.permutation(cells)[: 4 * SEEN_POINTS]
+    drawn = drawn[spread(view.points(drawn)[None], SEEN_POINTS)[0]]
+    line, column = np.divmod(drawn, own.shape[1])
+    middle = float(np.median(grid.depth.ravel()[drawn]))
+    reach = int(np.clip(round(PATCH / middle / grid.pitch), 2, 8))
+    step = np.arange(-reach, reach + 1)
+    lines = (line[:, None, None] + step[:, None]).clip(0, own.shape[0] - 1)
+    columns = (column[:, None, None] + step).clip(0, own.shape[1] - 1)
+    around = (lines * own.shape[1] + columns).reshape(len(drawn), -1)
+    points = view.points(around.ravel()).reshape(len(drawn), -1, 3)
+    here = view.points(drawn)
+    near = own.ravel()[around] & (
+        np.linalg.norm(points - here[:, None], axis=2) < 2 * PATCH
+    )
+    count = np.maximum(near.sum(1), 1)[:, None]
+    mean = (points * near[..., None]).sum(1) / count
+    off = (points - mean[:, None]) * near[..., None]
+    normals = np.linalg.eigh(off.swapaxes(1, 2) @ off)[1][..., 0]
+    towards = view.camera[:3, 3] - mean
+    normals *= np.where((normals * towards).sum(1) < 0, -1, 1)[:, None]
+    kept = count[:, 0] >= FEWEST
+    return mean[kept], normals[kept]
+
+
+def spread(points: Floats, count: int) -> Index:
+    """Return the numbers of points of each set that lie far from each other.
+
+    Args:
+        points: T sets of points, (T, P, 3).
+        count: number of points that are chosen of each.
+
+    Returns:
+        Numbers, (T, count) int64, or all if there are fewer.
+    """
+    row = np.arange(len(points))
+    chosen = [np.zeros(len(points), np.int64)]
+    far = np.full(points.shape[:2], np.inf)
+    for _ in range(min(count, points.shape[1]) - 1):
+        off = points - points[row, chosen[-1]][:, None]
+        far = np.minimum(far, np.einsum("tpi,tpi->tp", off, off))
+        chosen.append(far.argmax(1))
+    return np.stack(chosen, 1)
+
+
+def keys_of(points: Float, normals: Float, one: Index, two: Index) -> Index:
+    """Return the distance and the three angles of pairs of points, rounded, as one number each."""
+    way = points[two] - points[one]
+    length = np.linalg.norm(way, axis=1)
+    way = way / np.maximum(length, 1e-9)[:, None]
+    key = np.rint(length / DISTANCE_STEP).astype(np.int64)
+    for a, b in (
+        (normals[one], way),
+        (normals[two], way),
+        (normals[one], normals[two]),
+    ):
+        angle = np.arccos(np.clip((a * b).sum(1), -1, 1))
+        key = key * ANGLES + np.rint(angle / ANGLE_STEP).astype(np.int64)
+    return key
+
+
+def frames(normals: Floats) -> Float:
+    """Return rotations that turn unit normals to the first axis, (N, 3, 3)."""
+    x = np.asarray(normals, np.float64)
+    aside = np.where(np.abs(x[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    y = np.cross(x, aside)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], 1)
+
+
+def turns_of(points: Float, normals: Float, one: Index, two: Index) -> Float:
+    """Return the turn of the second point of each pair about the normal of the first, radians."""
+    way = np.einsum("nij,nj->ni", frames(normals)[one], points[two] - points[one])
+    return np.arctan2(way[:, 2], way[:, 1])
+
+
+def rank_within(things: Index) -> Index:
+    """Return the number of earlier equal elements of each element, (N,) int64."""
+    order = np.argsort(things, kind="stable")
+    first = np.searchsorted(things[order], things[order])
+    rank = np.empty(len(things), np.int64)
+    rank[order] = np.arange(len(things)) - first
+    return rank
