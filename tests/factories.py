@@ -32,9 +32,10 @@ from nextview.geometry.resting import resting_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.inference import BINS_OUTPUT
 from nextview.recognition.map_names import measure_of
+from nextview.recognition.novelty import unit
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS, Sensor
-from nextview.things.memory import taught_meshes
+from nextview.things.memory import AZIMUTHS, RINGS, taught_meshes
 
 FURNITURE = ["chair", "monitor", "table"]
 """Of ``write_furniture``."""
@@ -76,6 +77,14 @@ def write_off(path: Path, mesh: Mesh) -> Path:
     return path
 
 
+def write_scan(mesh: Mesh, folder: Path) -> Path:
+    """Write a mesh of known size as it was scanned, in metres: ``folder/NAME.ply``."""
+    path = folder / f"{mesh.name}.ply"
+    placed = mesh.vertices * mesh.metres + mesh.centre
+    trimesh.Trimesh(placed, mesh.faces, process=False).export(path)
+    return path
+
+
 def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) -> Path:
     """Chairs, monitors and tables of boxes, each stretched at random, as
     ``folder/CLASS/SPLIT/CLASS_K.off``.
@@ -93,6 +102,22 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
                 folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label)
             )
     return folder
+
+
+def drawn_thing(name: str, size: int = 256) -> dict[str, np.ndarray]:
+    """What is remembered of a thing, drawn instead of looked at, with features of a size."""
+    rng = np.random.default_rng([*name.encode()])
+    return {
+        "views": unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, size))).astype(
+            np.float16
+        ),
+        "rotations": np.eye(3, dtype=np.float32)[None],
+        "held_out": unit(rng.normal(size=(8, size))).astype(np.float16),
+        "held_out_views": np.zeros((8, 2), np.float32),
+        "radii": np.array([0.1], np.float32),
+        "upright": np.array([False]),
+        "pictures": np.zeros((64, 64), np.uint8),
+    }
 
 
 # Networks of a few weights with the interface of the real ones

@@ -16,10 +16,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 # what is installed from this repository: the folder of each project, and that of its modules
-PROJECTS = {
-    "nextview": (".", "src"),
-    "nextview-lab": ("lab", "lab/src"),
-}
+PROJECTS = {"nextview": (".", "src"), "nextview-lab": ("lab", "lab/src")}
 COMMANDS = {"nextview": "nextview_command", "nextview-lab": "nextview_lab_command"}
 
 # by the name, in lower case, and the extra of it that is asked for

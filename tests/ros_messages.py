@@ -16,7 +16,6 @@ K = np.array([[260.0, 0, 79.5], [0, 265.0, 59.5], [0, 0, 1]])
 SHAPE = 120, 160
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
 DEPTH = "/camera/depth/image_rect_raw"
 CAMERA_INFO = "/camera/depth/camera_info"

@@ -224,11 +224,8 @@ def household(shared) -> Path:
 
     def make(folder: Path) -> None:
         names = [thing.name for thing in open_memory("ycb")[0].memory.things][:10]
-        for name, mesh in meshes_of(names).items():
-            placed = mesh.vertices * mesh.metres + mesh.centre
-            trimesh.Trimesh(placed, mesh.faces, process=False).export(
-                folder / f"{name}.ply"
-            )
+        for mesh in meshes_of(names).values():
+            factories.write_scan(mesh, folder)
 
     return shared("household", make)
 

@@ -2,7 +2,6 @@
 samples of long recordings.
 """
 
-import shutil
 import tracemalloc
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from ros_messages import (
     DEPTH,
     SHAPE,
     K,
-    at,
     compressed_message,
     header,
     image_message,
@@ -131,17 +129,6 @@ def test_compressed_depth_is_read_where_there_is_no_raw_one(tmp_path, encoding):
     assert f"depth of {DEPTH}" in both.notes
 
 
-def test_messages_out_of_order_are_put_into_the_order_of_their_stamps(tmp_path):
-    said = [*tf_of_an_arm(), *images_at([0.5, 1.5, 2.5])]
-    order = np.random.default_rng(1).permutation(len(said))
-    # recorded in another order than they were stamped in
-    shuffled = [(said[i][0], START + 0.01 * n, said[i][2]) for n, i in enumerate(order)]
-    capture = read_capture(write_bag(tmp_path / "bag", shuffled, mcap=False))
-    found = np.array([frame.pose for frame in capture.frames])
-    expected = np.array([tool_at(time) @ MOUNTED for time in (0.5, 1.5, 2.5)])
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
 @pytest.mark.parametrize("mcap", [True, False])
 def test_a_long_recording_is_sampled_without_loading_all_of_it(
     tmp_path, mcap, monkeypatch
@@ -255,37 +242,3 @@ def test_no_pose_is_made_up_in_a_gap_of_tf():
     np.testing.assert_allclose(
         tree.pose("tool", "base_link", 2.0), tool_at(2.0), atol=1e-9
     )
-
-
-@pytest.mark.parametrize("mcap", [True, False])
-def test_a_compressed_file_of_a_bag_expands_within_limits(mcap, tmp_path, monkeypatch):
-    """Noise shrinks to no hundredth; images of one distance do, and fill no disk."""
-    said = [*tf_of_an_arm(), *images_at([1.0, 2.0])]
-    bag = write_bag(tmp_path / "bag", said, mcap, compressed="file")
-    plain = write_bag(tmp_path / "plain", said, mcap)
-    assert not [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
-    for one, other in zip(
-        read_capture(bag).frames, read_capture(plain).frames, strict=True
-    ):
-        np.testing.assert_array_equal(one.read().depth, other.read().depth)
-
-    monkeypatch.setattr(bag_reader, "LARGEST_BAG_CHUNK", 2**16)
-    assert len(read_capture(bag).frames) == 2
-    flat = image_message(
-        np.full((480, 640), 700), "16UC1", header=header("optical", 0.0)
-    )
-    times = START + 0.1 * np.arange(40)
-    many = [(DEPTH, time, at(flat, time)) for time in times]
-    bomb = write_bag(tmp_path / "bomb", [*said, *many], mcap, compressed="file")
-    with pytest.raises(DatasetError):
-        read_capture(bomb)
-
-
-def test_a_bag_without_metadata_is_read_by_its_only_file(tmp_path):
-    bag = write_bag(tmp_path / "bag", [*tf_of_an_arm(), *images_at([1.0])])
-    (bag / "metadata.yaml").unlink()
-    assert len(read_capture(bag).frames) == 1
-    assert len(read_capture(next(bag.glob("*.mcap"))).frames) == 1
-    shutil.copy(next(bag.glob("*.mcap")), bag / "second.mcap")
-    with pytest.raises(DatasetError):
-        read_capture(bag)

@@ -10,14 +10,11 @@ import pytest
 from factories import run_python
 from programs import COMMANDS, called, check_help, example_of, main
 
-from nextview import errors
 from nextview.checks import extras
 from nextview.cli import progress
 from nextview.cli.call_with_arguments import call, find
 from nextview.cli.commands import NEXTVIEW
-from nextview.data import pool
-from nextview.errors import MissingExtraError, NextviewError, shell_words
-from nextview.files import check_new
+from nextview.errors import MissingExtraError
 
 COMMAND = [sys.executable, "-m", "nextview"]
 
@@ -66,18 +63,10 @@ def test_the_example_of_a_help_is_a_command_line(name, monkeypatch):
             "learn a b --remove",
             "Error parsing --remove: its value is missing: TEXT ...",
         ),
-        (
-            "check a --intrinsics",
-            "--intrinsics: its value is missing: FX FY CX CY|PATH",
-        ),
         ("learn a b --turntable left", "Expected one of ('ccw', 'cw')."),
         (
             "check a --intrinsic 2",
             "no option --intrinsic; did you mean '--intrinsics'?",
-        ),
-        (
-            "learn --tabletop=no a b",
-            "no option --tabletop; did you mean '--turntable'?",
         ),
         ("list models --xyz", "no option --xyz; nextview list --help lists those"),
         ("explore --no_browse", "no option --no-browse; did you mean '--no-browser'?"),
@@ -125,28 +114,6 @@ def test_a_command_of_the_laboratory_says_where_it_is(word, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_messages_name_an_option_as_it_is_typed_where_they_are_read(tmp_path, capsys):
-    """In a shell, in Python, and in a worker process of a command."""
-    (tmp_path / "out").mkdir()
-    for name in ("a", "b"):
-        (tmp_path / name).with_suffix(".off").write_text("OFF\n")
-    with pytest.raises(
-        NextviewError, match="another name, or overwrite=True to"
-    ) as python:
-        check_new(tmp_path / "a.off")
-    said = ended(capsys, "demo-episode", "--figure", tmp_path / "a.off")[1]
-    assert "another name, or --overwrite to" in said
-    assert "--" not in str(python.value)
-
-    with shell_words():
-        assert dict(pool.each(errors.option, ["depth_scale"], 1)) == {
-            "depth_scale": "--depth-scale"
-        }
-    assert dict(pool.each(errors.option, ["depth_scale"], 1)) == {
-        "depth_scale": "depth_scale"
-    }
-
-
 def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
     def stop(*arguments, **options):
         raise KeyboardInterrupt
@@ -169,9 +136,7 @@ def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
             "standard output cannot be written (No space left on",
         ),
         (">&-", "list models", 0, ""),
-        (">&-", "recognise none.off", 2, "none.off: no such file"),
         ("2>&-", "recognise none.off", 2, ""),
-        ("2>/dev/full", "recognise none.off", 2, ""),
     ],
 )
 def test_the_exit_status_is_right_if_an_output_is_full_or_closed(

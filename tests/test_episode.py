@@ -1,6 +1,6 @@
 """Episodes against a plain loop over one object, and policies that misbehave."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.special import softmax
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import RandomAll, Unidirectional
+from nextview.policies.baselines import Unidirectional
 from nextview.policies.maps import MapPeak
 from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping
 from nextview.session.episode import Episodes, run_episodes
@@ -128,55 +128,6 @@ def test_many_episodes_at_once_are_each_episode_alone(
         )
 
 
-class Turning:
-    """Remembers what it was told of the azimuth bins; goes where the rng says."""
-
-    needs = ("azimuth_bins",)
-
-    def __init__(self):
-        self.features = []
-
-    def next_views(self, state: EpisodeState, rng: np.random.Generator):
-        self.features.append((state.episodes, state.current, state.azimuth_bins))
-        return RandomAll(SPHERE).next_views(state, rng)
-
-
-def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
-    """Each view says something of the side seen from it; together they speak of where the
-    object's own zero points.
-    """
-    table, policy, calibration = Table.random(20), Turning(), Calibration(0.7, 0.4)
-    log_evidence = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
-
-    def observe(episodes, views):
-        return replace(
-            table.observe(episodes, views), azimuth_bins=log_evidence[episodes, views]
-        )
-
-    starts = np.random.default_rng(2).integers(0, 40, 20)
-    rng = np.random.default_rng(0)
-    done = run_episodes(
-        observe, SPHERE, policy, starts, Stopping(0.995, 6), rng, calibration
-    )
-    assert (
-        len({len(episodes) for episodes, _, _ in policy.features}) > 1
-    )  # some end earlier
-    for n_views, (episodes, current, azimuth_bins) in enumerate(policy.features, 1):
-        for e, now, found in zip(episodes, current, azimuth_bins, strict=True):
-            at = done.outcome.views[e, :n_views]
-            assert at[-1] == now
-            # summed by the azimuth that the object's zero has, a steps from the view's
-            zero = np.zeros((CLASSES, 8))
-            for view in at:
-                for side in range(8):
-                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += log_evidence[
-                        e, view, :, side
-                    ]
-            expected = softmax(zero / (1 + 0.4 * (n_views - 1)), axis=1)
-            seen = expected[:, (SPHERE.azimuth_index[now] - np.arange(8)) % 8]
-            np.testing.assert_allclose(found, seen, atol=1e-9)
-
-
 # Refusing
 
 
@@ -212,30 +163,3 @@ def test_a_policy_that_misbehaves_is_named(fault, part, episode):
     with pytest.raises(PolicyError, match=f"^policy Broken .*{part}") as refusal:
         run(Table.random(20), Broken(fault), np.arange(20), Stopping(1.0, 5))
     assert refusal.value.episode == episode
-
-
-def test_a_look_that_fails_is_not_taken_in():
-    class Moody:
-        needs = ()
-        fail = True
-
-        def next_views(self, state, rng):
-            if self.fail:
-                raise RuntimeError("not now")
-            return (state.current + 1) % 40
-
-    policy, sphere = Moody(), ViewSphere.named("40")
-    episodes = Episodes(
-        sphere, policy, np.array([3]), Stopping(1.0, 3), np.random.default_rng(0)
-    )
-    observation = Evidence(np.array([[1.0, 0.0]]))
-    with pytest.raises(PolicyError):
-        episodes.update(observation)
-    with pytest.raises(ValueError, match="finite"):
-        episodes.update(Evidence(np.array([[np.nan, 0.0]])))
-    with pytest.raises(ValueError, match="2 views for 1"):
-        episodes.update(Evidence(np.zeros((2, 2))))
-    policy.fail = False
-    step = episodes.update(observation)
-    assert step.belief[0, 0] == pytest.approx(1 / (1 + np.exp(-1)))
-    assert step.next_views.tolist() == [4]

@@ -24,18 +24,12 @@ from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_images import ExpectedSensor, SeenSurroundings
 from nextview.things.expected_model import Leading
-from nextview.things.expected_pose import surface_errors
 from nextview.things.expected_views import ExpectedViews, Outlook, expected_views
 from nextview.things.library import Hypotheses, Library
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.score import score
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.target import view_of
-from nextview.things.unseen_space import (
-    UNSEEN_FILLED,
-    MeasuredDepth,
-    chance_of_sight,
-)
 
 SPHERE = ViewSphere.named("40")
 AWAY = 0.45  # metres from the centre
@@ -88,13 +82,6 @@ def test_the_best_view_shows_the_place_in_which_two_things_differ():
     assert values.max() < np.log(2) + 1e-9
 
 
-def test_views_of_identical_things_are_worth_nothing():
-    caster = surfaces_of(box_mesh(BODY, KNOB), box_mesh(BODY, KNOB))
-    found = expected_views(caster, hypotheses_of((0, 1), (0.3, 0.7)), cameras(), SENSOR)
-    np.testing.assert_allclose(found.information(), 0, atol=1e-6)
-    np.testing.assert_allclose(found.divergence, 0, atol=1e-5)
-
-
 def test_a_motion_absorbed_by_registration_gives_no_information():
     caster = surfaces_of(box_mesh(BODY), box_mesh(BODY))
     hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
@@ -124,44 +111,14 @@ def test_views_from_behind_an_obstacle_are_worth_nothing():
     assert behind[ahead].min() > 0.3
 
 
-def test_the_order_of_the_hypotheses_does_not_matter():
-    forth = knob_or_not((0.3, 0.7), (0, 1))
-    back = knob_or_not((0.3, 0.7), (1, 0))
-    np.testing.assert_allclose(forth.information(), back.information(), atol=1e-6)
-    np.testing.assert_allclose(
-        forth.divergence[:, 0, 1],
-        back.divergence[:, 1, 0],
-        atol=1e-5,
-    )
-    np.testing.assert_allclose(forth.divergence, forth.divergence.swapaxes(1, 2))
-
-
 def expected(divergence, belief, things) -> ExpectedViews:
     """Views of which the divergences are known."""
     divergence = np.asarray(divergence, float)
     hypotheses = hypotheses_of(things, belief)
     some = np.ones(len(divergence))
     return ExpectedViews(
-        hypotheses,
-        divergence,
-        np.zeros_like(divergence),
-        some,
-        0 * some,
+        hypotheses, divergence, np.zeros_like(divergence), some, 0 * some
     )
-
-
-@pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
-def test_information_has_the_known_limits_and_is_between_them(belief):
-    divergence = np.zeros((3, 2, 2))
-    divergence[1] = 4.0 * (1 - np.eye(2))
-    divergence[2] = 4000.0 * (1 - np.eye(2))
-    found = expected(divergence, belief, (0, 1))
-    entropy = -sum(p * np.log(p) for p in belief)
-    kept = np.exp(-1)  # a quarter of the divergence
-    between = -sum(p * np.log(p + kept * (1 - p)) for p in belief)
-    np.testing.assert_allclose(found.information(), [0, between, entropy], atol=1e-12)
-    np.testing.assert_allclose(found.entropy(), entropy)
-    np.testing.assert_allclose(found.gain(0)[2], -np.log(belief[0]))
 
 
 def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
@@ -228,11 +185,7 @@ def outlook_of(belief, taken=1) -> Outlook:
 
 
 def settled(
-    belief,
-    visited,
-    reachable=None,
-    travel=None,
-    **policy,
+    belief, visited, reachable=None, travel=None, **policy
 ) -> tuple[int, np.ndarray]:
     """Where the policy goes from some views, a box or the same with a knob, and its values."""
     been = np.isin(np.arange(len(SPHERE)), visited)[None]
@@ -263,31 +216,6 @@ def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
     assert (np.isnan(values) == ~(reachable[0] & (np.arange(40) != from_behind))).all()
 
 
-@pytest.mark.parametrize("near", [1, 7])
-def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monkeypatch):
-    def the_same(outlook, cameras, goal):
-        divergence = np.tile(5.0 * (1 - np.eye(2)), (len(cameras), 1, 1))
-        some = np.ones(len(divergence))
-        return ExpectedViews(outlook.hypotheses, divergence, divergence, some, 0 * some)
-
-    monkeypatch.setattr(Outlook, "expect", the_same)
-    travel = np.where(np.arange(40) == near, 1.0, 9.0)[None]
-    assert settled((0.5, 0.5), [4], travel=travel)[0] == near
-
-
-def test_without_informative_views_the_farthest_view_is_chosen():
-    chosen, _ = settled((1.0, 0.0), [0])
-    assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
-    _, values = settled(
-        (0.5, 0.5),
-        [4],
-        travel=np.full((1, 40), 3.0),
-        travel_weight=0.1,
-    )
-    _, free = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0))
-    np.testing.assert_allclose(values[0], free[0] - 0.3)
-
-
 def test_an_outlook_combines_the_views_and_what_explains_them(knobs_memory, knobs):
     recogniser = VerifiedRecogniser(knobs_memory / "memory.json", 1)
     mesh = load_mesh(knobs / "knob.ply", unit="m")
@@ -295,10 +223,7 @@ def test_an_outlook_combines_the_views_and_what_explains_them(knobs_memory, knob
     block = trimesh.creation.box((0.2, 1.0, 1.5))
     block.apply_translation((1.8, 0.0, 0.0))  # object radii
     obstacle = Mesh(
-        np.asarray(block.vertices),
-        block.faces.astype(np.int32),
-        np.zeros(3),
-        1.0,
+        np.asarray(block.vertices), block.faces.astype(np.int32), np.zeros(3), 1.0
     )
     camera = SensedCamera(mesh, sensor, np.random.default_rng(0), around=obstacle)
     observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
@@ -337,116 +262,3 @@ def test_poses_of_a_robot_are_ranked():
     assert rank_views(outlook, inside[:0], inside[:0], np.arange(0), "thing") == ()
     with pytest.raises(UsageError, match="the goal is thing or pose, not 'name'"):
         rank_views(outlook, inside, inside, np.arange(3), "name")
-
-
-def half_a_wall() -> MeasuredDepth:
-    """What a camera on -x sees: a wall 35 cm before it where y > 0, and far away the rest."""
-    pose = look_at_origin(np.zeros(1), np.full(1, np.pi))[0]
-    pose[:3, 3] *= AWAY / np.linalg.norm(pose[:3, 3])
-    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
-    rays = (
-        np.stack([(x - 32) / 60, (y - 32) / 60, np.ones_like(x)], -1) @ pose[:3, :3].T
-    )
-    depth = np.where(rays[..., 1] > 0, 0.35, 5.0).astype(np.float32)
-    return MeasuredDepth(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
-
-
-def lines_from(*sides: float, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Level lines of sight that end on the z axis, from cameras on the side of +y or -y."""
-    rays = np.array([[[0.0, -side, 0.0]] for side in sides], np.float32)
-    return np.full_like(rays, (0, 0, height)), rays
-
-
-def test_a_line_of_sight_through_space_that_no_view_looked_into_may_be_blocked():
-    ends, rays = lines_from(1.0, -1.0, -1.0)
-    blocked = np.array([[False], [False], [True]])
-    sight = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -1.0, 1.0)
-    assert sight[1, 0] == 1  # the camera looked through all of it
-    # One line is blocked and 15 cm are known to be free; the other 15 cm are filled oftener.
-    assert -np.log(sight[0, 0]) == pytest.approx(UNSEEN_FILLED, rel=0.15)
-
-
-def test_a_low_line_of_sight_is_blocked_more_often_than_a_high_one():
-    known = lines_from(-1.0, -1.0)
-    blocked = np.array([[False], [False], [True]])
-    lost = []
-    for height in (0.0, 0.05):  # half as high as what stands around, and three quarters
-        ends, rays = lines_from(1.0, height=height)
-        lines = np.concatenate([ends, known[0]]), np.concatenate([rays, known[1]])
-        sight = chance_of_sight([half_a_wall()], *lines, blocked, 0.15, -0.1, 0.1)
-        lost.append(-np.log(sight[0, 0]))
-    assert lost[1] == pytest.approx(lost[0] / 2, rel=0.15)
-
-
-def test_nothing_is_expected_where_nothing_stands_or_above_what_stands():
-    ends, rays = lines_from(1.0, -1.0, -1.0)
-    alone = np.zeros((3, 1), bool)
-    assert (
-        chance_of_sight([half_a_wall()], ends, rays, alone, 0.15, -1.0, 1.0) == 1
-    ).all()
-    blocked = np.array([[False], [False], [True]])
-    above = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -1.0, -0.05)
-    assert above[0, 0] == 1
-
-
-def test_a_view_is_trusted_by_the_pixels_that_show_the_thing():
-    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
-    near = cameras()
-    far = cameras()
-    far[:, :3, 3] *= 4
-    hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
-    many = expected_views(caster, hypotheses, near, SENSOR).found
-    few = expected_views(caster, hypotheses, far, SENSOR).found
-    # The box covers about 8 x 10 cm, 424 pixels a radian.
-    pixels = (424 / AWAY) ** 2 * 0.08 * 0.1
-    assert many.mean() == pytest.approx(pixels / (pixels + 1000), rel=0.1)
-    assert few.mean() == pytest.approx(pixels / 16 / (pixels / 16 + 1000), rel=0.25)
-
-
-def ball() -> Surface:
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    return Surface.from_mesh(make_mesh(sphere.vertices, sphere.faces, unit="m"), "ball")
-
-
-def test_a_turn_that_nothing_can_tell_is_no_error_of_the_surface():
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = np.eye(3) * 0.2**2
-    moved = np.zeros((6, 6))
-    moved[3:, 3:] = np.eye(3) * 0.003**2
-    assert surface_errors(ball(), np.eye(3), turned) < 1e-4
-    assert surface_errors(ball(), np.eye(3), moved) == pytest.approx(0.003, rel=0.01)
-    box = Surface.from_mesh(box_mesh(BODY), "box")
-    assert surface_errors(box, np.eye(3), turned) > 0.003
-
-
-@pytest.mark.parametrize("left", [0.0, -1e-22])
-def test_what_is_known_exactly_has_an_error_and_a_logarithm(left):
-    """A covariance without a direction, which rounding may make negative there."""
-    flat = np.diag([0, 0, 0, left, left, left])
-    error = surface_errors(ball(), np.eye(3), flat)
-    assert 0 < error < 1e-5
-    assert np.isfinite(
-        np.log(surface_errors(ball(), np.eye(3), np.stack([flat] * 2)))
-    ).all()
-
-
-def test_informative_views_reduce_the_pose_uncertainty():
-    loose = np.diag([1e-4, 1e-4, 1e-2, 1e-6, 1e-6, 1e-6])  # the azimuth is hardly known
-    surfaces = surfaces_of(box_mesh(BODY, HANDLE))
-    hypotheses = hypotheses_of((0,), (1.0,))
-    wall_around = SeenSurroundings(wall(0.14))
-    found = expected_views(
-        surfaces,
-        hypotheses,
-        cameras(),
-        SENSOR,
-        wall_around,
-        covariance=loose,
-    )
-    hidden = found.found < 1e-6
-    towards = SPHERE.directions[:, 0]
-    assert hidden[(towards > 0.6) & (SPHERE.elevation < 0.4)].all()
-    assert found.sharper[hidden].max() < found.sharper[~hidden].min()
-    np.testing.assert_allclose(found.worth("pose")[hidden], 0, atol=1e-9)
-    assert found.worth("pose").max() > 0.5
-    np.testing.assert_allclose(found.worth("thing"), 0, atol=1e-9)

@@ -7,21 +7,17 @@ from functools import partial
 
 import numpy as np
 import pytest
-from PIL import Image
 from recordings import (
     CAMERA,
     HALF,
     LAYOUTS,
-    NAMES,
     SHAPE,
     K,
-    packed_by_lzf,
     points_of,
     views_around,
     write_clouds,
     write_folder,
     write_graspnet,
-    write_pcd,
     write_recording,
     write_ycb_video,
 )
@@ -29,7 +25,6 @@ from recordings import (
 from nextview.captured.camera_file import read_camera_file
 from nextview.captured.check import check_capture
 from nextview.captured.folders import is_capture, read_capture
-from nextview.captured.pcd import decompress_lzf, fitted_intrinsics
 from nextview.errors import DatasetError, UsageError
 from nextview.teaching.thing_sources import find_things
 
@@ -84,43 +79,6 @@ def test_a_single_cloud_needs_no_pose_and_may_be_of_any_precision(views, tmp_pat
     (captured,) = read_capture(path).frames
     np.testing.assert_array_equal(captured.pose, np.eye(4))
     np.testing.assert_allclose(captured.read().depth, depth / 1000, atol=1e-6)
-
-
-def test_a_sequence_of_ocid_is_read_cloud_by_cloud(views, tmp_path):
-    """It has depth images, too, without intrinsics, and things are added between the images."""
-    for name, (depth, _) in zip(NAMES, views, strict=True):
-        write_pcd(tmp_path / f"pcd/{name}.pcd", points_of(depth))
-        for folder in ("depth", "label", "rgb"):
-            (tmp_path / folder).mkdir(exist_ok=True)
-            Image.fromarray(depth).save(tmp_path / f"{folder}/{name}.png")
-    assert is_capture(tmp_path)
-    with pytest.raises(DatasetError):
-        read_capture(tmp_path)
-    (captured,) = read_capture(tmp_path / "pcd/000002.pcd").frames
-    np.testing.assert_allclose(captured.read().depth, views[2][0] / 1000, atol=1e-6)
-
-
-def test_the_fit_to_points_is_exact_and_tells_noise():
-    rng = np.random.default_rng(0)
-    intrinsics, misfit = fitted_intrinsics(
-        points_of(rng.uniform(500, 2000, SHAPE)).astype(float)
-    )
-    np.testing.assert_allclose(intrinsics, K, atol=1e-3)
-    assert misfit < 1e-3
-    assert fitted_intrinsics(rng.normal(size=(*SHAPE, 3)))[1] > 10
-    assert fitted_intrinsics(np.full((*SHAPE, 3), np.nan))[1] == np.inf
-
-
-def test_lzf_is_unpacked_as_liblzf_packs_it():
-    assert decompress_lzf(b"\x00a\xe0\x0a\x00", 20) == 20 * b"a"
-    assert decompress_lzf(b"\x04hello\x60\x04", 10) == b"hellohello"
-    content = np.repeat(np.arange(50, dtype=np.float64), 7).tobytes()
-    packed = packed_by_lzf(content)
-    assert len(packed) < len(content)
-    assert decompress_lzf(packed, len(content)) == content
-    for damaged, size in ((b"\x00a\x20\x05", 4), (b"a", 1), (b"\x00a\xe0", 9)):
-        with pytest.raises(ValueError, match=r"bytes where|damaged LZF"):
-            decompress_lzf(damaged, size)
 
 
 def test_captures_without_poses_are_read_one_by_one(views, tmp_path):

@@ -36,14 +36,7 @@ def begin(models, limits=None, distance=0.5, max_views=4, seed=0, **asked) -> Se
     rng = np.random.default_rng(seed)
     thing = ObservedObject(**asked)
     session = Session(
-        models,
-        policy,
-        SPHERE,
-        0,
-        Stopping(1.0, max_views),
-        rng,
-        thing,
-        distance,
+        models, policy, SPHERE, 0, Stopping(1.0, max_views), rng, thing, distance
     )
     session.limits = limits or Limits()
     return session
@@ -53,11 +46,7 @@ def look(pose, *meshes, masked=False) -> Frame:
     """What a camera sees of things, the object first."""
     depth, which = cast(meshes, pose, INTRINSICS, SHAPE)
     return Frame(
-        depth,
-        INTRINSICS,
-        pose,
-        which == 0 if masked else None,
-        pixel_centre=0.5,
+        depth, INTRINSICS, pose, which == 0 if masked else None, pixel_centre=0.5
     )
 
 
@@ -181,34 +170,11 @@ def test_limits_hold_for_the_targets_of_a_scene_too(ycb):
         scene.limits = 0.4
 
 
-def test_what_ends_is_no_wall_once_a_frame_shows_what_is_behind(tiny):
-    screen = box((1.3, 0.02, 1.2), (0, 0.45, 0.6))
-    session = begin(tiny, distance=0.7, point=(0, 0, 0.03))
-    session.update(
-        look(pose_at(30, -90, 0.6, (0, 0, 0.1)), BRICK, TABLE, screen, FLOOR)
-    )
-    assert BEHIND_WALL in session.left_out
-    session.update(
-        look(pose_at(15, 190, 1.3, (0, 0.45, 0.05)), BRICK, TABLE, screen, FLOOR)
-    )
-    assert BEHIND_WALL not in session.left_out
-
-
 def test_the_object_is_no_obstacle(tiny):
     """However near the camera is asked to be, and whatever it hides."""
     session = begin(tiny, Limits(0, np.inf), distance=1.2, point=(0, 0, 0.5))
     session.update(look(pose_at(20, -90, 2.5, (0, 0, 0.9)), WARDROBE, FLOOR))
     assert set(session.left_out) == {""}
-
-
-def test_on_a_turntable_the_room_is_no_obstacle(tiny):
-    wall = box((5, 0.1, 3), (0, 0.4, 1.0))
-    frame = look(pose_at(30, -90, 0.8, (0, 0, 0.05)), BRICK, wall, masked=True)
-    session = begin(tiny, distance=0.7, support=False)
-    session.update(frame)
-    assert set(session.left_out) == {""}
-    session.limits = Limits(clearance=0.1)
-    assert BEHIND_WALL in session.left_out
 
 
 # What follows
@@ -227,47 +193,10 @@ def test_where_no_candidate_is_left_the_session_ends_and_says_why(tiny):
     assert "no other view in reach: 39 too low" in repr(result)
 
 
-def test_why_a_session_is_stranded_counts_each_candidate_once(tiny):
-    session = begin(tiny, max_views=6)
-    session.update(look(FROM, BRICK, TABLE))
-    while not session.done:
-        session.failed()
-    low = session.left_out.count(TOO_LOW)
-    assert session.result.why_stranded == f"{39 - low} failed, {low} too low"
-
-    session = begin(tiny, max_views=6)
-    session.reachable = lambda pose: False
-    session.update(look(FROM, BRICK, TABLE))
-    assert session.result.why_stranded == f"{39 - low} out of reach, {low} too low"
-
-
-def test_limits_that_are_set_later_count_from_then_on(tiny):
-    session = begin(tiny)
-    session.update(look(FROM, BRICK, TABLE))
-    target = session.target
-    session.limits = Limits(min_height=float(target[2, 3]) + 0.01)
-    assert session.target[2, 3] > target[2, 3]
-    assert session.views[-1].next_view == session.view
-    with pytest.raises(UsageError, match="limits are"):
-        session.limits = 0.3
-
-
-def test_a_function_of_reach_is_asked_only_of_what_is_left(tiny):
-    asked = []
-    session = begin(tiny)
-    session.reachable = lambda pose: asked.append(pose[2, 3]) or True
-    session.update(look(FROM, BRICK, TABLE))
-    assert asked
-    assert min(asked) >= 0.08
-
-
 def test_a_session_for_a_robot_takes_the_limits_at_its_beginning():
     system = nextview.load(policy="spread", threshold=1.0)
     session = system.session(
-        distance=0.5,
-        min_height=0.2,
-        max_height=0.4,
-        clearance=0.05,
+        distance=0.5, min_height=0.2, max_height=0.4, clearance=0.05
     )
     assert session.limits == Limits(0.2, 0.4, 0.05)
     session.update(look(FROM, BRICK, TABLE))
@@ -300,44 +229,3 @@ def test_a_session_with_frames_can_be_pickled_and_goes_on_alike(tiny):
     for one in (session, other):
         one.update(second)
     assert other.left_out == session.left_out
-
-
-def test_the_values_of_a_view_rank_the_candidates():
-    """As the page about cameras says: the largest of those that are left is the target."""
-    session = nextview.load(policy="gain", threshold=1.0, threads=1).session(
-        distance=0.5
-    )
-    view = session.update(look(FROM, BRICK, TABLE))
-    taken = {earlier.index for earlier in session.views}
-    left = [
-        k
-        for k in range(40)
-        if not session.left_out[k] and k not in taken and np.isfinite(view.values[k])
-    ]
-    assert session.view == max(left, key=lambda k: view.values[k])
-
-
-# What is set by hand
-
-
-def test_a_distance_inside_the_object_is_refused_once_its_size_is_known(tiny):
-    session = begin(tiny)
-    session.update(look(FROM, BRICK, TABLE))
-    with pytest.raises(UsageError, match="from the centre of an object"):
-        session.distance = 0.03
-    session.distance = 0.7
-    centre = session.object.object_frame.centre
-    np.testing.assert_allclose(np.linalg.norm(places(session) - centre, axis=1), 0.7)
-
-
-def test_what_a_masked_array_hides_is_out_of_reach(tiny):
-    session = begin(tiny)
-    hidden = np.arange(40) % 2 == 0
-    session.reachable = np.ma.array(np.ones(40, bool), mask=hidden)
-    np.testing.assert_array_equal(session.reachable, ~hidden)
-
-    ways = np.zeros((40, 40), bool)
-    ways[:, hidden] = True
-    session.travel_cost = np.ma.array(np.ones((40, 40), int), mask=ways)
-    assert np.isinf(session.travel_cost[ways]).all()
-    assert (session.travel_cost[~ways] == 1).all()

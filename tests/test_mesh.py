@@ -17,9 +17,7 @@ from scipy.spatial.transform import Rotation
 from test_broken_files import glb, one_triangle
 
 from nextview.errors import MeshError
-from nextview.geometry import triangles as limits
 from nextview.geometry.mesh import load_mesh, make_mesh
-from nextview.geometry.mesh_file import read_off
 from nextview.geometry.triangles import triangulate
 
 # A house: a box with a ridge on it, of triangles, quads and pentagons. Its last vertex is used by
@@ -225,24 +223,6 @@ def test_dialects_of_off(tmp_path, dialect):
     assert_is_the_house(tmp_path / "house.off", DIALECTS[dialect])
 
 
-@given(st.data())
-def test_the_fast_and_the_tolerant_way_of_reading_off_agree(data):
-    count = data.draw(st.integers(3, 8))
-    number, corner = st.floats(-1e6, 1e6), st.integers(0, count - 1)
-    triples = st.lists(
-        st.tuples(number, number, number), min_size=count, max_size=count
-    )
-    corners = st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=6)
-    vertices, faces = data.draw(triples), data.draw(corners)
-    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in vertices]
-    rows += ["3 {} {} {}".format(*face) for face in faces]
-    text = "\n".join([f"OFF\n{count} {len(faces)} 0", *rows]) + "\n"
-    coloured = re.sub(r"(?m)^(3 \d \d \d)$", r"\1 1 2 3", text)
-    for read in (read_off(text.encode()), read_off(coloured.encode())):
-        np.testing.assert_array_equal(read[0], vertices)
-        np.testing.assert_array_equal(read[1], faces)
-
-
 OBJS = {
     "capitals": as_obj("house").upper(),
     "texture, normals and groups": "mtllib none.mtl\nvt 0 0\nvn 0 0 1\n"
@@ -349,15 +329,6 @@ def test_the_object_frame(shape, scale, offset):
     np.testing.assert_allclose(back, positions, rtol=0, atol=rounding)
 
 
-def test_a_mesh_is_the_same_with_copies_of_its_triangles():
-    ball = trimesh.creation.icosphere(2)
-    plain = make_mesh(ball.vertices, ball.faces)
-    copies = [ball.faces, ball.faces[:, ::-1], ball.faces + len(ball.vertices)]
-    doubled = make_mesh(np.tile(ball.vertices, (2, 1)), np.concatenate(copies))
-    np.testing.assert_array_equal(doubled.faces, plain.faces)
-    np.testing.assert_array_equal(doubled.vertices, plain.vertices)
-
-
 # Polygons
 
 
@@ -421,48 +392,3 @@ def test_the_triangles_cover_the_polygon_and_nothing_else(name):
         np.testing.assert_allclose(found.sum(0), area * turn[:, 2], atol=1e-9)
         middles = outline[faces[np.linalg.norm(found, axis=1) > 1e-9]].mean(1)
         assert Outline(outline).contains_points(middles).all()
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    st.lists(st.floats(0.05, 1), min_size=4, max_size=60),
-    st.floats(0, 0.02),
-    st.integers(0, 100),
-)
-def test_any_polygon_without_crossings_bent_or_not(radii, bend, seed):
-    rng = np.random.default_rng(seed)
-    turns = np.linspace(0, 2 * np.pi, len(radii), endpoint=False)
-    outline = np.array(radii)[:, None] * np.stack([np.cos(turns), np.sin(turns)], 1)
-    points = np.column_stack([outline, bend * rng.standard_normal(len(outline))])
-    found = areas(points, cut(points))
-    assert found[:, 2].min() > -1e-3
-    assert found[:, 2].sum() == pytest.approx(shoelace(outline), rel=0.02)
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        np.zeros((5, 3)),
-        np.arange(5)[:, None] * np.ones(3),
-        np.array([(0, 0, 0), (1, 0, 0)]),
-        np.array([(0, 0, 0), (1, 0, 0), (np.nan, 1, 0), (0, 1, 0)]),
-        1e200 * np.array([(0, 0, 0), (2, 1, 0), (0, 2, 0), (0.5, 1, 0)]),
-    ],
-    ids=["a point", "a line", "two corners", "NaN", "huge"],
-)
-def test_a_degenerate_polygon_breaks_nothing(points):
-    faces = cut(points.astype(float))
-    assert len(faces) == max(len(points) - 2, 0)
-    assert ((faces >= 0) & (faces < len(points))).all()
-
-
-def test_polygons_that_are_none_or_take_too_long_are_refused(monkeypatch):
-    with pytest.raises(MeshError):
-        triangulate(np.zeros((4, 3)), np.array([0, 1, 2, 7]), np.array([4]))
-    with pytest.raises(MeshError):
-        triangulate(np.zeros((4, 3)), np.zeros(5002, int), np.array([5002]), 100)
-    monkeypatch.setattr(limits, "MAX_CUTTING_STEPS", 100.0)
-    with pytest.raises(MeshError):
-        cut(np.array([(*p, 0.0) for p in COMB]))
-    around = np.column_stack([np.cos(TURNS), np.sin(TURNS), 0 * TURNS])
-    assert len(cut(around)) == 10  # a convex one takes no time

@@ -115,21 +115,6 @@ def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, 
         )
 
 
-def test_a_base_plate_is_asked_about_however_the_scan_is_turned():
-    body = trimesh.creation.cylinder(0.03, 0.12, sections=48)
-    body.apply_translation((0, 0, 0.06))
-    for side, asked in ((0.16, False), (0.32, True)):
-        plate = trimesh.creation.box((side, side, 0.008))
-        plate.apply_translation((0, 0, -0.004))
-        shape = joined(body, plate, connected=True)
-        doubts = []
-        for turn in Rotation.random(30, random_state=0).as_matrix():
-            faces = NOISE.permutation(np.asarray(shape.faces))
-            doubts.append(mesh_doubts(shape.vertices @ turn.T, faces))
-        assert {len(one) for one in doubts} == {int(asked)}
-        assert len(set(doubts)) == 1  # also how many times as large it is
-
-
 @pytest.mark.parametrize(
     "shape",
     [

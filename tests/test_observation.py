@@ -64,30 +64,7 @@ def test_a_view_shows_something_from_so_many_pixels_on(size):
     assert least - 1 < max(LEAST_PIXELS, LEAST_VISIBLE_SHARE * size**2) <= least
 
 
-def test_specks_far_apart_show_nothing_until_they_are_many_or_touch():
-    """Squares of 8 x 8 pixels in an image of 112: below LEAST_VISIBLE_SHARE each."""
-    for squares, apart, seen in [
-        (1, 9, False),
-        (4, 9, False),
-        (10, 9, True),
-        (2, 8, True),
-        (4, 8, True),
-    ]:
-        depth = np.zeros((112, 112), np.float32)
-        for k in range(squares):
-            row, column = divmod(apart * k, 108)
-            depth[row * 20 : row * 20 + 8, column : column + 8] = 3
-        assert np.count_nonzero(depth) == 64 * squares
-        assert Observation(depth, POSE, pinhole(112, 3.0)).seen == seen
-
-
 # Refusing
-
-
-FAR = POSE.copy()
-FAR[0, 3] = 1500.0
-NOISY = VIEW.depth * 450
-NOISY[np.nonzero(NOISY)[0][:3], np.nonzero(NOISY)[1][:3]] = 7
 
 
 images = npst.arrays(

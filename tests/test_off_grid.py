@@ -12,7 +12,6 @@ from nextview.geometry.viewsphere import (
     VISITED_ANGLE,
     Directions,
     ViewSphere,
-    look_at_origin,
     viewpoints_of,
 )
 from nextview.policies.base import EpisodeState, Evidence
@@ -42,27 +41,6 @@ def evidence(rng, b=1) -> Evidence:
     }
     bins = np.log(rng.dirichlet(np.ones(8), (b, CLASSES)))
     return Evidence(rng.normal(size=(b, CLASSES)), maps, bins)
-
-
-def direction(elevation, azimuth):
-    return look_at_origin(np.radians(elevation), np.radians(azimuth), 1.0)[..., :3, 3]
-
-
-# Layouts
-
-
-def test_a_fibonacci_hemisphere_is_even():
-    directions = viewpoints_of("fibonacci:200").directions
-    assert directions.shape == (200, 3)
-    assert (directions[:, 2] > 0).all()
-    angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
-    np.fill_diagonal(angles, 180)
-    # side of a square of each one's share of the half sphere
-    even = np.degrees(np.sqrt(2 * np.pi / 200))
-    assert angles.min(1).min() > 0.75 * even
-    assert angles.min(1).max() < 1.1 * even
-    heights = np.sort(directions[:, 2])  # equal areas: heights are uniform (Archimedes)
-    np.testing.assert_allclose(heights, (np.arange(200) + 0.5) / 200)
 
 
 # Policies off their grid
@@ -114,57 +92,6 @@ def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(nam
         assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(
             state, rng
         )
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    st.floats(-20, 89), st.floats(0, 360), st.sampled_from(LAYOUTS), st.integers(0, 99)
-)
-def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout, seed):
-    """Bilinear in elevation and in azimuth from the camera, written out for each view."""
-
-    class Fixed:
-        sphere, needs, travel_weight = SPHERE, (), 0.5
-        cells = np.random.default_rng(seed).random((1, 40))
-
-        def scores(self, state):
-            assert SPHERE.azimuth_index[state.current[0]] == 0
-            return self.cells
-
-        def next_views(self, state, rng):
-            raise AssertionError
-
-    sphere, rng = (
-        Directions(viewpoints_of(layout).directions),
-        np.random.default_rng(seed),
-    )
-    state = state_at(
-        sphere,
-        direction(elevation, azimuth),
-        rng,
-        reachable=rng.random((1, len(sphere))) < 0.5,
-    )
-    travel = rng.random((1, len(sphere)))
-    state = replace(state, travel=travel)
-    if not state.free.any():
-        return
-    grid = np.column_stack([Fixed.cells.reshape(5, 8), Fixed.cells.reshape(5, 8)[:, 0]])
-    expected = []
-    for view in range(len(sphere)):
-        up, round_ = sphere.angles(view)
-        row = np.clip(up, 0, 72) / 18
-        column = (round_ - azimuth) % 360 / 45
-        r, c = min(int(row), 3), min(int(column), 7)
-        a, b = row - r, column - c
-        corners = (
-            grid[r, c] * (1 - b) + grid[r, c + 1] * b,
-            grid[r + 1, c] * (1 - b) + grid[r + 1, c + 1] * b,
-        )
-        expected.append(corners[0] * (1 - a) + corners[1] * a - 0.5 * travel[0, view])
-    expected = np.where(state.free[0], expected, -np.inf)
-    chosen = OffGrid(Fixed(), SPHERE, sphere).next_views(state, rng)[0]
-    assert state.free[0, chosen]
-    assert expected[chosen] == pytest.approx(expected.max(), abs=1e-6)
 
 
 @settings(deadline=None, max_examples=150)

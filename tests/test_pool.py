@@ -34,10 +34,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("way", ["a file", "standard input"])
 def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
     (tmp_path / "script.py").write_text(LINES)
-    call = {
-        "a file": ["script.py"],
-        "standard input": ["-"],
-    }[way]
+    call = {"a file": ["script.py"], "standard input": ["-"]}[way]
     done = subprocess.run(
         [sys.executable, *call],
         input=LINES,

@@ -3,31 +3,24 @@ them.
 """
 
 import json
-import pickle
 import re
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from factories import INTRINSICS, TABLE, box, cast, pose_at
-from matplotlib.contour import ContourSet
 from programs import main
 from scipy.spatial.transform import Rotation
-from test_household import bottle, mug
 
 import nextview
 from nextview.errors import SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
-from nextview.geometry.pinhole import PinholeCamera
-from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.resting import rotated
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
-from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncertainty_of
-from nextview.sensing import Frame, ObservedObject
-from nextview.simulation.simulated import SimulatedCamera
+from nextview.recognition.poses import share_of_likeliest
+from nextview.sensing import Frame
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
@@ -39,6 +32,23 @@ SPOT = np.array([0.4, -0.25, 0.0])  # on the table
 def l_block() -> trimesh.Trimesh:
     parts = [box((0.16, 0.04, 0.04)), box((0.04, 0.08, 0.04), (-0.06, 0.06, 0))]
     return trimesh.util.concatenate(parts)
+
+
+def mug() -> trimesh.Trimesh:
+    wall = trimesh.creation.annulus(0.036, 0.04, 0.1)
+    bottom = trimesh.creation.cylinder(0.04, 0.006).apply_translation((0, 0, -0.047))
+    handle = trimesh.creation.torus(0.03, 0.006)
+    handle.apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    )
+    handle.apply_translation((0.055, 0, 0))
+    return trimesh.util.concatenate([wall, bottom, handle])
+
+
+def bottle() -> trimesh.Trimesh:
+    body = trimesh.creation.cylinder(0.035, 0.16)
+    neck = trimesh.creation.cylinder(0.013, 0.06).apply_translation((0, 0, 0.11))
+    return trimesh.util.concatenate([body, neck])
 
 
 THINGS = {
@@ -78,8 +88,7 @@ def meshes(metric_scans):
 def session_of(system, views: int, start: int = 0, **more) -> nextview.Session:
     """A session that does not stop before so many views."""
     return replace(system, stopping=FixedLength(max_views=views)).session(
-        start=start,
-        **more,
+        start=start, **more
     )
 
 
@@ -103,12 +112,7 @@ def placed(name: str, yaw: float, at=SPOT) -> np.ndarray:
 
 
 def frame_of(
-    name: str,
-    pose: np.ndarray,
-    camera: np.ndarray,
-    seed=0,
-    sigma=0.001,
-    posed=True,
+    name: str, pose: np.ndarray, camera: np.ndarray, seed=0, sigma=0.001, posed=True
 ) -> Frame:
     """A noisy depth frame of a scan on the table."""
     scan = THINGS[name]().apply_translation(ORIGIN).apply_transform(pose)
@@ -134,10 +138,7 @@ def test_a_pose_is_where_the_thing_is_in_the_world(system, name):
     for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
         session.update(
             frame_of(
-                name,
-                true,
-                pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))),
-                seed,
+                name, true, pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))), seed
             )
         )
         result = session.result
@@ -180,8 +181,7 @@ def test_simulated_cameras_give_it_in_the_object_frame(system, meshes, name):
     degrees, millimetres = off_by(result.pose, true, name)
     assert millimetres < 5
     np.testing.assert_allclose(
-        sum(each.probability for each in result.pose_candidates),
-        1,
+        sum(each.probability for each in result.pose_candidates), 1
     )
     if name in ("block", "mug"):
         assert degrees < 2 * result.pose_uncertainty.degrees
@@ -196,41 +196,6 @@ def test_simulated_cameras_give_it_in_the_object_frame(system, meshes, name):
     assert result.pose_uncertainty.degrees < 7
 
 
-def test_the_last_view_changes_nothing_where_nothing_is_seen(system, meshes):
-    session = session_of(system, 3, start=3)
-    camera = nextview.SimulatedCamera(meshes["mug"])
-    seen = camera.observe(system.sphere.poses[3])
-    first = session.update(seen)
-    empty = replace(seen, depth=np.zeros_like(seen.depth), pose=system.sphere.poses[9])
-    second = session.update(empty)
-    assert second.joint is first.joint
-    np.testing.assert_array_equal(first.belief, second.belief)
-    third = session.update(camera.observe(system.sphere.poses[12]))
-    assert third.joint is not first.joint
-    assert session.result.answer == "mug"
-
-
-def test_views_are_judged_together_once_an_update(known, monkeypatch):
-    recogniser = recogniser_of(known)
-    asked = []
-    explained = VerifiedRecogniser.explained
-
-    def counted(self, observations):
-        asked.append(len(observations))
-        return explained(self, observations)
-
-    monkeypatch.setattr(VerifiedRecogniser, "explained", counted)
-    system = nextview.load(models=known, threads=1, recogniser=recogniser)
-    session = session_of(system, 3, distance=0.5)
-    true = placed("carton", 0.1)
-    for around in (20, 110, 200):  # the object frame gets better by each
-        session.update(frame_of("carton", true, pose_at(20, around, 0.5, SPOT), around))
-    assert session.object.revision > 0
-    # once more where the segmentation leaves open what the object is
-    assert sorted(set(asked)) == [1, 2, 3]
-    assert len(asked) <= 6
-
-
 def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     mug_of_no_size = replace(meshes["mug"], unit=None)
     result = system.recognise(mug_of_no_size, seed=2)
@@ -238,12 +203,10 @@ def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     assert result.pose_candidates == ()
     assert "not known in metres" in result.why_no_pose
     plain = nextview.load(
-        models=known,
-        recogniser=TaughtRecogniser(known / "memory.json", 1),
+        models=known, recogniser=TaughtRecogniser(known / "memory.json", 1)
     )
     np.testing.assert_array_equal(
-        plain.recognise(mug_of_no_size, seed=2).views[0].belief,
-        result.views[0].belief,
+        plain.recognise(mug_of_no_size, seed=2).views[0].belief, result.views[0].belief
     )
 
 
@@ -258,31 +221,6 @@ def test_things_without_geometry_are_recognised_by_features(mixed_memory, knobs)
     assert system.recognise(knob, seed=2).pose is not None
 
 
-@pytest.mark.parametrize("turned", [(2.2, -0.5, 1.1), (1.0, 0.3, 2.0)])
-def test_a_thing_in_a_gripper_is_named_and_placed(system, turned):
-    true = placed("mug", 0.0)
-    turn = Rotation.from_rotvec(turned).as_matrix()
-    true[:3, :3] = turn
-    true[:3, 3] = (0.4, -0.25, 0.5) - turn @ (THINGS["mug"]().bounds.mean(0) + ORIGIN)
-
-    held = ObservedObject(support=False)
-    session = session_of(system, 2, object=held, distance=0.5)
-    scan = THINGS["mug"]().apply_translation(ORIGIN).apply_transform(true)
-    for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
-        camera = pose_at(up, around, 0.5, (0.4, -0.25, 0.5))
-        depth, _ = cast([scan, TABLE], camera)
-        # of the arm and the table nothing is in the mask
-        mask = cast([scan], camera)[0] > 0
-        noise = 0.001 * depth**2 * np.random.default_rng(seed).normal(size=depth.shape)
-        measured = np.where(depth > 0, depth + noise, 0).astype(np.float32)
-        session.update(Frame(measured, INTRINSICS, camera, mask=mask, pixel_centre=0.5))
-
-    assert session.result.answer == "mug"
-    degrees, millimetres = off_by(session.result.pose, true, "mug")
-    assert degrees < 5
-    assert millimetres < 2.5
-
-
 def test_an_object_that_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     recogniser = recogniser_of(known)
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
@@ -290,36 +228,17 @@ def test_an_object_that_no_scan_explains_is_unknown_with_a_p_value(known, meshes
         [box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))]
     )
     result = system.recognise(
-        make_mesh(stranger.vertices, stranger.faces, unit="m"),
-        seed=1,
+        make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1
     )
     assert result.unknown
-    assert (result.answer, result.pose, result.novelty) == (
-        None,
-        None,
-        0.0,
-    )
+    assert (result.answer, result.pose, result.novelty) == (None, None, 0.0)
     taught = system.recognise(meshes["mug"], seed=1)
     assert (taught.answer, taught.unknown) == ("mug", False)
     assert taught.novelty > 0.5
     never = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0)
     assert not never.recognise(
-        make_mesh(stranger.vertices, stranger.faces, unit="m"),
-        seed=1,
+        make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1
     ).unknown
-
-
-@pytest.mark.parametrize(
-    "again",
-    [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
-)
-def test_a_copy_of_a_session_with_geometry_continues_identically(system, meshes, again):
-    session = session_of(system, 2, start=5)
-    camera = nextview.SimulatedCamera(meshes["block"])
-    session.update(camera.observe(session.pose))
-    other = again(session)
-    assert len(other.views) == 1
-    assert repr(other.run(camera)) == repr(session.run(camera))
 
 
 def test_errors_are_as_large_as_the_uncertainty_says(system):
@@ -334,10 +253,7 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
         session = session_of(system, 2, distance=0.5)
         for around in rng.uniform([-50, 0], [0, 50]):
             camera = pose_at(
-                rng.uniform(25, 50),
-                around,
-                0.5,
-                np.add(SPOT, (0, 0, 0.04)),
+                rng.uniform(25, 50), around, 0.5, np.add(SPOT, (0, 0, 0.04))
             )
             shown = frame_of(name, true, camera, seed=episode, sigma=0.0015)
             believed = camera.copy()
@@ -405,94 +321,7 @@ def test_json_and_the_table_tell_the_pose(known, metric_scans, capsys):
     assert "Its pose is not known: the scale" in capsys.readouterr().out
 
 
-def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_path):
-    result = system.recognise(meshes["mug"], start=12)
-    vertices, faces = result.posed_surface
-    seen = result.views[0].observation
-    rays = (
-        PinholeCamera.of(seen.intrinsics, seen.depth.shape).rays.reshape(-1, 3)
-        @ seen.pose[:3, :3].T
-    )
-    depth, _ = RayCaster([(vertices, faces)]).cast(seen.pose[:3, 3], rays)
-    shown = np.isfinite(depth).reshape(seen.depth.shape)
-    assert (shown & (seen.depth > 0)).sum() > 0.95 * (shown | (seen.depth > 0)).sum()
-
-    drawn = [
-        axes
-        for axes in result.plot(tmp_path / "mug.png").axes
-        if axes.findobj(ContourSet)
-    ]
-    assert len(drawn) == len(result.views)
-
-
 # How sure it is
-
-
-def candidate(
-    turn=(0, 0, 0),
-    at=(0, 0, 0),
-    probability=1.0,
-    symmetry=None,
-    degrees=0.0,
-    millimetres=0.0,
-):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
-    pose[:3, 3] = at
-    return PoseCandidate(
-        "thing",
-        0,
-        pose,
-        probability,
-        degrees,
-        millimetres,
-        symmetry=symmetry,
-    )
-
-
-class About:
-    """A symmetry about an axis."""
-
-    def __init__(self, axis, order):
-        self.axis, self.order = axis, order
-
-
-def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
-    both = [
-        candidate(probability=0.75, degrees=1.0, millimetres=2.0),
-        candidate((0, 0, 90), (0.01, 0, 0), 0.25),
-    ]
-    found = uncertainty_of(both, camera=3.0)
-    assert found.degrees == pytest.approx(np.sqrt(0.75 * 1 + 0.25 * 90**2))
-    assert found.millimetres == pytest.approx(np.sqrt(0.75 * 4 + 0.25 * 100 + 9))
-
-
-@pytest.mark.parametrize(
-    ("symmetry", "turn", "left"),
-    [
-        (None, (0, 0, 170), 170),
-        ((), (0, 0, 170), 170),
-        ((About((0, 0, 1), 2),), (0, 0, 170), 10),
-        ((About((0, 0, 1), 4),), (0, 0, 100), 10),
-        ((About((0, 0, 1), 0),), (0, 0, 123), 0),
-        ((About((0, 0, 1), 0),), (0, 20, 0), 20),
-        ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (180, 0, 0), 0),
-        ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (0, 175, 0), 5),
-        (
-            (About((0, 0, 1), 2), About((1, 0, 0), 2)),
-            (0, 175, 0),
-            5,
-        ),  # half a turn about y follows
-        ((About((0, 0, 1), 4), About((1, 0, 0), 4)), (90, 0, 0), 0),  # a cube
-        ((About((0, 0, 1), 0), About((1, 0, 0), 0)), (10, 20, 30), 0),  # a ball
-    ],
-)
-def test_turns_that_change_nothing_are_no_uncertainty(symmetry, turn, left):
-    both = [
-        candidate(probability=0.0, symmetry=symmetry),
-        candidate(turn, probability=1.0, symmetry=symmetry),
-    ]
-    assert uncertainty_of(both).degrees == pytest.approx(left, abs=1e-5)
 
 
 def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
@@ -526,48 +355,3 @@ def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     assert "the pose of" in own[0].words
     with pytest.raises(UsageError, match=r"\(V, 4, 4\), not \(4, 4\)"):
         session.ranked(mine[0])
-
-
-def test_nothing_is_ranked_where_nothing_can_be_foreseen(known, meshes):
-    session = nextview.load(models=known, threads=1).session()
-    exact = SimulatedCamera(meshes["mug"]).observe(session.pose)
-    session.update(replace(exact, radius=None))
-    with pytest.raises(
-        SessionError,
-        match="no taught thing of known geometry explains them",
-    ):
-        session.ranked()
-    plain = nextview.load(threads=1)
-    policy = DiscriminateGeometry(plain.sphere)
-    with pytest.raises(SessionError, match="needs things of known geometry"):
-        nextview.Session(plain.models, policy, plain.sphere)
-
-
-@pytest.mark.parametrize("scale", [0.01, 0.1, 5.0])
-def test_an_object_of_another_order_of_size_is_unknown(known, scale):
-    recogniser = recogniser_of(known)
-    system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
-    carton = THINGS["carton"]()
-    carton.apply_scale(scale)
-    result = system.recognise(
-        make_mesh(carton.vertices, carton.faces, unit="m"),
-        start=10,
-    )
-    assert result.unknown or not result.seen
-    assert result.pose is None
-
-
-def test_a_pose_is_as_sure_as_those_that_look_the_same():
-    half = About((0, 0, 1), 2)
-    first, opposite = (
-        candidate(probability=0.5),
-        candidate((0, 0, 180), probability=0.3),
-    )
-    beside = candidate((0, 0, 90), probability=0.2)
-    assert share_of_likeliest([first, opposite, beside]) == pytest.approx(0.5)
-    known = [replace(each, symmetry=(half,)) for each in (first, opposite, beside)]
-    assert share_of_likeliest(known) == pytest.approx(0.8)
-    moved = candidate(at=(0.02, 0, 0), probability=0.5)
-    assert share_of_likeliest([first, moved]) == pytest.approx(0.5)
-    other = replace(beside, thing="another")
-    assert share_of_likeliest([first, other]) == 1

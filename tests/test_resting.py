@@ -23,17 +23,6 @@ def cup(height=2.0, top=1.0, bottom=0.8):
     return shape
 
 
-def with_handle():
-    return Trimesh(
-        *_joined(cup(), creation.box((0.9, 0.25, 1.2)).apply_translation((1.2, 0, 0)))
-    )
-
-
-def _joined(first, second):
-    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
-    return np.concatenate([first.vertices, second.vertices]), faces
-
-
 def plate(points):
     """A sheet without thickness, cut along a polygon that is seen whole from its first corner."""
     fan = [(0, k, k + 1) for k in range(1, len(points) - 1)]
@@ -94,48 +83,6 @@ def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(
 )
 def test_a_ball_and_a_die_have_one_pose(shape):
     assert len(resting_poses(of(shape))) == 1
-
-
-def test_what_falls_on_its_side_in_most_throws_has_that_pose():
-    """Dropped from random directions, by brute force: what points down decides on which face it
-    lands.
-    """
-    rng = np.random.default_rng(3)
-    for shape in (cup(1.5), creation.cylinder(0.4, 2, sections=SIDE), with_handle()):
-        mesh = of(shape)
-        ups = resting_poses(mesh)[:, 2]
-        hull = Trimesh(mesh.vertices).convex_hull
-        landed = [_rest(hull, direction) for direction in rng.normal(size=(100, 3))]
-        tilts = np.arccos(np.clip(landed @ np.array([0, 0, 1.0]), -1, 1))
-        covered = np.abs(tilts[:, None] - np.arccos(ups[:, 2])[None]).min(
-            1
-        ) < np.radians(20)
-        assert covered.mean() > 0.7
-
-
-def _rest(hull, down):
-    """The direction up after a thing fell with ``down`` ahead: it rolls over edges until its
-    weight is above a face.
-    """
-    for _ in range(100):
-        face = int((hull.face_normals @ down / np.linalg.norm(down)).argmax())
-        corners, normal = hull.triangles[face], hull.face_normals[face]
-        foot = hull.center_mass + normal * ((corners[0] - hull.center_mass) @ normal)
-        edges = np.roll(corners, -1, 0) - corners
-        inside = np.cross(edges, foot - corners) @ normal
-        if inside.min() >= -1e-9:
-            return -normal
-        worst = int(inside.argmin())
-        pair = (hull.face_adjacency == face).any(1)
-        shared = hull.face_adjacency_edges[pair]
-        ends = {
-            tuple(np.round(corners[worst], 6)),
-            tuple(np.round(corners[(worst + 1) % 3], 6)),
-        }
-        for faces, edge in zip(hull.face_adjacency[pair], shared, strict=True):
-            if {tuple(np.round(point, 6)) for point in hull.vertices[edge]} == ends:
-                down = hull.face_normals[int(faces[faces != face][0])]
-    return -normal
 
 
 @pytest.mark.parametrize("sides", [(3.0, 2.0, 0.8), (2.0, 1.5, 1.0), (1.0, 0.7, 1.3)])

@@ -8,15 +8,12 @@ import trimesh
 from factories import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 
 from nextview.data.samples import sample_mesh
-from nextview.errors import ObservationError
-from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.facets import Noise
 from nextview.sensing.planes import Plane, sample
 from nextview.sensing.walls import find_walls
 
 UP = np.array([0, 0, 1.0])
-EXACT = Noise(np.ones(1), np.zeros(1))
 FLOOR = box((12, 12, 0.02), (0, 0, -0.01))
 FAR_WALL = box((0.02, 12, 3), (-3.0, 0, 1.4))
 NEAR_WALL = box((0.02, 12, 3), (-0.5, 0, 1.4))
@@ -35,7 +32,6 @@ def sample_of_size(name: str, height: float, at=(0.0, 0.0, 0.0)) -> trimesh.Trim
     return trimesh.Trimesh(vertices, mesh.faces, process=False)
 
 
-CHAIR = sample_of_size("chair", 0.9)
 CUPBOARD = box((0.4, 1.2, 0.9), (0, 0, 0.45))
 DESK = trimesh.util.concatenate(
     [box((0.8, 1.5, 0.04), (0, 0, 0.7))]
@@ -47,13 +43,6 @@ DESK = trimesh.util.concatenate(
 )
 MUG = trimesh.creation.cylinder(0.04, 0.1).apply_translation((-0.1, 0.2, 0.77))
 MONITOR = sample_of_size("monitor", 0.45, (0, 0.1, 0.72))
-BED = trimesh.util.concatenate(
-    [box((2.0, 1.5, 0.45), (0, 0, 0.225)), box((0.06, 1.5, 0.5), (-1.0, 0, 0.7))]
-)
-SOFA = trimesh.util.concatenate(
-    [box((0.9, 1.8, 0.4), (0, 0, 0.2)), box((0.2, 1.8, 0.45), (-0.35, 0, 0.62))]
-    + [box((0.9, 0.2, 0.25), (0, y, 0.52)) for y in (-0.8, 0.8)]
-)
 
 
 def frame(meshes, pose, seed=0, sigma=0.003, mask_of=None, wide=0) -> Frame:
@@ -74,11 +63,7 @@ def frame(meshes, pose, seed=0, sigma=0.003, mask_of=None, wide=0) -> Frame:
                 | np.roll(mask, -1, 1)
             )
     return Frame(
-        np.where(depth > 0, noisy, 0),
-        INTRINSICS,
-        pose,
-        mask=mask,
-        pixel_centre=0.5,
+        np.where(depth > 0, noisy, 0), INTRINSICS, pose, mask=mask, pixel_centre=0.5
     )
 
 
@@ -122,7 +107,7 @@ def test_objects_in_a_room_are_segmented_without_its_walls(walls, asked):
     assert (which == 0)[thing.sightings[0].mask].mean() > 0.95
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.003, 0.008])
+@pytest.mark.parametrize("sigma", [0.008])
 @pytest.mark.parametrize("walls", ROOMS)
 def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
     pose = pose_at(12, 20, 2.4, middle_of(CUPBOARD))
@@ -142,23 +127,9 @@ def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
     )
 
 
-def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it():
-    front = box((0.5, 3.2, 2.2), (-0.25, 0, 1.1))
-    pose = pose_at(0, 0, 1.2, (0, 0, 0.6))
-    seen = frame([front, FLOOR], pose)
-    samples = sample(seen, seen.depth > 0, EXACT)
-    assert len(find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0))) == 1
-    assert not find_walls(
-        samples,
-        Plane(UP, 0.0),
-        np.random.default_rng(0),
-        place=middle_of(front),
-    )
-
-
 @pytest.mark.parametrize("asked", ["aim", "point"])
-@pytest.mark.parametrize("behind", [1.5, 3.0, 6.0])
-@pytest.mark.parametrize("elevation", [10, 25])
+@pytest.mark.parametrize("behind", [1.5, 6.0])
+@pytest.mark.parametrize("elevation", [10])
 def test_objects_far_behind_a_table_are_ignored(elevation, behind, asked):
     mug = box((0.08, 0.08, 0.1), (0.1, 0, 0.05))
     clutter = [
@@ -213,37 +184,6 @@ def test_a_point_at_a_thing_on_a_table_names_the_thing(height):
     assert thing.warnings == []
 
 
-def test_a_wrong_pose_is_no_support_out_of_the_picture():
-    """The camera's axes are OpenGL's: no plane is level, so nothing tells where the floor is."""
-    pose = pose_at(25, 20, 1.8, (0, 0, 0.6))
-    seen = frame([DESK, NEAR_WALL], pose)
-    wrong = Frame(
-        seen.depth,
-        seen.intrinsics,
-        pose @ np.diag([1.0, -1, -1, 1]),
-        pixel_centre=0.5,
-    )
-    with pytest.raises(ObservationError):
-        ObservedObject(point=(0, 0, 0.3)).add(wrong)
-
-
-@pytest.mark.parametrize("asked", ["mask", "point", "aim"])
-@pytest.mark.parametrize("mesh", [BED, SOFA], ids=["bed", "sofa"])
-@pytest.mark.parametrize("azimuth", [10, 50])
-def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
-    target = middle_of(mesh)
-    thing = ObservedObject(point=target if asked == "point" else None)
-    scene = [mesh, FLOOR, box((0.02, 12, 3), (-1.6, 0, 1.4))]
-    thing.add(
-        frame(
-            scene,
-            pose_at(18, azimuth, 3.2, target),
-            mask_of=0 if asked == "mask" else None,
-        )
-    )
-    assert_is(thing, mesh)
-
-
 # Pieces
 
 
@@ -261,23 +201,10 @@ def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
     assert_is(thing, table)
 
 
-def test_an_occluded_object_is_not_part_of_a_nearer_one():
-    mug, carton = (
-        box((0.1, 0.3, 0.12), (0, 0, 0.06)),
-        box((0.1, 0.2, 0.3), (-0.3, 0, 0.15)),
-    )
-    thing = ObservedObject(point=middle_of(mug))
-    thing.add(
-        frame([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)), sigma=0.001)
-    )
-    _, which = cast([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)))
-    assert (which == 1)[thing.sightings[0].mask].mean() < 0.02
-
-
 # Extent
 
 
-@pytest.mark.parametrize("flying", [1, 4, 40])
+@pytest.mark.parametrize("flying", [4, 40])
 def test_flying_pixels_do_not_affect_the_size(flying):
     ball = trimesh.creation.icosphere(3, 0.04).apply_translation((0, 0, 0.04))
     clean = frame([ball, TABLE], pose_at(35, 0, 0.6, (0, 0, 0.04)), mask_of=0)
@@ -292,26 +219,6 @@ def test_flying_pixels_do_not_affect_the_size(flying):
         thing.add(seen)
         radii.append(thing.object_frame.radius)
     assert radii[1] == pytest.approx(radii[0], rel=0.03)
-
-
-RIM = trimesh.creation.annulus(0.11, 0.13, 0.03).apply_translation((0, 0, 0.015))
-KNOB = box((0.05, 0.03, 0.05), (0, 0, 0.025))
-TROUGH = trimesh.util.concatenate(
-    [box((0.7, 0.04, 0.5), (0, y, 0.25)) for y in (-0.38, 0.38)]
-    + [box((0.04, 0.8, 0.5), (x, 0, 0.25)) for x in (-0.35, 0.35)]
-    + [box((0.2, 0.2, 0.12), (0, 0, 0.06))]
-)
-
-
-@pytest.mark.parametrize("asked", ["aim", "point"])
-@pytest.mark.parametrize("name", ["trough"])
-def test_parts_within_the_outline_of_a_thing_belong_to_it(name, asked):
-    mesh = {"lid": trimesh.util.concatenate([RIM, KNOB]), "trough": TROUGH}[name]
-    ground = TABLE if name == "lid" else FLOOR
-    pose = pose_at(50, 30, 0.5 if name == "lid" else 2.0, middle_of(mesh))
-    thing = ObservedObject(point=middle_of(mesh) if asked == "point" else None)
-    thing.add(frame([mesh, ground], pose))
-    assert_is(thing, mesh)
 
 
 @pytest.mark.parametrize("azimuth", [-60, -45, -30])
@@ -329,69 +236,3 @@ def test_an_object_in_a_corner_is_not_part_of_the_walls(azimuth):
         )
     )
     assert_is(thing, crate)
-
-
-@pytest.mark.parametrize("shift", [-0.8, 0.8])
-@pytest.mark.parametrize("share", [0.0, 0.004])
-def test_with_large_noise_outlying_depths_do_not_affect_the_size(
-    share,
-    shift,
-):
-    crate = box((0.4, 0.5, 0.5), (0, 0, 0.25))
-    pose = pose_at(20, 30, 3.0, middle_of(crate))
-    seen = frame([crate, FLOOR], pose, sigma=0.008, mask_of=0)
-    # Small groups of pixels, which no look at their neighbours tells from the noise.
-    rows, columns = np.nonzero(seen.mask)
-    chosen = np.random.default_rng(1).choice(
-        len(rows),
-        int(share * len(rows) / 4),
-        replace=False,
-    )
-    depth = seen.depth.copy()
-    for down in (0, 1):
-        for right in (0, 1):
-            depth[rows[chosen] + down, columns[chosen] + right] += shift
-    thing = ObservedObject()
-    thing.add(Frame(depth, INTRINSICS, pose, mask=seen.mask, pixel_centre=0.5))
-    assert_is(thing, crate, radius=0.12)
-
-
-@pytest.mark.parametrize("wide", [0, 2])
-@pytest.mark.parametrize("azimuth", [100, 130, -110])
-def test_a_handle_behind_the_edge_of_its_mug_is_kept_by_a_mask(azimuth, wide):
-    body = trimesh.creation.cylinder(0.04, 0.1).apply_translation((0, 0, 0.05))
-    upright = trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0), (0, 0, 0))
-    handle = trimesh.creation.torus(0.028, 0.005).apply_transform(upright)
-    handle.apply_translation((0.045, 0, 0.05))
-    scene = [trimesh.util.concatenate([body, handle]), TABLE]
-    thing = ObservedObject()
-    thing.add(
-        frame(scene, pose_at(30, azimuth, 0.5, (0, 0, 0.05)), mask_of=0, wide=wide)
-    )
-    assert_is(thing, scene[0], radius=0.05)
-
-
-@pytest.mark.parametrize(
-    "mesh",
-    [BED, SOFA, DESK, CUPBOARD],
-    ids=["bed", "sofa", "desk", "cupboard"],
-)
-@pytest.mark.parametrize("sigma", [0.001, 0.008])
-def test_depth_is_distinguished_from_range_in_a_room(mesh, sigma):
-    target = middle_of(mesh)
-    pose = pose_at(20, 25, 2.6, target)
-    right = frame([mesh, FLOOR, FAR_WALL], pose, sigma=sigma)
-    ObservedObject().add(right)
-    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
-    rays = np.stack([column, row, np.ones(SHAPE)], -1) @ np.linalg.inv(INTRINSICS).T
-    floor = frame([FLOOR], look_at_origin(np.radians(60), 0, 1.5), sigma=0.001)
-    range_image = floor.depth * np.linalg.norm(rays, axis=-1)
-    with pytest.raises(ObservationError, match="a range"):
-        ObservedObject().add(
-            Frame(
-                range_image.astype(np.float32),
-                INTRINSICS,
-                floor.pose,
-                pixel_centre=0.5,
-            )
-        )

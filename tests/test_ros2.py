@@ -14,7 +14,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
-from factories import TABLE, box, cast, pose_at
+from factories import box, pose_at
 from ros_messages import (
     SHAPE,
     STORE,
@@ -30,45 +30,20 @@ from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.captured.transforms import NoTransformError
-from nextview.data.samples import sample_mesh
-from nextview.errors import ModelError, NextviewError, ObservationError
-from nextview.sensing import Frame, ObservedObject
+from nextview.errors import ObservationError
 
 ROS = Path(__file__).parents[1] / "ros2"
 sys.path.insert(0, str(ROS / "nextview_ros"))
 from nextview_ros import conversion
 
-ROS_MODULES = (
-    "geometry_msgs",
-    "geometry_msgs.msg",
-    "moveit_msgs",
-    "moveit_msgs.msg",
-    "nextview_msgs",
-    "nextview_msgs.action",
-    "nextview_msgs.msg",
-    "nextview_msgs.srv",
-    "rcl_interfaces",
-    "rcl_interfaces.msg",
-    "rclpy",
-    "rclpy.action",
-    "rclpy.callback_groups",
-    "rclpy.executors",
-    "rclpy.node",
-    "rclpy.qos",
-    "sensor_msgs",
-    "sensor_msgs.msg",
-    "shape_msgs",
-    "shape_msgs.msg",
-    "std_srvs",
-    "std_srvs.srv",
-    "std_msgs",
-    "std_msgs.msg",
-    "tf2_msgs",
-    "tf2_msgs.msg",
-    "vision_msgs",
-    "vision_msgs.msg",
-)
+ROS_MODULES = """
+geometry_msgs geometry_msgs.msg moveit_msgs moveit_msgs.msg nextview_msgs
+nextview_msgs.action nextview_msgs.msg nextview_msgs.srv rcl_interfaces
+rcl_interfaces.msg rclpy rclpy.action rclpy.callback_groups rclpy.executors
+rclpy.node rclpy.qos sensor_msgs sensor_msgs.msg shape_msgs shape_msgs.msg
+std_srvs std_srvs.srv std_msgs std_msgs.msg tf2_msgs tf2_msgs.msg vision_msgs
+vision_msgs.msg
+"""
 """What the node imports from ROS."""
 
 
@@ -98,9 +73,7 @@ def recorded(folder, views):
                     else what
                 )
                 bag.write(
-                    connections[topic],
-                    k,
-                    STORE.serialize_cdr(what, topics[topic]),
+                    connections[topic], k, STORE.serialize_cdr(what, topics[topic])
                 )
     found = {topic: [] for topic in topics}
     with Reader(folder) as bag:
@@ -130,11 +103,7 @@ def depth():
 @pytest.mark.parametrize("padding", [0, 12])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_a_recorded_image_equals_the_camera_image(
-    tmp_path,
-    depth,
-    encoding,
-    padding,
-    big,
+    tmp_path, depth, encoding, padding, big
 ):
     pose = pose_at(40, 70, 0.7, (0.4, 0.1, 0.0), turn=(3, -2, 5))
     given = (
@@ -150,9 +119,7 @@ def test_a_recorded_image_equals_the_camera_image(
     ((image, info, transform),) = recorded(tmp_path / "bag", [written])
     frame = conversion.frame_of(image, info, transform)
     np.testing.assert_allclose(
-        frame.depth,
-        depth,
-        atol=6e-4 if encoding == "16UC1" else 0,
+        frame.depth, depth, atol=6e-4 if encoding == "16UC1" else 0
     )
     np.testing.assert_allclose(frame.pose, pose, atol=1e-9)
     # the first pixel's centre is at 0.5 here
@@ -163,12 +130,10 @@ def test_rectified_images_have_the_intrinsics_of_p():
     p = np.array([[250.0, 0, 81, -12.0], [0, 250, 61, 0], [0, 0, 1, 0]])
     info = info_message(d=(0.1, -0.2, 0, 0, 0), p=p)
     np.testing.assert_array_equal(
-        conversion.intrinsics_of(info, rectified=True),
-        p[:, :3],
+        conversion.intrinsics_of(info, rectified=True), p[:, :3]
     )
     with pytest.raises(
-        ObservationError,
-        match=r"distorts \(plumb_bob\): use rectified images",
+        ObservationError, match=r"distorts \(plumb_bob\): use rectified images"
     ):
         conversion.intrinsics_of(info)
 
@@ -203,50 +168,6 @@ def test_messages_that_cannot_be_used_are_refused(depth, wrong, match):
         conversion.frame_of(**made)
 
 
-def views_of_a_chair():
-    """Depth in millimetres, pinhole matrix and pose of three views of a chair on a table."""
-    mesh = sample_mesh("chair")
-    chair = box((0.1, 0.1, 0.1))
-    chair.vertices, chair.faces = 0.12 * mesh.vertices, mesh.faces
-    chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
-    k = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
-    centres = k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    for azimuth in (20, 110, 250):
-        pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
-        depth, _ = cast((TABLE, chair), pose, centres, (480, 640))
-        yield np.rint(1000 * depth).astype(np.uint16), k, pose
-
-
-def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
-    """Views that are recorded and played back end as the same frames without ROS do."""
-    views = list(views_of_a_chair())
-    messages = [
-        (
-            image_message(depth, "16UC1"),
-            info_message(k, depth.shape),
-            transform_message(pose),
-        )
-        for depth, k, pose in views
-    ]
-    ends = []
-    for given in (
-        [Frame(*view) for view in views],
-        [conversion.frame_of(*each) for each in recorded(tmp_path / "bag", messages)],
-    ):
-        session = nextview.load(threshold=1.0, max_views=3).session(
-            object=ObservedObject(life_size=False)
-        )
-        for frame in given:
-            session.update(frame)
-        ends.append(session)
-    assert ends[1].result.answer == "chair"
-    np.testing.assert_allclose(
-        ends[1].views[-1].belief,
-        ends[0].views[-1].belief,
-        atol=1e-5,
-    )
-
-
 # What the node tells of an object, with stand-ins for the messages
 
 
@@ -277,8 +198,7 @@ def outputs(monkeypatch):
     def hypothesis():
         told = SimpleNamespace(pose=pose_message(), covariance=np.zeros(36))
         return SimpleNamespace(
-            hypothesis=SimpleNamespace(class_id="", score=0.0),
-            pose=told,
+            hypothesis=SimpleNamespace(class_id="", score=0.0), pose=told
         )
 
     def collision_object(**fields):
@@ -292,7 +212,7 @@ def outputs(monkeypatch):
         )
 
     collision_object.ADD, collision_object.REMOVE = b"\x00", b"\x01"
-    for name in ROS_MODULES:
+    for name in ROS_MODULES.split():
         monkeypatch.setitem(sys.modules, name, MagicMock())
     stand_ins = {
         "geometry_msgs": {
@@ -331,9 +251,7 @@ def seen_at(centre, **fields):
 def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
     poses = [np.eye(4), np.eye(4)]
     poses[0][:3, :3] = Rotation.from_euler(
-        "xyz",
-        [20, -35, 110],
-        degrees=True,
+        "xyz", [20, -35, 110], degrees=True
     ).as_matrix()
     poses[0][:3, 3] = 0.4, -0.1, 0.02  # the scan's origin, not its middle
     candidates = [
@@ -384,8 +302,7 @@ def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(ou
         [np.pi**2 / 3] * 3
     )  # of an even angle, +- 180 degrees
     np.testing.assert_allclose(
-        matrix_of(told.results[0].pose.pose)[:3, 3],
-        (0.3, 0.2, 0.1),
+        matrix_of(told.results[0].pose.pose)[:3, 3], (0.3, 0.2, 0.1)
     )
 
     told = outputs.detection_of(seen_at((0, 0, 0.2), answer=None), "world")
@@ -430,240 +347,6 @@ def mesh_of(told):
     vertices = [[vertex.x, vertex.y, vertex.z] for vertex in mesh.vertices]
     faces = [triangle.vertex_indices for triangle in mesh.triangles]
     return trimesh.Trimesh(vertices, faces, process=False)
-
-
-# The node, with stand-ins for ROS
-
-
-class RosNode:
-    """What the node uses of ``rclpy.node.Node``."""
-
-    get_clock = get_logger = MagicMock()
-    create_publisher = create_subscription = MagicMock()
-    create_service = create_timer = MagicMock()
-
-    def __init__(self, name, parameter_overrides):
-        self.values = dict(parameter_overrides)
-
-    def declare_parameter(self, name, default, descriptor):
-        self.values.setdefault(name, default)
-
-    def get_parameter(self, name):
-        return SimpleNamespace(value=self.values[name])
-
-
-@pytest.fixture
-def node_with(monkeypatch):
-    """Make a node with some parameters."""
-    for name in ROS_MODULES:
-        monkeypatch.setitem(sys.modules, name, MagicMock())
-    monkeypatch.setattr(sys.modules["rclpy.node"], "Node", RosNode)
-    ours = [
-        f"nextview_ros.{name}"
-        for name in ("inputs", "outputs", "parameters", "following", "node")
-    ]
-    for name in ours:
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    made = importlib.import_module("nextview_ros.node").NextviewNode
-    yield lambda **given: made(parameter_overrides={"patience": 0.1} | given)
-    for name in ours:
-        sys.modules.pop(name, None)
-
-
-@pytest.fixture
-def node(node_with):
-    """A node with the usual models."""
-    return node_with()
-
-
-def trigger():
-    return SimpleNamespace(success=None, message=None)
-
-
-A_GOAL = SimpleNamespace(
-    near=[], region=[], mask=[], in_air=False, distance=0.5, threshold=0.0, max_views=0
-)
-
-
-def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
-    for begin in (lambda goal: None, node.begin_session):
-        begin(A_GOAL)
-        answer = node.failed(None, trigger())
-        assert answer.success is False
-        assert "call look" in answer.message
-        assert not node.busy.locked()
-
-
-def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
-    node.begin_session(A_GOAL)
-    # before the first look there is none
-    monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)
-    answer = node.answer(trigger(), lambda: "")
-    assert answer.success is False
-    assert answer.message
-
-
-def test_models_of_classes_alone_recognise_an_object_and_have_no_scene(
-    node_with, monkeypatch
-):
-    given = {"models": ["modelnet10"], "threshold": 1.0, "max_views": 3}
-    node = node_with(track_rate=0.0, **given)
-    node.tell_tf()
-    node.begin_session(A_GOAL)
-    for number, view in enumerate(views_of_a_chair()):
-        monkeypatch.setattr(node, "frames", lambda view=view: [Frame(*view)])
-        answer = node.look(None, trigger())
-        assert answer.success, answer.message
-        assert (len(node.next_views()) > 5) == (number < 2)
-    assert node.session.result.answer == "chair"
-
-    node.session = None
-    for refused in (node.look, node.failed):
-        assert refused(None, trigger()).success is False
-    assert "things of known geometry" in node.look(None, trigger()).message
-    with pytest.raises(ModelError, match="things of known geometry"):
-        node.begin_scene(SimpleNamespace(labels=[], region=[], distance=0, max_views=0))
-
-
-def test_frames_of_one_time_are_used_together_and_alone_where_one_is_refused(node):
-    taken = []
-
-    def update(frames):
-        if "nothing" in frames:
-            raise ObservationError("it shows nothing")
-        taken.append(list(frames))
-        warning = SimpleNamespace(message="a warning")
-        return tuple(SimpleNamespace(taken=True, warnings=[warning]) for _ in frames)
-
-    node.session, node.scene = None, SimpleNamespace(update=update)
-    assert node.take_in(["left", "right"]) == (2, ["a warning"])
-    assert taken == [["left", "right"]]
-    assert node.take_in(["left", "nothing"]) == (1, ["a warning", "it shows nothing"])
-    assert taken[1:] == [["left"]]
-    assert node.take_in([]) == (0, [])
-
-
-def label_message(rows, encoding, big=0):
-    """A message of labels, (H, W), with rows that are 4 bytes longer than needed."""
-    kind = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}[encoding]
-    data = rows.astype(f"{'>' if big else '<'}{kind}").view(np.uint8)
-    data = np.pad(data, ((0, 0), (0, 4)), constant_values=9)
-    height, width = rows.shape
-    return message(
-        "sensor_msgs/msg/Image",
-        header=header("optical"),
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=big,
-        step=data.shape[1],
-        data=data.ravel(),
-    )
-
-
-@pytest.mark.parametrize(
-    ("encoding", "largest", "big"),
-    [("mono8", 255, 0), ("8UC1", 255, 1), ("mono16", 60_000, 0), ("16UC1", 60_000, 1)],
-)
-def test_labels_are_an_image_of_eight_or_sixteen_bits(encoding, largest, big):
-    rows = np.random.default_rng(0).integers(0, largest + 1, (7, 9))
-    rows[0, 0] = largest
-    given = label_message(rows, encoding, big)
-    np.testing.assert_array_equal(conversion.labels_of(given), rows)
-    with pytest.raises(ObservationError, match="a label image is encoded as mono8 or"):
-        conversion.labels_of(replace(given, encoding="32SC1"))
-    with pytest.raises(ObservationError, match="has not 20 bytes"):
-        conversion.labels_of(replace(given, data=given.data[:20]))
-
-
-# Following, with stand-ins for cameras and tracker
-
-
-class Tracked:
-    """A tracker that keeps the times of its frames."""
-
-    def __init__(self, scene):
-        self.scene, self.times, self.things = scene, [], ()
-
-    def update(self, frame, time):
-        assert time >= max(self.times, default=time)
-        self.times.append(time)
-
-    def follow(self, scene, since):
-        assert scene is self.scene
-        self.since = since
-
-
-def arrived(camera, time):
-    """An image of a camera that has just come."""
-    camera.latest = SimpleNamespace(header=header("optical", time)), None
-
-
-@pytest.fixture
-def follower(node, monkeypatch):
-    """Two cameras that are followed, and the frames without a transform."""
-    monkeypatch.setattr(nextview, "Tracker", Tracked)
-    module = sys.modules["nextview_ros.following"]
-    cameras = [
-        SimpleNamespace(namespace=name, latest=None) for name in ("left", "right")
-    ]
-    missing = set()
-
-    def frame_of(camera, image, info):
-        if camera.namespace in missing:
-            raise NoTransformError("tf has nothing")
-        return image
-
-    made = module.Follower(cameras, frame_of)
-    made.begin(SimpleNamespace(tops=(1,)))
-    return made, cameras, missing
-
-
-def times(steps):
-    """Seconds of the stamps of steps, or what is wrong with them."""
-    return [
-        str(step) if isinstance(step, NextviewError) else step.sec + step.nanosec / 1e9
-        for step in steps
-    ]
-
-
-def test_each_image_is_followed_once_in_the_order_of_the_stamps(follower):
-    made, (left, right), _ = follower
-    assert times(made.steps(10.0)) == []
-    arrived(left, 10.25)
-    arrived(right, 10.0)
-    assert times(made.steps(10.3)) == [10.0, 10.25]
-    assert times(made.steps(10.3)) == []
-    arrived(right, 10.125)  # late: an image of the other camera was followed
-    assert times(made.steps(10.3)) == []
-    arrived(right, 10.5)
-    assert times(made.steps(10.5)) == [10.5]
-    assert made.tracker.times == [10.0, 10.25, 10.5]
-
-
-def test_an_image_waits_for_its_transform_but_not_for_ever(follower):
-    made, (left, _), missing = follower
-    missing.add("left")
-    arrived(left, 10.0)
-    assert times(made.steps(10.0)) == []
-    arrived(left, 10.125)
-    missing.clear()
-    assert times(made.steps(10.125)) == [10.0]  # newer ones do not overtake it
-    missing.add("left")
-    assert times(made.steps(10.2)) == []
-    assert times(made.steps(10.5)) == ["tf has nothing"]
-    assert times(made.steps(10.5)) == []
-
-
-def test_a_bag_that_begins_again_is_followed_anew(follower):
-    made, (left, _), _ = follower
-    first = made.tracker
-    arrived(left, 20.0)
-    assert times(made.steps(20.0)) == [20.0]
-    arrived(left, 10.0)
-    assert times(made.steps(10.0)) == [10.0]
-    assert made.tracker is not first
-    assert made.tracker.times == [10.0]
 
 
 # What cannot be run here is at least well formed

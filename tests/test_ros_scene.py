@@ -18,11 +18,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-import trimesh
-from factories import SimulatedTable, TableCamera, camera_over, leaning, view, without
-from geometry_msgs.msg import Point
+from factories import camera_over, view, without, write_scan
 from nextview_msgs.action import LookUntilSettled
-from nextview_msgs.msg import Box
 from nextview_ros.player import PlayerNode, RecordedFrames
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -47,20 +44,11 @@ from test_scene_changes import shifted
 
 import nextview
 from nextview.sensing import Frame
-from nextview.simulation.sensor import SENSORS
 from nextview.teaching.learn import learn
 
 TAUGHT = ("cracker_box", "tomato_soup_can")
 STRANGER = "mug"
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-
-
-def write_scan(mesh, folder):
-    """Write the scan of a thing in metres; the path."""
-    path = folder / f"{mesh.name}.ply"
-    placed = mesh.vertices * mesh.metres + mesh.centre
-    trimesh.Trimesh(placed, mesh.faces, process=False).export(path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -202,49 +190,6 @@ def test_a_goal_looks_until_the_table_is_settled(robot, camera):
     assert names["unknown"] not in robot.objects
 
 
-def test_looks_without_a_goal_go_to_the_scene_and_a_goal_begins_anew(robot):
-    _, result = robot.goal(LookUntilSettled, max_views=1)
-    assert robot.look().success
-    assert wait(result).result.views == 1
-    again = robot.look()
-    assert not again.success
-    assert "this picture was handed in before" in again.message
-    robot.pose = view(110)
-    until(lambda: "2 views" in robot.look().message, "a look from there")
-    _, result = robot.goal(LookUntilSettled, max_views=1)
-    assert robot.look().success
-    assert wait(result).result.views == 1
-
-
-def test_a_view_that_cannot_be_reached_is_not_asked_for_again(robot):
-    robot.goal(LookUntilSettled, distance=0.65)
-    assert "no view was asked for" in robot.failed().message
-    assert robot.look().success
-    first = robot.target()
-    heard = robot.heard["next_pose"]
-    assert robot.failed().success
-    second = robot.target(heard)
-    assert np.linalg.norm(second[:3, 3] - first[:3, 3]) > 0.05
-    left = [matrix_of(pose) for pose in robot.heard["next_poses"].poses]
-    assert min(np.linalg.norm(pose[:3, 3] - first[:3, 3]) for pose in left) > 0.05
-
-
-def test_only_the_region_is_searched(robot, camera):
-    thing = next(one for one in camera.table.things if one.name == "cracker_box")
-    low, high = thing.placed.min(0) - 0.02, thing.placed.max(0) + 0.02
-    low, high = (
-        Point(**dict(zip("xyz", corner, strict=True)))
-        for corner in (low.tolist(), high.tolist())
-    )
-    _, result = robot.goal(
-        LookUntilSettled, region=[Box(low=low, high=high)], max_views=1
-    )
-    assert robot.look().success
-    objects = wait(result).result.objects
-    assert "cracker_box" in {one.name for one in objects}
-    assert "tomato_soup_can" not in {one.name for one in objects}
-
-
 def label_image(labels, encoding="mono16"):
     """A message of labels, (H, W), in 8 or 16 bits a pixel."""
     rows = labels.astype("<u2" if encoding == "mono16" else "u1")
@@ -378,30 +323,6 @@ def test_the_transform_of_a_thing_follows_it_and_ends_where_it_is_lost(
 def is_missing(robot, number):
     """Whether a thing is not tracked any more."""
     return str(number) not in [one.id for one in robot.heard["tracked"].detections]
-
-
-def test_a_thing_that_leans_is_named(running, mine, ycb_meshes):
-    things = (
-        leaning(ycb_meshes["cracker_box"], 25, (0, 0)),
-        leaning(ycb_meshes["tomato_soup_can"], 0, (0.16, 0.02)),
-    )
-    camera = TableCamera(
-        SimulatedTable(things), SENSORS["stereo"], np.random.default_rng(1)
-    )
-
-    def see(pose):
-        return np.rint(1000 * camera.frame(pose).depth).astype(np.uint16)
-
-    intrinsics = camera.sensor.intrinsics - HALF_PIXEL
-    robot = Robot(see, intrinsics, {"depth": view(20)}, namespace="/lean")
-    running.add(robot)
-    running.add(node_with("/lean", models=[str(mine)], patience=10.0))
-    _, result = robot.goal(LookUntilSettled, max_views=1)
-    assert robot.look_when_all_is_there().success
-    objects = wait(result).result.objects
-    (found,) = [one for one in objects if one.name == "cracker_box"]
-    assert found.confident
-    assert is_in_place(camera, "cracker_box", matrix_of(found.pose.pose))
 
 
 def test_a_thing_that_is_learned_gets_its_name_in_the_frames_so_far(

@@ -3,7 +3,6 @@
 import pickle
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from factories import camera_over, view
 
@@ -56,16 +55,6 @@ def test_a_name_that_is_ruled_out_leaves_the_likeliest_other_one(
     assert not after.confident
 
     assert pickle.loads(pickle.dumps(without)).ruled_out == ("banana",)
-
-
-def test_to_rule_out_another_name_changes_nothing(ycb, banana_frame, before):
-    after = result_of(
-        ycb.without("bleach_cleanser").without("wood_block"), banana_frame
-    )
-    assert after.answer == "banana"
-    assert after.novelty == before.novelty
-    assert after.doubt == before.doubt
-    np.testing.assert_array_equal(after.pose, before.pose)
 
 
 def test_if_all_names_are_ruled_out_the_object_is_unknown(ycb, banana_frame):

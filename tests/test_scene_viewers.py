@@ -84,9 +84,7 @@ def test_a_recording_has_things_and_cameras_where_they_are(made, camera):
     for number, frame in enumerate(scene.frames, 1):
         where = rows[f"world/cameras/{number}", "Transform3D:translation", number]
         np.testing.assert_allclose(
-            np.ravel(where),
-            frame.camera_to_world[:3, 3],
-            atol=1e-6,
+            np.ravel(where), frame.camera_to_world[:3, 3], atol=1e-6
         )
     assert (f"world/objects/{before['banana']}", "Clear:is_recursive", 3) in rows
 
@@ -113,9 +111,7 @@ def test_a_page_has_things_and_cameras_where_they_are(made, camera):
         for number, frame in enumerate(scene.frames, 1):
             handle = server.scene.get_handle_by_name(f"/cameras/{number}")
             np.testing.assert_allclose(
-                handle.position,
-                frame.camera_to_world[:3, 3],
-                atol=1e-6,
+                handle.position, frame.camera_to_world[:3, 3], atol=1e-6
             )
         assert server.scene.get_handle_by_name(f"/objects/{before['banana']}") is None
     finally:

@@ -6,18 +6,10 @@ from factories import camera_over, view
 
 from nextview.errors import ObservationError
 from nextview.scene.scene import Scene
-from nextview.segmentation.features import (
-    PICTURE_CHANNELS,
-    features,
-    largest_planes,
-    quarter_turns,
-    shrink,
-    surface_normals,
-    turned,
-)
+from nextview.segmentation.features import shrink
 from nextview.segmentation.instances import LearnedSegmenter, instances_of
 from nextview.segmentation.network import AFFINITY_STEPS as STEPS
-from nextview.segmentation.parting import pair_slices, part, sharpen
+from nextview.segmentation.parting import pair_slices, part
 from nextview.sensing.frame import Frame
 
 INTRINSICS = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -29,71 +21,6 @@ def level_frame(depth):
     return Frame(
         depth, np.array([[500.0, 0, width / 2], [0, 500, height / 2], [0, 0, 1]])
     )
-
-
-def plane_frame(normal, distance):
-    """Depth of a plane ``normal @ p = -distance`` before a camera of 640 x 480 pixels."""
-    frame = Frame(np.ones((480, 640), np.float32), INTRINSICS)
-    x, y = frame.rays
-    normal = np.asarray(normal) / np.linalg.norm(normal)
-    towards = normal[0] * x[None, :] + normal[1] * y[:, None] + normal[2]
-    return frame.with_depth((-distance / towards).astype(np.float32)), normal
-
-
-def test_small_picture_lies_on_the_same_plane():
-    frame, normal = plane_frame([0.2, -0.8, -1], 0.7)
-    small = shrink(frame.depth, frame.rays)
-    assert small.depth.shape == (160, 214)
-    heights = small.points @ normal + 0.7
-    assert np.abs(heights).max() < 2e-3  # means of blocks of an inclined plane
-
-
-@pytest.mark.parametrize("shape", [(480, 640), (424, 512), (481, 643), (7, 5), (2, 2)])
-def test_small_picture_of_any_shape(shape):
-    frame = level_frame(np.full(shape, 0.8, np.float32))
-    small = shrink(frame.depth, frame.rays)
-    assert features(small, None).shape == (PICTURE_CHANNELS, *small.depth.shape)
-    np.testing.assert_allclose(small.depth[0, 0], 0.8, rtol=1e-6)
-
-
-def test_flying_pixels_are_no_mean():
-    depth = np.full((480, 640), 1.0, np.float32)
-    depth[::4, ::4] = 0.6  # one pixel of each block
-    frame = Frame(depth, INTRINSICS)
-    np.testing.assert_allclose(shrink(frame.depth, frame.rays).depth, 1.0, rtol=1e-6)
-
-
-def test_normals_are_those_of_the_plane():
-    frame, normal = plane_frame([0.1, -0.7, -1], 0.9)
-    small = shrink(frame.depth, frame.rays)
-    inside = surface_normals(small)[5:-5, 5:-5].reshape(-1, 3)
-    assert (inside @ normal).min() > np.cos(np.radians(1))
-
-
-def test_planes_of_two_levels_are_found():
-    floor, normal = plane_frame([0, -1, -1], 1.2)
-    table, _ = plane_frame([0, -1, -1], 0.7)
-    depth = floor.depth.copy()
-    depth[150:330, 200:500] = table.depth[150:330, 200:500]
-    small = shrink(depth, floor.rays)
-    found = largest_planes(small.points, surface_normals(small), small.depth > 0)
-    offsets = sorted(
-        offset for direction, offset in found[:2] if direction @ normal > 0.999
-    )
-    np.testing.assert_allclose(offsets, [0.7, 1.2], atol=0.01)
-
-
-@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
-def test_a_turned_picture_shows_the_same_points(quarters):
-    frame, _ = plane_frame([0.3, -0.8, -1], 0.7)
-    small = shrink(frame.depth, frame.rays)
-    up = np.array([0.2, -0.9, -0.4])
-    again, there = turned(small, up, quarters)
-    np.testing.assert_allclose(
-        again.points @ there, np.rot90(small.points @ up, quarters)
-    )
-    assert quarter_turns(there) == -quarters % 4
-    assert quarter_turns(turned(again, there, quarter_turns(there))[1]) == 0
 
 
 def output_of(labels, strength=6.0):
@@ -131,37 +58,6 @@ def test_parts_of_one_thing_behind_another_are_joined():
     )
     found = part(output_of(labels), np.ones(labels.shape, bool))
     assert same_partition(found, labels)
-
-
-def test_noise_in_single_pairs_changes_nothing():
-    rng = np.random.default_rng(3)
-    labels = np.zeros((60, 80), int)
-    labels[10:40, 10:35] = 1
-    labels[10:40, 35:60] = 2
-    output = output_of(labels, 3.0)
-    output[3:] += rng.normal(0, 1.5, output[3:].shape).astype(np.float32)
-    found = part(output, np.ones(labels.shape, bool))
-    sizes = np.sort(np.bincount(found[labels > 0]))[::-1]
-    assert sizes[:2].min() > 0.95 * 30 * 25
-
-
-@pytest.mark.parametrize("step", [(0, 1), (3, -3), (20, 0), (8, 8), (50, 0), (0, -70)])
-def test_pairs_are_a_step_apart(step):
-    rows, columns = np.indices((40, 60))
-    first, second = pair_slices((40, 60), *step)
-    assert rows[first].shape == (max(0, 40 - step[0]), max(0, 60 - abs(step[1])))
-    assert (rows[second] - rows[first] == step[0]).all()
-    assert (columns[second] - columns[first] == step[1]).all()
-
-
-def test_edges_follow_the_depth():
-    depth = np.full((480, 640), 1.0, np.float32)
-    depth[101:303, 203:407] = 0.8  # no multiple of the factor
-    frame = Frame(depth, INTRINSICS)
-    small = shrink(frame.depth, frame.rays)
-    labels = (small.depth < 0.9).astype(np.int64)
-    found = sharpen(labels, small, frame.depth)
-    np.testing.assert_array_equal(found == 1, depth < 0.9)
 
 
 def test_masks_and_labels_say_the_same():

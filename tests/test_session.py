@@ -61,13 +61,10 @@ def test_a_stopping_rule_of_ones_own(camera):
 
 
 @pytest.mark.parametrize(
-    ("first", "confident", "n_views"),
-    [("chair", True, 5), ("table", False, 6)],
+    ("first", "confident", "n_views"), [("chair", True, 5), ("table", False, 6)]
 )
 def test_an_object_that_is_swapped_after_the_first_view_gets_no_confident_answer(
-    first,
-    confident,
-    n_views,
+    first, confident, n_views
 ):
     cameras = [SimulatedCamera(sample_mesh(name)) for name in (first, *["chair"] * 5)]
     session = nextview.load(
@@ -91,8 +88,7 @@ def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "again",
-    [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
+    "again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))]
 )
 @pytest.mark.parametrize("policy", ["gain", "lem", "visible-gain"])
 def test_a_copy_of_a_session_continues_independently(camera, policy, again):
@@ -119,8 +115,7 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     for view in session.views:
         alone.update(view.observation)
     np.testing.assert_array_equal(
-        [v.belief for v in session.views],
-        [v.belief for v in alone.views],
+        [v.belief for v in session.views], [v.belief for v in alone.views]
     )
 
 
@@ -133,13 +128,7 @@ def test_an_unfinished_session_reports_the_current_belief(system, camera):
         before.travel,
         before.radius,
         before.views,
-    ) == (
-        None,
-        {},
-        0,
-        None,
-        (),
-    )
+    ) == (None, {}, 0, None, ())
     assert repr(before) == "nothing is seen (0 views)"
     view = session.update(camera.observe(session.pose))
     result = session.result

@@ -1,6 +1,5 @@
 """Several collections at once: a thing by its geometry, else a class, else none of them."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -69,10 +68,7 @@ def test_a_thing_is_named_with_its_pose(system, meshes, name):  # noqa: F811
 @pytest.mark.parametrize("name", ["chair", "table", "monitor"])
 @pytest.mark.parametrize("unit", ["cm", None])
 def test_a_class_is_named_where_no_thing_explains_what_is_seen(
-    system,
-    alone,
-    name,
-    unit,
+    system, alone, name, unit
 ):
     shown = replace(sample_mesh(name), unit=unit)
     result = system.recognise(shown, start=12, seed=2)
@@ -82,9 +78,7 @@ def test_a_class_is_named_where_no_thing_explains_what_is_seen(
     by_network = alone.recognise(shown, start=12, seed=2)
     ours = result.views[0].belief[4:]
     np.testing.assert_allclose(
-        ours / ours.sum(),
-        by_network.views[0].belief,
-        atol=0.02 if unit else 1e-6,
+        ours / ours.sum(), by_network.views[0].belief, atol=0.02 if unit else 1e-6
     )
 
 
@@ -94,22 +88,10 @@ def test_an_object_of_neither_kind_is_unknown(system):
         [ring, box((0.01, 0.01, 0.14), (0.09, 0, 0.07))]
     )
     result = system.recognise(
-        make_mesh(stranger.vertices, stranger.faces, unit="m"),
-        seed=1,
+        make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1
     )
     assert result.unknown
     assert (result.answer, result.pose) == (None, None)
-
-
-def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
-    session = replace(system, stopping=nextview.Stopping(1.0, 2)).session(start=3)
-    camera = nextview.SimulatedCamera(meshes["mug"])
-    session.update(camera.observe(session.pose))
-    other = pickle.loads(pickle.dumps(session))
-    # what was said of the first view is asked anew
-    other.update(camera.observe(other.pose))
-    assert len(other.views) == 2
-    assert len(session.views) == 1
 
 
 def test_incompatible_models_are_rejected(known):  # noqa: F811

@@ -25,11 +25,7 @@ def test_python_and_command_line_stop_alike(options, capsys):
     for start in range(0, 40, 14):
         main(
             [
-                "recognise",
-                str(SAMPLE.with_stem("table")),
-                "--start",
-                str(start),
-                "--json",
+                *f"recognise {SAMPLE.with_stem('table')} --start {start} --json".split(),
                 *given,
             ]
         )

@@ -9,24 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 from factories import meshed
-from safetensors.numpy import load_file, save_file
-from scipy.spatial.distance import cdist
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
 from nextview.cli.episode_table import print_episode
 from nextview.data.samples import sample_mesh
-from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
-from nextview.geometry.observation import SceneView
-from nextview.recognition.novelty import (
-    NEIGHBOUR,
-    Novelty,
-    Quantiles,
-    as_stored,
-    hidden_share,
-    read_novelty,
-)
+from nextview.recognition.novelty import Novelty, as_stored, read_novelty
 from nextview.session.result_json import episode_as_json
 
 
@@ -46,43 +35,7 @@ def units(rng, n, f):
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-# The score
-
-
-def test_the_score_agrees_with_brute_force():
-    rng = np.random.default_rng(0)
-    score, views = some_score(rng), units(rng, 20, 7)
-    # Between unit vectors the squared distance is 2 less twice their product; the rows are units up
-    # to rounding.
-    products = (
-        1 + (score.neighbours**2).sum(1) - cdist(views, score.neighbours) ** 2
-    ) / 2
-    tenth = np.sort(products, 1)[:, -NEIGHBOUR]
-    np.testing.assert_allclose(score.scores(views), (-tenth + 0.8) / 0.2, atol=1e-4)
-    np.testing.assert_allclose(
-        score.scores(views, np.arange(20) > 9)[10:],
-        (-tenth[10:] + 0.9) / 0.1,
-        atol=1e-4,
-    )
-
-
 # Files and cards
-
-
-def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distribution_says():
-    rng = np.random.default_rng(0)
-    few, many = rng.normal(3, 2, 48), rng.normal(3, 2, 100_000)
-    table = np.quantile(few, np.linspace(0, 1, 101))[None]
-    score = Quantiles(
-        table, np.array([48]), joint=True, usual=np.array([[0.0, 1.0], [0.5, 0.0]])
-    )
-    assert score.of_belief(np.array([-9.0, -8.0]), 1) == 7.0
-    assert score.of_belief(np.array([-7.0, -8.0]), 5) == 6.5
-    assert score.p_value(few.max(), 1) == 1 / 49  # no more can be said by counting
-    far = 3 + 2 * 2.5
-    assert few.max() < far
-    assert score.p_value(far, 1) == pytest.approx((many > far).mean(), abs=0.01)
-    assert score.p_value(far, 1) < 1 / 49
 
 
 def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(
@@ -106,67 +59,6 @@ def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_anothe
         path.write_bytes(content)
         with pytest.raises(ModelError):
             read_novelty(path, hashlib.sha256(content).hexdigest())
-
-
-def with_value(values, value):
-    changed = values.copy()
-    changed.flat[1 % changed.size] = value
-    return changed
-
-
-MUTATIONS = {
-    "gone": lambda values: None,
-    "one dimension less": lambda values: values[0],
-    "empty": lambda values: values[:0],
-    "complex": lambda values: values.astype(np.complex64),
-}
-OF_ONE = {
-    ("quantiles", "NaN"): lambda values: with_value(values, np.nan),
-    ("quantiles", "descending"): lambda values: values[:, ::-1],
-    ("quantiles", "a single one"): lambda values: values[:, :1],
-    ("objects", "none"): lambda values: values * 0,
-    ("objects", "two"): lambda values: np.repeat(values, 2),
-    ("neighbours", "too few"): lambda values: values[: NEIGHBOUR - 1],
-    ("neighbours", "a zero vector"): lambda values: np.vstack(
-        [values[1:], 0 * values[:1]]
-    ),
-    ("standard", "infinite"): lambda values: with_value(values, np.inf),
-    ("standard", "no deviation"): lambda values: values * (1, 0),
-    ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
-}
-
-
-def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_path):
-    path = tmp_path / "a.novelty.safetensors"
-    some_score(np.random.default_rng(7)).save(path)
-    arrays = load_file(path)
-    read_novelty(path, sha256_of(path))
-    wrong = {(name, how): f for name in arrays for how, f in MUTATIONS.items()}
-    for (name, how), change in (wrong | OF_ONE).items():
-        changed = change(arrays[name])
-        kept = {key: values for key, values in arrays.items() if key != name}
-        kept |= {} if changed is None else {name: changed}
-        ordered = {key: np.array(values, order="C") for key, values in kept.items()}
-        save_file(ordered, path)
-        with pytest.raises(ModelError):
-            read_novelty(path, sha256_of(path))
-            pytest.fail(f"{name}, {how}")
-
-
-@pytest.mark.parametrize(
-    ("beside", "share"), [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)]
-)
-def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
-    beside, share
-):
-    depth, target = np.full((60, 60), 3.0, np.float32), np.zeros((60, 60), bool)
-    # with 76 pixels of outline: 20 to each side, and 4 near a corner
-    target[20:40, 20:40] = True
-    depth[20:40, 40:] = beside
-    depth[20:40, 42:] = 5.0
-    assert hidden_share(
-        SceneView(depth, target, np.eye(4), np.eye(3))
-    ) == pytest.approx(share, abs=1e-9)
 
 
 # Sessions

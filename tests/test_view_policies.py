@@ -32,10 +32,6 @@ class Twice:
         self.asked += 1
         return int(np.flatnonzero(choice.views.free)[self.asked - 1])
 
-class NotMade:
-    def __init__(self, sphere):
-        pass
-
 class OfOneObject:
     needs = ()
     def __init__(self, sphere):
@@ -173,8 +169,6 @@ def test_a_scene_goes_where_its_policy_says(ycb, ycb_meshes):
     [
         ("targt", "no policy of a scene is called 'targt'; did you mean 'target'"),
         ("rules_of_mine:missing", r"cannot be made \(AttributeError: .*missing"),
-        ("nowhere_at_all:rule", r"cannot be made \(ModuleNotFoundError: "),
-        ("rules_of_mine:NotMade", r"NotMade cannot be made \(TypeError: .*sphere"),
         ("rules_of_mine:OfOneObject", r"views of a single object \(next_views\)"),
         ("rules_of_mine:number", "is no function"),
     ],
@@ -189,25 +183,14 @@ def test_what_is_no_policy_is_refused_at_once(ycb, policy, sentence):
     [
         (np.zeros(3), r"has to return \d+ numbers, .* not float64 of the shape \(3,\)"),
         (None, "has to return .*, not object of the shape"),
-        (1.5, "has to return .*, not float64 of the shape"),
-        (True, "has to return .*, not bool of the shape"),
-        ("here", "has to return .*, not <U4 of the shape"),
         ([[1], [2, 3]], "raised ValueError: "),
         (10_000, "chose view 10000; there are "),
-        (-1, "chose view -1; there are "),
         (np.full(40, np.nan), "values every free view as NaN"),
     ],
 )
 def test_what_is_no_choice_is_refused(seen, said, sentence):
     with pytest.raises(PolicyError, match=f"^policy mine {sentence}"):
         NamedPolicy("mine", lambda choice, rng: said).ranked(seen[1], rng())
-
-
-def test_a_view_that_is_not_free_is_refused(seen):
-    _, choice = seen
-    barred = int(np.flatnonzero(~choice.views.free)[0])
-    with pytest.raises(PolicyError, match=f"mine chose view {barred}, which is not fr"):
-        NamedPolicy("mine", lambda choice, rng: barred).ranked(choice, rng())
 
 
 def test_an_error_in_a_policy_keeps_its_traceback(seen):

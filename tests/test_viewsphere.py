@@ -4,7 +4,7 @@ pose.
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from nextview.geometry.viewsphere import (
@@ -20,16 +20,6 @@ spheres = st.builds(
     azimuths=st.integers(3, 12),
     distance=st.floats(1.1, 10),
 )
-
-
-def haversine(sphere: ViewSphere, a: int, b: int) -> float:
-    """Great-circle angle from latitudes and longitudes (Sinnott 1984)."""
-    (lat1, lon1), (lat2, lon2) = (np.radians(sphere.angles(v)) for v in (a, b))
-    h = (
-        np.sin((lat2 - lat1) / 2) ** 2
-        + np.cos(lat1) * np.cos(lat2) * np.sin((lon2 - lon1) / 2) ** 2
-    )
-    return 2 * np.arcsin(np.sqrt(min(h, 1)))
 
 
 def test_forty_views_whose_azimuth_runs_from_x_to_y_and_elevation_upwards():
@@ -65,25 +55,6 @@ def test_a_window_holds_all_rings_and_the_azimuths_beside(sphere):
             ) % sphere.azimuths
             assert steps.tolist() == [0, 1, 2]
             assert (sphere.ring[ring] == row).all()
-
-
-@given(spheres)
-def test_travel_is_the_shortest_way_over_the_unrolled_grid(sphere):
-    n = sphere.azimuths
-    for a in range(len(sphere)):
-        for b in range(len(sphere)):
-            (ra, ca), (rb, cb) = divmod(a, n), divmod(b, n)
-            ways = [np.hypot(ra - rb, ca - cb + turn * n) for turn in (-1, 0, 1)]
-            assert sphere.travel[a, b] == pytest.approx(min(ways))
-
-
-@settings(deadline=None)
-@given(spheres)
-def test_arcs_are_the_haversine_formula(sphere):
-    views = range(len(sphere))
-    expected = np.array([[haversine(sphere, a, b) for b in views] for a in views])
-    # Haversine itself is only this exact near opposite points.
-    np.testing.assert_allclose(sphere.arc, expected, atol=5e-8)
 
 
 @given(st.floats(-np.pi / 2, np.pi / 2), st.floats(-10, 10), st.floats(0.1, 100))

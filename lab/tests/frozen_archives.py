@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import trimesh
-from factories import camera_over, meshes_of, view
+from factories import camera_over, meshes_of, view, write_scan
 from PIL import Image
 
 from nextview.files import write_record
@@ -50,9 +49,7 @@ def write_archive(folder: Path) -> None:
     things = []
     for name, mesh in meshes_of((*SHOWN, OTHER)).items():
         (folder / "scans").mkdir(exist_ok=True)
-        scan = folder / f"scans/{name}.ply"
-        placed = mesh.vertices * mesh.radius + mesh.centre
-        trimesh.Trimesh(placed, mesh.faces, process=False).export(scan)
+        scan = write_scan(mesh, folder / "scans")
         digest = hashlib.sha256(scan.read_bytes()).hexdigest()
         things.append(FrozenThing(name, digest, "CC BY 4.0", "YCB"))
     write_record(folder / "things.json", things)

@@ -11,14 +11,11 @@ import pytest
 from lab_programs import main, refused
 from pipeline import benchmark
 
-from nextview.recognition.belief import Calibration, RiskBounds, Stopping
+from nextview.recognition.belief import Calibration, Stopping
 from nextview_lab.benchmark.classes import load
-from nextview_lab.benchmark.leaderboard import promised_risks
 from nextview_lab.benchmark.replay import make_specs, replay, truncate
-from nextview_lab.benchmark.report import report
 from nextview_lab.data.metrics import calibration_error
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.thesis.reproduction import page
 
 
 @pytest.fixture(scope="module")
@@ -103,23 +100,9 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
     """
     p = replace(predictions, calibration=Calibration(0.8, 0.5))
     p.save(tmp_path / "p.npz")
-    main(
-        [
-            "benchmark",
-            "classes",
-            str(tmp_path / "p.npz"),
-            str(tmp_path / "out"),
-            "--policies",
-            "lem",
-            "spread",
-            "--runs",
-            "3",
-            "--samples",
-            "20",
-            "--thresholds",
-            "0.7",
-        ]
-    )
+    line = f"benchmark classes {tmp_path / 'p.npz'} {tmp_path / 'out'} --runs 3"
+    line += " --samples 20 --thresholds 0.7 --policies lem spread"
+    main(line.split())
     found, specs = load(tmp_path / "out"), make_specs(p, runs=3, seed=0)
     stopping = Stopping.of(p.calibration, 0.7, max_views=5)
     assert stopping.threshold_decay == 0.5
@@ -173,71 +156,3 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
         samples=20,
     )
     assert half.predictions.names == both.names[1::2]
-
-
-def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
-    text = page(results / "p.npz", samples=200)
-    benchmark(results / "p.npz", tmp_path / "full", samples=200)
-    measures = pd.read_csv(tmp_path / "full" / "measures.csv").query("set == 'all'")
-    summary = measures.set_index(["policy", "threshold", "measure"])["value"]
-    tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(
-        ["policy", "threshold", "measure"]
-    )
-    for name in ("lem", "oracle-gain"):
-        row = next(
-            line
-            for line in text.split("## Every policy")[1].splitlines()
-            if line.startswith(f"| {name} |")
-        )
-        for cell, measure in zip(
-            row.split("|")[2:],
-            ["accuracy", "clean_accuracy", "n_views"],
-            strict=False,
-        ):
-            assert float(cell.split()[0]) == pytest.approx(
-                summary[name, 0.97, measure],
-                abs=0.0051,
-            )
-        test = tests.loc[(name, 0.97, "accuracy")]
-        assert (
-            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}"
-            in text
-        )
-    assert "LCM from a predicted map; no such network" in text
-
-
-def test_measured_error_rates_stand_beside_the_promised_ones(
-    predictions, tmp_path, capsys
-):
-    bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
-    replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(
-        tmp_path / "r.npz"
-    )
-    policies, rates = ("random", "lem", "oracle-gain"), tmp_path / "rates"
-    found = benchmark(
-        tmp_path / "r.npz",
-        rates,
-        policies=policies,
-        risks=(0.1, 0.2),
-        runs=4,
-        samples=50,
-    )
-    rows = pd.read_parquet(rates / "episodes.parquet")
-    risks = promised_risks(found.tables, found.settings["risks"])
-    assert {(row.policy, row.risk, row.threshold) for row in risks} == {
-        (name, *promise)
-        for name in ("random", "lem")
-        for promise in ((0.1, 0.8), (0.2, 0.7))
-    }
-    for row in risks:
-        cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
-        stopped = cell[cell.confidence >= row.threshold]
-        assert row.error == pytest.approx(
-            (stopped.answer.astype(str) != stopped.label.astype(str)).mean()
-        )
-        assert row.confident == pytest.approx(len(stopped) / len(cell))
-        assert row.low <= row.error <= row.high
-    assert any(promise.broken for promise in risks)  # the logits are noise
-    assert capsys.readouterr().out == ""  # the library prints nothing
-    report(rates)
-    assert "Promised error rates" in (rates / "report.html").read_text()

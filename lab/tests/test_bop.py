@@ -126,17 +126,10 @@ def moved_away(name):
     return lambda folder: shutil.rmtree(folder / name)
 
 
-TARGETS = "test_targets_bop19.json"
 SCENE = "test/000001"
 MISTAKES = {
     "no models": (moved_away("models"), (), "has no models"),
-    "no targets": (removed(TARGETS), (), "bop19.json: no such file"),
     "another split": (None, ("--split", "val"), "--split names one of test"),
-    "no cameras": (
-        removed(f"{SCENE}/scene_camera.json"),
-        (),
-        "scene_camera.json: no such file",
-    ),
     "no depth at all": (
         removed(f"{SCENE}/depth/000003.png", f"{SCENE}/depth/000007.png"),
         (),
@@ -144,7 +137,6 @@ MISTAKES = {
     ),
     "an unknown model": (None, ("--ids", "mug=99"), "has no model 99; it has 2, 14"),
     "an unknown thing": (None, ("--ids", "mag=14"), "knows nothing called mag"),
-    "no number": (None, ("--ids", "mug"), "NAME=NUMBER"),
 }
 
 

@@ -3,17 +3,14 @@ force and SciPy.
 """
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
 from pipeline import some_predictions
-from scipy.special import softmax
 from scipy.stats import bootstrap
 
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.recognition.belief import Calibration
-from nextview_lab.benchmark.evaluation import evaluate, fused_views
+from nextview_lab.benchmark.evaluation import evaluate
 
 RING = ViewSphere((45.0,), 3)
 
@@ -66,47 +63,6 @@ def test_accuracy_by_hand():
     assert of[3, "", "accuracy"] == (3 / 4, 4)
     assert of[3, "", "class_clean_accuracy"] == (1 / 2, 3)
     assert table["published"].isna().all()
-
-
-def test_confusion_and_calibration_by_hand():
-    found = evaluate(by_hand(), 10, np.random.default_rng(0))
-    answers = {
-        (row.n_views, row.label, row.answer): row.answers
-        for row in found.confusion.itertuples()
-    }
-    assert answers == {
-        (1, "a", "a"): 6,
-        (1, "a", "b"): 3,
-        (1, "b", "a"): 3,
-        (1, "b", "b"): 0,
-        (3, "a", "a"): 3,
-        (3, "a", "b"): 0,
-        (3, "b", "a"): 1,
-        (3, "b", "b"): 0,
-    }
-    # one view: 9 answers at 0.9, of which 6 are right; 3 at 0.6, none of them right
-    rows = found.reliability[found.reliability["n_views"] == 1]
-    np.testing.assert_allclose(
-        rows[["confidence", "accuracy", "answers"]],
-        [[0.6, 0, 3], [0.9, 6 / 9, 9]],
-        rtol=1e-6,
-    )
-    error = (9 * abs(0.9 - 6 / 9) + 3 * 0.6) / 12
-    assert score(found.fusion, n_views=1).calibration_error == pytest.approx(error)
-
-
-def test_fusing_random_views_against_every_combination():
-    rng = np.random.default_rng(2)
-    logits, labels = rng.normal(size=(30, 3, 4)), rng.integers(4, size=30)
-    right, confidence = fused_views(logits, labels, Calibration(1.5, 0.4), rng, 4)
-    for k, temperature in ((1, 1.5), (2, 1.5 * 1.4), (3, 1.5 * 1.8)):
-        # of three views, the rotations of any order hold every pair once
-        sums = np.stack(
-            [logits[:, list(views)].sum(1) for views in combinations(range(3), k)]
-        )
-        assert right[k - 1].mean() == pytest.approx((sums.argmax(2) == labels).mean())
-        belief = softmax(sums / temperature, axis=2)
-        assert confidence[k - 1].mean() == pytest.approx(belief.max(2).mean())
 
 
 def test_intervals_are_scipys():

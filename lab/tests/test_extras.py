@@ -5,17 +5,11 @@ import subprocess
 import sys
 import tomllib
 from functools import cache
-from importlib.metadata import PackageNotFoundError, packages_distributions
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
-from linked_environment import (
-    PROJECTS,
-    ROOT,
-    asked_for,
-    installation,
-    requirements_of,
-)
+from linked_environment import ROOT, installation
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -92,52 +86,6 @@ def faults(code: str, folder: str = ".") -> list[str]:
 def test_all_imports_are_declared_dependencies(path):
     folder = "lab" if path.is_relative_to(ROOT / "lab") else "."
     assert faults(path.read_text(encoding="utf-8"), folder) == []
-
-
-@pytest.mark.parametrize(
-    ("code", "wrong"),
-    [
-        ("import numpy\nfrom scipy.optimize import minimize\nimport os.path", []),
-        ("def f():\n    with extras():\n        import rerun", []),
-        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import rerun", []),
-        ("import rerun", ["rerun: imported outside of extras()"]),
-        ("import nextview_lab", ["nextview_lab: neither"]),
-        (
-            "class A:\n    def f(self):\n        from faiss import Index",
-            ["faiss: imported outside of extras()"],
-        ),
-        (
-            "try:\n    import hypothesis\nexcept ImportError:\n    pass",
-            ["hypothesis: neither"],
-        ),
-        ("with extras():\n    import pytest", ["pytest: neither"]),
-        ("import not_a_package_of_anybody", ["not_a_package_of_anybody: neither"]),
-    ],
-)
-def test_a_wrong_import_is_found(code, wrong):
-    found = faults(code)
-    assert len(found) == len(wrong)
-    assert all(
-        phrase.startswith(begin) for phrase, begin in zip(found, wrong, strict=True)
-    )
-
-
-@pytest.mark.parametrize("folder", [".", "lab"])
-def test_an_extra_contains_the_package_that_its_error_names(folder):
-    (name,) = [name for name, (place, _) in PROJECTS.items() if place == folder]
-    declared = {".": EXTRAS, "lab": EXTRAS_OF_LAB}
-    for extra, packages in declared[folder].items():
-        asked = requirements_of({name: [extra]}).values()
-        texts = [text for of_project in asked for text in of_project]
-        try:
-            brought = {
-                canonicalize_name(name)
-                for name, _ in asked_for([(text, "") for text in texts])
-            }
-        except PackageNotFoundError:
-            continue  # the extra is not installed here
-        for package in packages:
-            assert brought_by()[package] & brought, (extra, package)
 
 
 @pytest.fixture(scope="module")

@@ -8,27 +8,22 @@ import pytest
 from factories import change_card, make_recogniser
 from pipeline import some_predictions, train_predictions
 from scipy.special import softmax
-from scipy.stats import binomtest, kstest
 
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
-from nextview.recognition.novelty import Quantiles
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.training.card_fits import (
-    error_bound,
     fit_calibration,
     fit_risk,
     fit_temperature,
     loss,
-    valley_gains,
 )
 from nextview_lab.training.fitting_set import blind_walks
-from nextview_lab.training.unknown import fit_novelty, quantiles
+from nextview_lab.training.unknown import fit_novelty
 
-SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 
 
@@ -72,50 +67,6 @@ def test_the_correlation_and_temperature_of_generated_looks_are_found(
         assert losses[0] < loss(data, PLAIN_SUM, np.random.default_rng(2), walks=1)
 
 
-@pytest.mark.parametrize("right", [0.8, 0.5])
-def test_sides_count_as_far_as_looks_are_right_about_them(right):
-    """Both classes look alike; seen as the true one, a view claims to be right about the side 8
-    times in 10.
-    """
-    rng, n, v, s = np.random.default_rng(0), 2000, len(SMALL), SMALL.azimuths
-    labels, zero = rng.integers(0, 2, n), rng.integers(0, s, n)
-    claimed = rng.integers(0, s, (n, v, 2))  # seen as the other class: anything
-    true = (SMALL.azimuth_index - zero[:, None]) % s
-    wrong = (true + rng.integers(1, s, (n, v))) % s
-    claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(
-        rng.random((n, v)) < right, true, wrong
-    )
-    azimuth_bins = np.log(
-        np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))
-    ).astype(np.float32)
-    logits = rng.normal(size=(n, v, 2)).astype(np.float32) / 100
-    data = train_predictions(logits, labels, SMALL, ("a", "b"), azimuth_bins)
-    found = fit_temperature(data, np.random.default_rng(1), walks=1)
-    if right == 0.8:  # as good as they claim, and each by itself
-        assert found.bin_correlation == pytest.approx(0, abs=0.05)
-    else:
-        assert found.bin_correlation > 0.1
-    blind = Calibration(found.temperature, found.correlation)
-    of_found, of_blind = (
-        loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind)
-    )
-    assert of_found < of_blind
-
-
-def test_the_bound_of_single_episodes_is_that_of_clopper_and_pearson():
-    rng = np.random.default_rng(0)
-    for n, wrong in [(50, 0), (50, 3), (300, 30), (7, 7)]:
-        stopped = np.concatenate([np.ones(n), np.zeros(20)])
-        failed = np.concatenate([np.ones(wrong), np.zeros(n - wrong), np.zeros(20)])
-        order = rng.permutation(n + 20)
-        bound = error_bound(failed[order], stopped[order], np.full(n + 20, 0.7), 0.05)
-        exact = (
-            binomtest(wrong, n, alternative="less").proportion_ci(0.95, "exact").high
-        )
-        assert bound == pytest.approx(exact, abs=1e-6)
-    assert error_bound(np.zeros(5), np.zeros(5), np.ones(5), 0.1) == 1
-
-
 def test_promises_are_kept_as_often_as_promised():
     whole = correlated(40_000, 0.5, 1.0, seed=9)
     even = whole.weights
@@ -147,60 +98,6 @@ def test_promises_are_kept_as_often_as_promised():
             broken += error_at(bounds.threshold(risk, n_views)) > risk
     assert promises > 30
     assert broken <= 60 * delta + 3 * np.sqrt(60 * delta * (1 - delta))
-
-
-# What may be fitted to
-
-
-def test_a_shape_that_was_copied_counts_once():
-    p = replace(some_predictions(60), splits=np.array(["train"] * 60))
-    # The first object nine times more, under other names and a little otherwise recognised.
-    rows = np.array([*range(60), *[0] * 9])
-    arrays = {
-        name: getattr(p, name)[rows]
-        for name in ("labels", "splits", "conflicting", "depth_entropy")
-    }
-    names, maps = (
-        (*p.names, *(f"copy{i}" for i in range(9))),
-        {"lem": p.maps["lem"][rows]},
-    )
-    many = replace(
-        p,
-        **arrays,
-        logits=p.logits[rows] + (np.arange(69) >= 60)[:, None, None],
-        maps=maps,
-        names=names,
-    )
-    once = many.deduplicate()
-    assert once.names == p.names
-    np.testing.assert_array_equal(once.logits, p.logits)
-    relabelled = replace(
-        many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3]
-    )
-    # which of two labels is right is not for us
-    assert relabelled.deduplicate().names == (*p.names, "copy8")
-
-
-# Views that tell
-
-
-def telling(
-    sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0
-) -> Predictions:
-    """Every view says little of the class, but those on some rings, which depend on the class,
-    say it loudly.
-    """
-    rng = np.random.default_rng(seed)
-    c = len(rings_of_class)
-    labels = np.arange(n) % c
-    logits = rng.normal(size=(n, len(sphere), c)) * 0.1
-    logits[np.arange(n), :, labels] += 0.3
-    for i, label in enumerate(labels):
-        loud = np.isin(sphere.ring, rings_of_class[label])
-        logits[i, loud, label] += 3
-    return train_predictions(
-        logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c])
-    )
 
 
 # The stages
@@ -246,18 +143,6 @@ def test_a_calibration_goes_into_the_card_and_is_used(
     assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_valley_classes_are_those_that_gain_by_the_valley():
-    logits = np.zeros((2, 40, 2))
-    high = SPHERE.ring == 4
-    # class 0 is clear from below, class 1 from above
-    logits[0, ~high, 0], logits[1, high, 1] = 3, 3
-    # the map rises with the ring
-    maps = np.broadcast_to((SPHERE.ring / 4)[SPHERE.windows], (2, 40, 5, 3))
-    gains = valley_gains(SPHERE, logits, maps, np.array([0, 1]))
-    assert gains[0] > 0.1
-    assert gains[1] < -0.1
-
-
 # Novelty
 
 
@@ -291,22 +176,3 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
             usual, novel = (score.p_value(scores, n) < 0.05 for scores in novelty)
             assert usual.mean() == pytest.approx(0.05, abs=0.03)
             assert novel.mean() > 0.8
-
-
-def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
-    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400
-    held-out ones.
-    """
-    rng = np.random.default_rng(2)
-
-    def scores(n):
-        return rng.gamma(3, size=(n, 1)) + rng.normal(size=(n, 12))
-
-    labels = rng.choice(3, 400, p=(0.6, 0.3, 0.1))
-    table = quantiles(scores(400), labels, 5)
-    novelty = Quantiles(table, np.array([400]))
-    for n in range(1, 6):
-        p = novelty.p_value(scores(4000)[:, :n].mean(1), n)
-        # 1.36 / sqrt(400) of the held-out ones, more as classes differ
-        assert kstest(p, "uniform").statistic < 0.09
-        assert (p < 0.05).mean() == pytest.approx(0.05, abs=0.035)

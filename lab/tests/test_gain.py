@@ -1,27 +1,22 @@
 """The gain policy: what it may know, what it costs, and that training finds the views that tell."""
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from lab_programs import refused
-from pipeline import some_predictions
-from scipy.special import log_softmax
-from test_fits import SMALL, telling
+from pipeline import train_predictions
 from test_policies import SPHERE, state_of
 
 torch = pytest.importorskip("torch")
 
-from lab_programs import main
 
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import Gain, features, mirrored, mirrored_features
 from nextview.policies.policy_card import PolicyCard
 from nextview.policies.registry import make_policy
-from nextview.recognition.belief import Calibration
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.training.gain_training import (
     Perceptrons,
@@ -31,16 +26,9 @@ from nextview_lab.training.gain_training import (
     write_gain,
 )
 from nextview_lab.training.recipes import GainRecipe
-from nextview_lab.training.rollout import (
-    OBJECTIVES,
-    ReplayTable,
-    candidate_values,
-    fit_travel_weight,
-    judge,
-    rollout,
-    value_after,
-)
+from nextview_lab.training.rollout import ReplayTable, fit_travel_weight, judge, rollout
 
+SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 CLASSES = 4
 MAPS = (
     "lem",
@@ -131,91 +119,6 @@ def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(scope, inputs, fr
         )
 
 
-def test_in_the_objects_frame_it_does_not_matter_from_which_azimuth_the_object_is_seen():
-    """The same views of it are visited, and the camera stands at one of them or another of the
-    same ring.
-    """
-    # azimuth at which the object shows its azimuth bin 0, and the ring of the camera
-    zero, ring = 3, 2
-    states = []
-    for azimuth in (1, 6):
-        state = some_state(episodes=1)
-        side = (azimuth - zero) % 8
-        state.azimuth_bins[:] = 0.02
-        state.azimuth_bins[:, :, side] = 0.86
-        # of the sphere, by the object's own azimuth
-        around = np.random.default_rng(1).random((1, 5, 8))
-        state.evidence.maps["lem-sphere"] = around[:, :, (np.arange(8) + side) % 8]
-        state.visited[:] = np.arange(40) % 3 == 0
-        states.append(replace(state, current=np.array([ring * 8 + azimuth])))
-    inputs = ("belief", "place", "lem-sphere")
-    np.testing.assert_allclose(
-        *(features(SPHERE, state, inputs, "object") for state in states)
-    )
-    assert not np.allclose(
-        *(features(SPHERE, state, inputs, "camera") for state in states)
-    )
-    for state in states:  # and the networks are told on which side the camera is
-        assert (
-            features(SPHERE, state, ("azimuth_bin",), "object")[0, :8].argmax()
-            == (state.current[0] % 8 - zero) % 8
-        )
-
-
-# What every choice leads to
-
-
-def some_table(n=30, sphere=SMALL, seed=0, azimuth_bins=False) -> ReplayTable:
-    rng = np.random.default_rng(seed)
-    data = telling(sphere, [[0], [1], [2]], n, seed)
-    noisy = data.logits + rng.normal(size=data.logits.shape)
-    maps = {
-        "lem-sphere": rng.random(
-            (n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32
-        )
-    }
-    shape = (n, len(sphere), len(data.classes), sphere.azimuths)
-    likely = (
-        log_softmax(rng.normal(size=shape), axis=3).astype(np.float32)
-        if azimuth_bins
-        else None
-    )
-    calibration = Calibration(0.8, 0.5, bin_correlation=0.1 if azimuth_bins else None)
-    known = {"logits": noisy.astype(np.float32), "azimuth_bins": likely}
-    return ReplayTable(replace(data, **known, maps=maps, calibration=calibration))
-
-
-@pytest.mark.parametrize("azimuth_bins", [False, True])
-def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
-    table, seen = some_table(azimuth_bins=azimuth_bins), []
-    for moment in rollout(table, RandomAll(SMALL), 4, np.random.default_rng(0)):
-        state = moment.state
-        if seen:
-            before, log_evidence = seen[-1]
-            moved = SMALL.travel[before.state.current, state.current]
-            np.testing.assert_allclose(moment.travel - before.travel, moved)
-            for kind in OBJECTIVES:
-                reached = value_after(table, moment.total, state.step, kind)
-                np.testing.assert_allclose(
-                    reached, log_evidence[kind][np.arange(30), state.current], atol=1e-9
-                )
-        seen.append(
-            (
-                moment,
-                {kind: candidate_values(table, moment, kind) for kind in OBJECTIVES},
-            )
-        )
-    moment = seen[-1][0]
-    logs = np.log(moment.state.belief)  # test_nothing_seen computes beliefs by hand
-    assert (moment.state.visited.sum(1) == 4).all()
-    of_truth = logs[np.arange(30), table.data.labels]
-    np.testing.assert_allclose(
-        value_after(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9
-    )
-    right = (logs.argmax(1) == table.data.labels).astype(float)
-    np.testing.assert_array_equal(value_after(table, moment.total, 4, "right"), right)
-
-
 # The file that ships
 
 
@@ -259,6 +162,25 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     )
 
 
+def telling(
+    sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0
+) -> Predictions:
+    """Every view says little of the class, but those on some rings, which depend on the class,
+    say it loudly.
+    """
+    rng = np.random.default_rng(seed)
+    c = len(rings_of_class)
+    labels = np.arange(n) % c
+    logits = rng.normal(size=(n, len(sphere), c)) * 0.1
+    logits[np.arange(n), :, labels] += 0.3
+    for i, label in enumerate(labels):
+        loud = np.isin(sphere.ring, rings_of_class[label])
+        logits[i, loud, label] += 3
+    return train_predictions(
+        logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c])
+    )
+
+
 # Training
 
 
@@ -299,53 +221,3 @@ def test_training_finds_the_views_that_tell_the_class_believed():
         policy, travel_weight=fit_travel_weight([(fresh, policy)], 3, "log-belief", 0)
     )
     assert (travel(fitted) <= travel(Random(SMALL))).all()
-
-
-@pytest.fixture
-def unseen(tmp_path):
-    path = tmp_path / "unseen.npz"
-    p = some_predictions(90)
-    sphere = (
-        np.random.default_rng(0)
-        .random((90, len(p.sphere), p.sphere.rings, p.sphere.azimuths))
-        .astype(np.float32)
-    )
-    azimuth_bins = (
-        np.random.default_rng(1)
-        .normal(size=(90, len(p.sphere), 3, p.sphere.azimuths))
-        .astype(np.float32)
-    )
-    maps = p.maps | {"lem-sphere": sphere}
-    replace(
-        p, splits=np.array(["train"] * 90), maps=maps, azimuth_bins=azimuth_bins
-    ).save(path)
-    return path
-
-
-def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
-    p = Predictions.load(unseen)
-    p.of_objects(np.arange(20)).save(tmp_path / "validation.npz")
-    card = tmp_path / "mine.json"
-    main(
-        [
-            "train",
-            "gain",
-            str(unseen),
-            str(card),
-            "--epochs",
-            "1",
-            "--validation",
-            str(tmp_path / "validation.npz"),
-        ]
-    )
-    assert "70 objects" in json.loads(card.read_text())["learned_from"]
-    replace(p, azimuth_bins=None).save(tmp_path / "sideless.npz")
-    new = tmp_path / "new.json"
-    for arguments, sentence in [
-        (
-            [unseen, new, "--inputs", "beleif"],
-            "no map 'beleif'; predict it, or choose --inputs among belief, ",
-        ),
-        ([tmp_path / "sideless.npz", new], "holds no azimuth bins"),
-    ]:
-        assert sentence in refused(capsys, "train", "gain", *arguments)

@@ -1,14 +1,10 @@
 """The command line: its table of commands, how they end, and what they show."""
 
-import io
 import json
-import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 
 import pytest
@@ -33,13 +29,6 @@ def test_every_command_explains_itself(name, capsys):
     assert end.value.code == 0
     shown = capsys.readouterr().out
     check_help(name, COMMANDS[name], shown)
-
-
-@pytest.mark.parametrize("name", OF_LAB)
-def test_suggested_next_commands_exist(name):
-    named = re.findall(r"nextview(?:-lab)? \w+(?: \w+)?", COMMANDS[name].then)
-    known = {*COMMANDS, *(" ".join(each.split()[:2]) for each in COMMANDS)}
-    assert all(words in known or words.rpartition(" ")[0] in known for words in named)
 
 
 @pytest.mark.parametrize("preset", [None, "thesis"])
@@ -169,35 +158,3 @@ def test_help_needs_no_extra():
     assert done.returncode == 0, done.stderr
     assert "pip install 'nextview-lab[train]'" in done.stderr
     assert done.stdout == run_python(ask).stdout
-
-
-@pytest.fixture(scope="module")
-def completions_for_bash(tmp_path_factory):
-    pytest.importorskip("torch")
-    path = tmp_path_factory.mktemp("bash") / "nextview-lab.sh"
-    said = io.StringIO()
-    with redirect_stdout(said), suppress(SystemExit):
-        called("nextview-lab completion bash")
-    path.write_text(said.getvalue())
-    return path
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [
-        ("re", {"render", "report"}),
-        ("fit s", {"size"}),
-        ("train recogniser --lay", {"--layers"}),
-    ],
-)
-def test_bash_completes_commands_and_options(words, offered, completions_for_bash):
-    ask = (
-        f"source {completions_for_bash}; f=$(complete -p nextview-lab | sed 's/.*-F \\([^"
-        f" ]*\\).*/\\1/'); COMP_WORDS=(nextview-lab {words});"
-        " COMP_CWORD=$((${#COMP_WORDS[@]}-1)); $f; echo ${COMPREPLY[@]}"
-    )
-    done = subprocess.run(
-        ["bash", "-c", ask], capture_output=True, text=True, check=True
-    )
-    assert set(done.stdout.split()) == offered

@@ -43,15 +43,9 @@ def synthetic_predictions():
     )
 
 
-TABLE_OF = (
-    "random",
-    "random-all",
-    "furthest",
-    "spread",
-    "lem",
-    "lem-peak",
-    "oracle-gain",
-)
+TABLE_OF = """
+random random-all furthest spread lem lem-peak oracle-gain
+"""
 MEASURES = ("accuracy", "n_views", "travel_all", "confident", "calibration_error")
 
 
@@ -61,7 +55,9 @@ def table(folder):
     synthetic_predictions().save(folder / "p.npz")
     how = "--thresholds 0.8 0.97 --runs 3 --max-views 4 --samples 200 --seed 1"
     places = [str(folder / "p.npz"), str(folder / "out")]
-    main(["benchmark", "classes", *places, "--policies", *TABLE_OF, *how.split()])
+    main(
+        ["benchmark", "classes", *places, "--policies", *TABLE_OF.split(), *how.split()]
+    )
     rows = pd.read_csv(folder / "out" / "measures.csv").query("set == 'all'")
     rows = rows[rows.measure.isin(MEASURES) & rows.threshold.isin([0.8, 0.97])]
     return {

@@ -7,19 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 from skimage.measure import shannon_entropy
 
 from nextview.errors import DatasetError
-from nextview_lab.data.measures import (
-    QUANTUM,
-    confidence_maps,
-    depth_entropy,
-    measure,
-    normalise_per_object,
-)
+from nextview_lab.data.measures import QUANTUM, confidence_maps, depth_entropy, measure
 from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import MeasureError
 
@@ -54,24 +45,6 @@ def test_scikit_image_agrees_on_the_quantised_image(dtype):
         levels = np.floor(depth.astype(np.float64) / QUANTUM + 0.5)
         assert depth_entropy(depth) == pytest.approx(
             shannon_entropy(levels, base=2), abs=1e-9
-        )
-
-
-@given(
-    npst.arrays(
-        np.float64, (3, 9), elements=st.floats(-100, 100, allow_subnormal=False)
-    )
-)
-def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
-    scaled = normalise_per_object(values)
-    assert scaled.dtype == np.float32
-    for row, out in zip(values, scaled, strict=True):
-        if np.ptp(row) == 0:
-            assert (out == 0).all()
-            continue
-        assert (out.min(), out.max()) == (0, 1)
-        np.testing.assert_allclose(
-            out, np.interp(row, [row.min(), row.max()], [0, 1]), atol=1e-6
         )
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview_lab.data.rendering import render
 from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore
@@ -97,30 +96,6 @@ def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(
     (path / "image" / "c" / "0.00.partial").write_bytes(b"half")
     assert len(list(render(furniture, path, SPHERE, SIZE, workers=0))) == 18 - done
     assert_same(whole, path)
-
-
-@linux
-def test_a_full_disk_is_reported_and_the_next_run_resumes(furniture, whole, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if (
-        os.geteuid()
-        or subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]
-        ).returncode
-    ):
-        pytest.skip("only root can mount a small disk")
-    try:
-        path = disk / "views.zarr"
-        with pytest.raises(DatasetError, match="cannot be written"):
-            list(render(furniture, path, SPHERE, SIZE, workers=1))
-        done = int(ViewStore.open(path).done.sum())
-        assert 0 < done < 18
-        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
-        assert len(list(render(furniture, path, SPHERE, SIZE, workers=0))) == 18 - done
-        assert_same(whole, path)
-    finally:
-        subprocess.run(["umount", disk], check=True)
 
 
 def test_broken_meshes_are_recorded_and_tried_again(meshes, tmp_path):

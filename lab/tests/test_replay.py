@@ -4,24 +4,21 @@ promise.
 
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 import pytest
 from pipeline import some_predictions
-from scipy.special import log_softmax, softmax
 
 from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.policies.registry import make_policy
-from nextview.recognition.belief import Calibration, Stopping
+from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.recognition.own_stopping import own_stopping
-from nextview.session.episode import Episodes, run_episodes
+from nextview.session.episode import run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import EntryError
@@ -77,46 +74,6 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
     np.testing.assert_array_equal(
         np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views
     )
-
-
-def uncertain(seen, threshold):
-    """A user's stopping rule."""
-    return (seen.entropy < threshold) | (seen.n_views > 3) & (seen.margin > 0.2)
-
-
-@pytest.mark.parametrize("threshold", [0.2, 0.6])
-def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(
-    specs, threshold
-):
-    p, rule = specs.predictions, own_stopping("test_replay:uncertain", threshold, 5)
-    policy, paths = (
-        make_policy("lem", p.sphere, specs.valley_classes("lem")),
-        replay("lem", specs, 5, 0, beliefs=True),
-    )
-    episodes = Episodes(p.sphere, policy, specs.starts, rule, np.random.default_rng(0))
-    observe, stopped = evidence_of(p, specs.objects), np.zeros(len(specs.starts), int)
-    while len(episodes.running):
-        step = episodes.update(
-            observe(episodes.running, episodes.current[episodes.running])
-        )
-        entropy = -(step.belief * np.log2(step.belief)).sum(1)
-        lead = np.subtract(*np.sort(step.belief, 1)[:, [-1, -2]].T)
-        k = len(episodes.steps)
-        np.testing.assert_array_equal(
-            step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5)
-        )
-        stopped[step.episodes] = k
-    ends = truncate(paths, rule)
-    np.testing.assert_array_equal(ends.n_views, stopped)
-    for field in ("answer", "confidence", "confident", "travel"):
-        np.testing.assert_allclose(
-            getattr(ends, field),
-            getattr(episodes.outcome, field),
-            atol=1e-12,
-            err_msg=field,
-        )
-    with pytest.raises(UsageError):
-        truncate(replay("lem", specs, 5, 0), rule)
 
 
 @dataclass(frozen=True)
@@ -196,67 +153,6 @@ def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike
         truncate(replay("lem", specs, 9, 0), rule)
 
 
-@pytest.mark.parametrize("knows_bins", [False, True])
-def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_bins):
-    calibration, likely = Calibration(0.8, 0.5), None
-    if knows_bins:
-        calibration = msgspec.structs.replace(calibration, bin_correlation=0.1)
-        likely = log_softmax(
-            np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3
-        ).astype(np.float32)
-    specs = replace(
-        specs,
-        predictions=replace(
-            specs.predictions, calibration=calibration, azimuth_bins=likely
-        ),
-    )
-    p = specs.predictions
-    for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
-        views = replay(name, specs, 3, seed=0).views
-        for e in range(0, len(views), 7):
-            i, seen = specs.objects[e], list(views[e, :2])
-            around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
-            sums = {
-                v: p.log_evidence[i, [*seen, v]].astype(float).sum(0)
-                for v in around
-                if v not in seen
-            }
-            belief = {
-                v: calibration.belief(total, 3, 3)[p.labels[i]]
-                for v, total in sums.items()
-            }
-            assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
-
-
-def test_fixed_views_are_the_ones_their_name_says(specs):
-    p = specs.predictions
-    sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][
-        specs.objects
-    ]
-    entropy = p.depth_entropy[specs.objects]
-    by_name = {
-        "best-5": sure,
-        "worst-5": -sure,
-        "high-entropy-5": entropy,
-        "low-entropy-5": -entropy,
-    }
-    for name, values in by_name.items():
-        paths = replay(name, specs, max_views=3, seed=0)
-        taken = np.take_along_axis(values, paths.views, 1)
-        np.testing.assert_allclose(
-            np.sort(taken), np.sort(values)[:, -5:], err_msg=name
-        )
-        total = np.take_along_axis(
-            p.logits[specs.objects], paths.views[..., None], 1
-        ).sum(1)
-        ends = truncate(paths, Stopping(0.1))
-        np.testing.assert_array_equal(ends.n_views, 5)  # whatever is believed
-        np.testing.assert_array_equal(ends.answer, total.argmax(1))
-        np.testing.assert_allclose(
-            ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5
-        )
-
-
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
@@ -277,32 +173,6 @@ def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(
     with pytest.raises(ValueError, match=sentence):
         raise EntryError(grid.failures[path])
     assert path in grid.failures[path]
-
-
-def test_the_contestants_are_those_that_the_predictions_allow(specs):
-    names = default_entries(specs)
-    assert {"lem", "oracle-valley", "true-lcm", "orbit-8", "orbit-40"} <= set(names)
-    assert not any(name.startswith("lcm") for name in names)
-    p = specs.predictions
-    with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
-    assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
-    # of no valley classes
-    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)
-    assert [name for name in default_entries(other) if "view_area" in name] == [
-        "view_area",
-        "view_area-peak",
-    ]
-    for name, same in (
-        ("view_area", "lem-peak"),
-        ("view_area-oracle-valley", "lem-peak"),
-    ):
-        np.testing.assert_array_equal(
-            replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views
-        )
-    without = make_specs(replace(p, maps={}), 1, 0)
-    assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
-    for name in default_entries(with_lcm):
-        replay(name, with_lcm, 2, 0)
 
 
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(

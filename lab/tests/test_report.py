@@ -64,20 +64,6 @@ def test_the_page_is_whole_and_needs_nothing_from_outside(made):
     assert not list((made / "out").glob("*.part"))
 
 
-def test_the_tables_show_the_numbers_of_the_results(made):
-    text = (made / "out" / "report.html").read_text()
-    summary = load(made / "out").tables.measures.query("set == 'all'")
-    for policy in ("random", "lem", "oracle-gain"):
-        row = re.search(rf'<tr><th scope="row">{policy}\b.*?</tr>', text)[0]
-        cells = re.findall(r"<td>([\d.]+)", row)
-        of = summary.query("policy == @policy and threshold == 0.97").set_index(
-            "measure"
-        )["value"]
-        assert cells[:4] == [
-            f"{of[m]:.3f}" for m in ("accuracy", "clean_accuracy", "class_accuracy")
-        ] + [f"{of['n_views']:.2f}"]
-
-
 def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
     made, tmp_path
 ):

@@ -1,7 +1,6 @@
 """The segmentation network: its labelled frames, its training, and the file that is exported."""
 
 import csv
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,23 +11,17 @@ from lab_programs import main
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from nextview.errors import ModelError
-from nextview.files import sha256_of
 from nextview.geometry.pinhole import PinholeCamera
-from nextview.recognition.model_card import find_card
 from nextview.segmentation.features import SmallPicture
 from nextview.segmentation.network import (
     AFFINITY_STEPS,
     load_network,
-    new_card,
-    write_segmentation_card,
 )
 from nextview_lab.data.labelled_frames import (
     Example,
     LabelledFrames,
     draw_frames,
     frame_files,
-    output_scores,
 )
 from nextview_lab.worlds.worlds import BACKGROUND, SURFACE, World, photograph, slab
 
@@ -110,36 +103,6 @@ def drawn(tmp_path_factory):
     return files
 
 
-def test_a_varied_frame_is_of_the_same_world(drawn):
-    frames = LabelledFrames.load([file.path for file in drawn])
-    mirrored = set()
-    told = 0
-    for seed in range(6):
-        plain, varied = (
-            frames.example(seed % 4, rng) for rng in (None, np.random.default_rng(seed))
-        )
-        rows, columns = frames.labels.shape[1:]
-        flips = [
-            np.array_equal(turned, varied.classes[:rows, :columns])
-            for turned in (
-                plain.classes[:rows, :columns],
-                plain.classes[:rows, :columns][:, ::-1],
-            )
-        ]
-        assert any(flips)
-        mirrored.add(flips[1])
-        # gravity points nearly where it did, also in a mirror
-        if varied.features[13].any():
-            before, after = (
-                np.linalg.lstsq(x[1:4].reshape(3, -1).T, x[12].ravel())[0]
-                for x in (plain.features, varied.features)
-            )
-            told += 1
-            assert after @ (before * [-1 if flips[1] else 1, 1, 1]) > np.cos(0.2)
-    assert 0 < told < 6
-    assert mirrored == {False, True}
-
-
 KILLED = """
 import os, sys
 from pathlib import Path
@@ -169,32 +132,6 @@ def test_an_interrupted_drawing_resumes_with_the_same_frames(tmp_path, drawn):
     for one, other in zip(whole, again, strict=True):
         assert all(np.array_equal(one[name], other[name]) for name in one)
     assert not np.array_equal(whole[0]["depth"], whole[1]["depth"])
-
-
-def test_scores_of_outputs_that_are_right_and_wrong(drawn):
-    frames = LabelledFrames.load([file.path for file in drawn])
-    examples = [frames.example(index, None) for index in range(len(frames))]
-    classes = np.stack([example.classes for example in examples])
-    right = np.concatenate(
-        [
-            classes[:, None] == np.arange(3)[:, None, None],
-            2 * np.stack([example.same for example in examples]) - 1,
-        ],
-        1,
-    )
-    assert output_scores(right, examples) == {
-        "class_accuracy": 1,
-        "thing_iou": 1,
-        "pair_accuracy": 1,
-    }
-    wrong = right.copy()
-    wrong[:, :3] = right[:, [1, 2, 0]]
-    wrong[:, 3:] *= -1
-    assert output_scores(wrong, examples) == {
-        "class_accuracy": 0,
-        "thing_iou": 0,
-        "pair_accuracy": 0,
-    }
 
 
 torch = pytest.importorskip("torch")
@@ -240,12 +177,6 @@ def run(tmp_path_factory):
     return out
 
 
-def test_training_lowers_its_loss(run):
-    found = losses(run)
-    assert len(found) == RECIPE.epochs
-    assert found[-1] < 0.8 * found[0]
-
-
 def test_a_stopped_training_ends_with_the_weights_of_one_that_was_not(
     tmp_path, run, monkeypatch
 ):
@@ -286,50 +217,3 @@ def test_the_file_answers_as_the_network(run, exported, shape):
     assert answer.shape == (15, *shape)
     assert answer.dtype == np.float32
     assert np.abs(answer - expected[:, : shape[0], : shape[1]]).max() < 0.01
-
-
-def other_recogniser(card):
-    """The file of another network, with a card that has its hash."""
-    recogniser = find_card("recogniser-modelnet10").path
-    card.with_suffix(".onnx").write_bytes(recogniser.read_bytes())
-    write_segmentation_card(card, new_card("other", sha256_of(recogniser)))
-
-
-def with_field(name, value):
-    def change(card):
-        card.write_text(json.dumps(json.loads(card.read_text()) | {name: value}))
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("broken", "sentence"),
-    [
-        (lambda card: card.unlink(), r"segmentation\.json: no such file"),
-        (
-            lambda card: card.write_text("{"),
-            r"json: not the card of a segmentation netw",
-        ),
-        (
-            with_field("kind", "recogniser"),
-            r"json: not the card of a segmentation netw",
-        ),
-        (with_field("channels", 14), r"json: its network has other inputs or outputs"),
-        (
-            with_field("sha256", "0" * 64),
-            r"onnx: is not the file that its card describes",
-        ),
-        (lambda card: card.with_suffix(".onnx").unlink(), r"onnx: no such file"),
-        (other_recogniser, r"onnx: has input where it should have features"),
-    ],
-)
-def test_a_broken_network_is_refused_in_one_sentence(
-    tmp_path, exported, broken, sentence
-):
-    card = tmp_path / exported.name
-    for file in (exported, exported.with_suffix(".onnx")):
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    broken(card)
-    with pytest.raises(ModelError, match=sentence) as raised:
-        load_network(card)
-    assert "\n" not in str(raised.value)

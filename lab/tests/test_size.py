@@ -6,31 +6,7 @@ from pipeline import train_predictions
 from scipy.stats import norm
 
 from nextview.geometry.viewsphere import ViewSphere
-from nextview_lab.training.card_fits import ANY_SIZE, RADII, densities, fit_weight
-
-
-def test_a_density_is_that_of_its_class_and_a_share_of_anything():
-    rng = np.random.default_rng(0)
-    radii = np.exp(
-        np.concatenate(
-            [rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)]
-        )
-    )
-    found = densities(radii, np.repeat([0, 1], 500), 2)
-    span = np.log(RADII[-1] / RADII[0])
-    share = np.exp(found).mean(1) * span  # under the curve
-    assert share == pytest.approx([1, 1], rel=0.03)
-    near = np.abs(RADII - 0.1).argmin()
-    wanted = 0.95 * norm.pdf(
-        np.log(RADII[near]), np.log(0.1), np.hypot(0.1, 0.1 * 500**-0.2)
-    )
-    assert np.exp(found[0, near]) == pytest.approx(wanted, rel=0.15)
-    assert np.exp(found[1, near]) == pytest.approx(ANY_SIZE / span)
-    strays = np.concatenate([radii[:500], np.full(20, 15.0)])  # drawn in another unit
-    blurred = densities(strays, np.repeat(0, 520), 1)[0, near]
-    assert np.exp(blurred) == pytest.approx(wanted * 500 / 520, rel=0.15)
-    with pytest.raises(ValueError, match="objects of several sizes"):
-        densities(radii[:3], np.array([0, 0, 1]), 2)
+from nextview_lab.training.card_fits import RADII, fit_weight
 
 
 def test_the_weight_is_the_most_likely_one():

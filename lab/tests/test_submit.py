@@ -152,51 +152,16 @@ def asked(tmp_path, code, wait=60.0, line=b"x" * 100_000):
             "read()\nfor _ in range(10**6): print('yes', flush=True)",
             "'yes' was written before this view was sent",
         ),
-        (
-            "print('first\\nsecond', flush=True); read(); time.sleep(3)",
-            "was written before this view was sent",
-        ),
-        (
-            "read(); print('a\\n', flush=True); read()",
-            "an empty line was written before",
-        ),
-        (
-            "read(); os.write(1, 'gr\u00fc\u00df\\n'.encode('latin-1')); time.sleep(3)",
-            r"'gr\\xfc\\xdf' is not UTF-8 \(byte 0xfc\)",
-        ),
-        ("read(); os.write(1, b'half \\xc3\\n'); time.sleep(3)", "is not UTF-8"),
-        (
-            "read()\nwhile True: os.write(1, b'z' * 70000)",
-            "'zzz.*' is a line of more than 1 MB",
-        ),
+        ("read(); os.write(1, b'gr\\xfc\\xdf\\n')", r"'gr\\xfc\\xdf' is not UTF-8"),
         ("read(); os.write(1, b'{\"name'); os._exit(7)", "has ended with status 7"),
         ("read(); os.kill(os.getpid(), 9)", "has ended with status -9"),
-        (
-            "read(); subprocess.Popen(['sleep', '60']); os._exit(3)",
-            "has ended with status 3",
-        ),
-        ("os.close(0); time.sleep(3)", "closed its input or its output"),
-        ("read(); os.close(1); time.sleep(3)", "closed its input or its output"),
+        ("os.close(0); time.sleep(1)", "closed its input or its output"),
     ],
 )
 def test_a_process_that_breaks_the_protocol_is_told_at_once(tmp_path, code, said):
     with pytest.raises(ResultsError, match=said) as raised:
         asked(tmp_path, code)
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        "time.sleep(3)",
-        "read(1000); time.sleep(3)",
-        "read()\nwhile True: os.write(1, b' '); time.sleep(0.01)",
-    ],
-    ids=["never reads", "reads a part", "never ends its line"],
-)
-def test_a_line_of_any_length_is_waited_for_no_longer_than_told(tmp_path, code):
-    with pytest.raises(ResultsError):
-        asked(tmp_path, code, 0.5)
 
 
 def test_a_changed_image_is_found(own, tmp_path, capsys):
@@ -221,7 +186,6 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
     [
         (lambda v: v["episodes"].pop(), "episode 0001 0 times"),
         (lambda v: v.update(archive_sha256="0" * 64), "is of another archive"),
-        (lambda v: v.update(format=9), "has format 9"),
         (lambda v: v["episodes"][0]["said"].pop(), "has 1 view, not 2"),
         (lambda v: v["episodes"][0]["said"][0].update(view=1), "do not begin with 0"),
         (lambda v: v["episodes"][0]["said"][0].update(name="x"), "no thing called 'x'"),
@@ -234,15 +198,6 @@ def test_a_changed_image_is_found(own, tmp_path, capsys):
             "].pose[0]",
         ),
         (lambda v: v.update(method="nextview geometry"), "another file has the method"),
-        (lambda v: v.update(views=10**9), "$.views"),
-        (lambda v: v.update(version="7" * 100_000), "$.version"),
-        (lambda v: v["episodes"][1]["said"][1].update(view=10**12), "].view"),
-        (lambda v: v["episodes"][0]["said"][0].update(cpu_seconds=1e300), "].cpu_sec"),
-        (lambda v: v["episodes"][0]["said"][0].update(name="mug" * 10**6), "].name"),
-        (
-            lambda v: v["episodes"].extend([v["episodes"][1]] * 50_000),
-            "episode 0001 50001 times",
-        ),
     ],
 )
 def test_a_file_of_results_that_is_not_valid_is_refused(

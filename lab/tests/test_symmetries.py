@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from symmetric_parts import around, degrees_off, keyed, parts, toothed, turns_of
+from symmetric_parts import degrees_off, parts, turns_of
 
 from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry
-from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
+from nextview.recognition.poses import PoseCandidate, turn_apart
 from nextview.teaching.symmetries import named_symmetries
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
-from nextview_lab.worlds.solids import extruded, joined, moved, ring_points
 
 PARTS = parts()
 NEAR = 3.0  # degrees by which an axis may be off
@@ -45,10 +44,7 @@ def test_the_symmetries_of_a_part_are_its_true_ones_and_no_others(name):
         for angle in range(15, 360, 15)
     ]
     for other in others:
-        apart = turn_apart(
-            posed(np.eye(3), found),
-            posed(turn @ other @ turn.T, found),
-        )
+        apart = turn_apart(posed(np.eye(3), found), posed(turn @ other @ turn.T, found))
         assert apart == pytest.approx(degrees_off(other, np.eye(3), true), abs=NEAR)
 
 
@@ -63,81 +59,6 @@ def test_a_detail_that_breaks_a_symmetry_leaves_a_near_symmetry():
         assert all(abs(turn[:, 2] @ one.axis) > 0.999 for one in found)
 
 
-def elbow(degrees, bend, outer, wall):
-    """A bent pipe with open ends, millimetres; a half turn about x maps it to itself."""
-    steps = np.radians(np.linspace(-degrees / 2, degrees / 2, 41))
-    # along the outside, over one end, back along the inside, and over the other end
-    along = np.r_[steps, steps[::-1]][:, None]
-    radii = np.repeat([outer, outer - wall], len(steps))[:, None]
-    sides = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    reach = bend + radii * np.cos(sides)
-    vertices = np.stack(
-        [reach * np.cos(along), reach * np.sin(along), radii * np.sin(sides)], -1
-    )
-    corner = np.arange(radii.size * sides.size).reshape(radii.size, sides.size)
-    further, beside = np.roll(corner, -1, 0), np.roll(corner, -1, 1)
-    opposite = np.roll(further, -1, 1)
-    faces = [[corner, further, opposite], [corner, opposite, beside]]
-    return vertices.reshape(-1, 3), np.moveaxis(faces, 1, -1).reshape(-1, 3)
-
-
-@pytest.mark.parametrize(
-    ("degrees", "bend", "outer", "wall"),
-    [(90, 60, 15, 5), (180, 40, 12, 2), (120, 35, 12, 1), (45, 60, 20, 6)],
-)
-def test_the_inside_of_a_pipe_that_cameras_hardly_see_breaks_no_symmetry(
-    degrees, bend, outer, wall
-):
-    surface, turn = placed(*elbow(degrees, bend, outer, wall), seed=degrees)
-    (found,) = find_symmetries(surface)
-    assert found.order == 2
-    assert abs(turn[:, 0] @ found.axis) > 0.999
-
-
-def wheel(outline, bore, width=14):
-    """A wheel with a hub, so that no half turn maps it to itself."""
-    hub = extruded([ring_points(1.7 * np.ptp(bore[:, 1]) / 2, 64), bore], width / 2)
-    return joined([extruded([outline, bore], width), moved(hub, by=(0, 0, width))])
-
-
-def flattened(radius, across):
-    """The outline of a bore with a flat on the side of +x."""
-    flat = np.arccos(across / radius)
-    angles = np.linspace(flat, 2 * np.pi - flat, 60)
-    return radius * np.c_[np.cos(angles), np.sin(angles)]
-
-
-@pytest.mark.parametrize("teeth", [12, 17, 20, 24])
-@pytest.mark.parametrize(
-    ("bore", "breaks"),
-    [
-        (ring_points(7, 48), False),
-        (keyed(7, 4.6, 2.1), True),
-        (flattened(7, 4.9), True),
-    ],
-    ids=["round", "keyway", "flat"],
-)
-def test_a_gear_has_the_order_of_its_teeth_or_none(teeth, bore, breaks):
-    surface, turn = placed(*wheel(toothed(teeth, teeth + 2, 4.5), bore), seed=teeth)
-    found = find_symmetries(surface)
-    assert [one.order for one in found] == ([] if breaks else [teeth])
-    # Where the detail is hidden, the poses that differ by the teeth look alike.
-    near = find_near_symmetries(surface)[0]
-    assert near.order == teeth
-    assert abs(turn[:, 2] @ near.axis) > 0.999
-
-
-@pytest.mark.parametrize("holes", [5, 8, 12])
-def test_a_missing_hole_leaves_a_flange_without_symmetry(holes):
-    for missing, expected in ((0, [holes]), (1, [])):
-        some = around(holes, 30, 4)[missing:]
-        bore = ring_points(12, 64)
-        plate = extruded([ring_points(40, 96), bore, *some], 8)
-        hub = extruded([ring_points(18, 64), bore], 14)
-        surface, _ = placed(*joined([plate, moved(hub, by=(0, 0, 8))]), seed=holes)
-        assert [one.order for one in find_symmetries(surface)] == expected
-
-
 def test_a_scan_that_is_off_by_a_hundredth_is_as_round_as_the_can():
     can = trimesh.creation.cylinder(33, 100, sections=48).subdivide_to_size(6)
     rng = np.random.default_rng(0)
@@ -146,24 +67,6 @@ def test_a_scan_that_is_off_by_a_hundredth_is_as_round_as_the_can():
     found = find_symmetries(surface)
     assert [one.order for one in found] == [0, 2]
     assert abs(turn[:, 2] @ found[0].axis) > 0.998
-
-
-def test_a_face_that_nobody_can_see_breaks_no_symmetry():
-    cube = trimesh.creation.box((30, 30, 30))
-    inside = trimesh.creation.box((8, 4, 2))
-    inside.apply_translation((5, 4, 7))
-    both = trimesh.util.concatenate([cube, inside])
-    surface, _ = placed(both.vertices, both.faces)
-    assert [one.order for one in find_symmetries(surface)] == [4, 4, 4]
-
-
-def test_a_pose_is_as_uncertain_as_its_near_symmetry_makes_it():
-    # A gear and its copy turned by 90 degrees, equally likely: no symmetry leads from one to the
-    # other, so that the root mean square of 0 and 90 degrees is told.
-    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    found = find_symmetries(placed(*PARTS["gear_with_keyway"].solid)[0])
-    both = [posed(np.eye(3), found), posed(quarter, found)]
-    assert uncertainty_of(both).degrees == pytest.approx(90 / np.sqrt(2))
 
 
 def test_a_person_names_symmetries():
@@ -198,18 +101,3 @@ def test_an_invalid_symmetry_is_rejected_with_advice(text):
     with pytest.raises(UsageError, match="a symmetry is NAME=none") as error:
         named_symmetries([text])
     assert repr(text) in str(error.value)
-
-
-def test_one_thing_has_its_symmetries_once():
-    with pytest.raises(UsageError, match="given twice"):
-        named_symmetries(["mug=z", "mug=none"])
-
-
-def test_a_part_is_what_it_says():
-    # Volumes in closed form: that of a prism is the area of its outline times its height.
-    for name, volume in {
-        "die": 16**3,
-        "equal_bracket": 12 * (20 * 2.5 + 17.5 * 2.5),
-    }.items():
-        mesh = trimesh.Trimesh(*PARTS[name].solid)
-        assert mesh.volume == pytest.approx(volume)

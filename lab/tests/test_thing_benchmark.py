@@ -3,31 +3,19 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
 import trimesh
 from lab_programs import main
-from msgspec.structs import replace as replace_record
 
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record
-from nextview.geometry.mesh import UNITS, load_mesh
-from nextview.policies.base import EpisodeState
-from nextview.recognition.evidence import Evidence
-from nextview.simulation.sensed_camera import SensedCamera
+from nextview.geometry.mesh import UNITS
 from nextview_lab.benchmark import things as stage
 from nextview_lab.benchmark.confusable import Alikeness
-from nextview_lab.benchmark.known_things import things_of
-from nextview_lab.benchmark.thing_episodes import (
-    EPISODE_SPHERE,
-    VISIBLE_SHARES,
-    Setting,
-    ThingEpisode,
-    hiding_boxes,
-)
-from nextview_lab.benchmark.thing_policies import BLIND_RULES, RingSteps, TruthCeiling
+from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
+from nextview_lab.benchmark.thing_policies import BLIND_RULES
 from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun
 from nextview_lab.benchmark.thing_tables import summarise_things
 from nextview_lab.benchmark.things import ThingSettings, benchmark_things
@@ -73,12 +61,6 @@ def made(shared, knobs, settings):
 def results(made, tmp_path):
     """A copy of it."""
     return shutil.copytree(made, tmp_path / "out")
-
-
-def episode_of(knobs_memory, knobs, thing, occlusion="none"):
-    things = things_of(str(knobs_memory), None)
-    mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
-    return ThingEpisode(things, mesh, thing, 0, Setting("wrist", occlusion))
 
 
 # From scans to tables
@@ -167,76 +149,6 @@ def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
         trimesh.load(scan).apply_translation((0, 0.1, 0)).export(moved / scan.name)
     with pytest.raises(DatasetError, match="was taught from: it lies elsewhere"):
         benchmark_things(moved, tmp_path / "out2", settings, workers=0)
-
-
-def test_an_episode_says_what_the_recogniser_says_of_the_same_views(
-    knobs_memory, knobs
-):
-    episode = episode_of(knobs_memory, knobs, 0)
-    views = [episode.start, (episode.start + 3) % len(EPISODE_SPHERE)]
-    found, _ = episode.verified(views)
-    direct = episode.things([episode.observation(view) for view in sorted(views)])
-    np.testing.assert_array_equal(found.belief, direct.belief)
-    np.testing.assert_array_equal(found.poses, direct.poses)
-    # Within the errors of a sensor that is a few millimetres off, at half a metre.
-    assert episode.pose_error(views) < 8
-
-
-def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
-    episode = episode_of(knobs_memory, knobs, 0, occlusion="none")
-    standing = episode.stage.standing
-    for low, high in VISIBLE_SHARES.values():
-        boxes = hiding_boxes(standing, (low, high), (0, 1))
-        camera = SensedCamera(
-            standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
-        )
-        shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
-        assert low - 0.08 < np.mean(shares) < high + 0.08
-
-
-# Policies
-
-
-def state_at(view, visited=()):
-    mask = np.zeros((1, len(EPISODE_SPHERE)), bool)
-    mask[0, [view, *visited]] = True
-    nothing = Evidence(np.zeros((1, 1)))
-    return EpisodeState(
-        np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1
-    )
-
-
-def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
-    taken = [8]
-    for _ in range(7):
-        state = state_at(taken[-1], taken)
-        taken.append(
-            int(
-                RingSteps(EPISODE_SPHERE).next_views(state, np.random.default_rng(0))[0]
-            )
-        )
-    assert sorted(taken) == list(range(8, 16))
-    assert taken[1] == 11  # three steps of 45 degrees ahead
-    after = RingSteps(EPISODE_SPHERE).next_views(
-        state_at(taken[-1], taken), np.random.default_rng(0)
-    )
-    assert int(after[0]) not in taken
-
-
-@pytest.mark.long  # a whole benchmark
-def test_no_second_view_names_more_things_right_than_that_of_the_ceiling(
-    knobs, knobs_memory
-):
-    for thing in range(3):
-        episode = episode_of(knobs_memory, knobs, thing)
-        others = [v for v in range(0, len(EPISODE_SPHERE), 5) if v != episode.start]
-        best = max(episode.named_right([episode.start, view]) for view in others)
-        view = int(
-            TruthCeiling(episode).next_views(
-                episode.state([episode.start], ()), np.random.default_rng(0)
-            )[0]
-        )
-        assert episode.named_right([episode.start, view]) >= best
 
 
 # A recogniser of a user's own
@@ -359,53 +271,3 @@ def test_measures_are_those_of_a_hand_count():
     assert difference["low"].iloc[0] == pytest.approx(0.5)
     assert difference["high"].iloc[0] == pytest.approx(1)
     assert (rows["confusable half", "random"]["accuracy", 2]) == 0
-
-
-def paired(names, pose):
-    """An episode of each name; the policies are equally right, and find it with these errors."""
-    episodes = []
-    for name, (by_random, by_spread) in zip(names, pose, strict=True):
-        runs = {}
-        for policy, error in (("random", by_random), ("spread", by_spread)):
-            (run,) = runs_of(name, [True, True], [0.5, 0.6], [0, 1]).runs["random"]
-            runs[policy] = [replace_record(run, pose_error=[1.0, error])]
-        episodes.append(EpisodeRuns(name, 0, runs))
-    return episodes
-
-
-def test_p_values_of_families_are_those_of_a_brute_force():
-    rng = np.random.default_rng(4)
-    names = tuple(f"{letter}_{k}" for letter in "abcdefgh" for k in range(2))
-    alike = Alikeness(names, names, np.arange(16.0))
-    how = ThingSettings(views=(1, 2), threshold=0.97, families=True, samples=100)
-    right = rng.random((16, 2)) < (0.3, 0.9)
-    episodes = [
-        both(
-            name,
-            ([False, bool(a)], [0.5, 0.6], [0, 1]),
-            ([False, bool(b)], [0.5, 0.6], [0, 1]),
-        )
-        for name, (a, b) in zip(names, right, strict=True)
-    ]
-    tests = summarise_things(episodes, alike, how).tests
-    row = tests.query("set == 'all' and measure == 'accuracy'").iloc[0]
-    lead = (right[:, 1].astype(float) - right[:, 0]).reshape(8, 2).sum(1)
-    sums = [abs(np.dot(signs, lead)) for signs in product((1, -1), repeat=8)]
-    assert row["p"] == pytest.approx(np.mean(np.array(sums) >= abs(lead.sum())))
-    assert row["families"] == 8
-
-    pose = rng.gamma(2, 2, (16, 2)) * (2, 1)
-    tests = summarise_things(paired(names, pose), alike, how).tests
-    row = tests.query("set == 'all' and measure == 'pose error, 95 %'").iloc[0]
-
-    def far(errors):
-        ordered = np.sort(errors)
-        return ordered[int(np.ceil(0.95 * len(ordered) - 1e-9)) - 1]
-
-    assert row["difference"] == pytest.approx(far(pose[:, 1]) - far(pose[:, 0]))
-    count = 0
-    for signs in product((0, 1), repeat=8):
-        swapped = np.where(np.repeat(signs, 2)[:, None] == 1, pose[:, ::-1], pose)
-        apart = abs(far(swapped[:, 1]) - far(swapped[:, 0]))
-        count += apart >= abs(row["difference"]) - 1e-9
-    assert row["p"] == pytest.approx(count / 2**8)

@@ -12,36 +12,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline import store_of
 
 torch = pytest.importorskip("torch")
 L = pytest.importorskip("lightning")
 
 
 from nextview.errors import ModelError, ResultsError, UsageError
-from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview_lab.data.store import ViewStore
 from nextview_lab.training import recogniser_training as training
 from nextview_lab.training.export import export_map, export_recogniser
 from nextview_lab.training.fitting_set import hold_out
-from nextview_lab.training.map_training import Windows, train_map
-from nextview_lab.training.recipes import (
-    THESIS_RECOGNISER,
-    Hardware,
-    MapRecipe,
-    RecogniserRecipe,
-)
-from nextview_lab.training.recogniser_training import (
-    StoredInputs,
-    Views,
-    train_recogniser,
-)
+from nextview_lab.training.map_training import train_map
+from nextview_lab.training.recipes import Hardware, MapRecipe, RecogniserRecipe
+from nextview_lab.training.recogniser_training import StoredInputs, train_recogniser
 from nextview_lab.training.runs import fit, read_run
 
-V = 5
-SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
 RECIPE = RecogniserRecipe(size=32, epochs=3, views_per_object=4, batch=8)
 # Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16
 # gradient on a CPU is not always finite (torch 2.13).
@@ -62,61 +49,6 @@ SMALL_MAP = MapRecipe(
 # Batches
 
 
-def views_of(recipe, objects=6, views=V):
-    """Inputs whose pixels say which object and view they are."""
-    which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
-    source = StoredInputs(
-        np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects)
-    )
-    return Views([source], np.arange(objects), np.arange(objects) % 2, recipe)
-
-
-def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
-    views, orders = views_of(replace(THESIS_RECOGNISER, batch=5)), []
-    for views.epoch in (0, 1):
-        orders.append([int(x) for images, _ in views for x in images[:, 0, 0, 0]])
-    first, second = orders
-    assert sorted(first) == sorted(second) == list(range(6 * V))
-    assert first != second
-    assert (
-        np.concatenate([label for _, label in views]) == np.array(second) // V % 2
-    ).all()
-
-
-def test_map_batches_hold_each_view_with_its_own_map():
-    sphere, rng = ViewSphere.named("40"), np.random.default_rng(0)
-    values = rng.random((7, 40)).astype(np.float32)
-    # object and view, in the left half of the image
-    seen = np.zeros((7, 40, 4, 2, 2), np.uint8)
-    seen[..., 0, 0, 0], seen[..., 1, 0, 0] = (
-        np.arange(7)[:, None] + 1,
-        np.arange(40) + 1,
-    )
-    windows = Windows(
-        seen,
-        values,
-        sphere,
-        np.array([1, 2, 5]),
-        MapRecipe(views_per_object=6, batch=4),
-        training=True,
-    )
-    drawn, flips = [], []
-    for images, targets in windows:
-        assert len(images) == 4
-        for image, target in zip(images.numpy(), targets.numpy(), strict=True):
-            o, v = int(image[0].max()) - 1, int(image[1].max()) - 1
-            drawn.append((o, v))
-            flips.append(image[0, 0, 1] > 0)
-            steps = np.arange(8) * (-1 if flips[-1] else 1)
-            assert (
-                target == values[o, np.arange(5)[:, None] * 8 + (v + steps) % 8]
-            ).all()
-    assert len(drawn) == 16
-    assert len(set(drawn)) == 16  # no view comes twice before all have come
-    assert {o for o, _ in drawn} == {1, 2, 5}
-    assert 0 < sum(flips) < 16
-
-
 def test_folds_divide_every_class_evenly_and_keep_twins_together():
     labels, measured = (
         np.repeat([0, 1], [12, 8]),
@@ -128,40 +60,6 @@ def test_folds_divide_every_class_evenly_and_keep_twins_together():
     counts = np.array([np.bincount(labels[fold], minlength=2) for fold in folds])
     assert np.ptp(counts, axis=0).max() <= 2  # a twin of the other class may shift one
     assert any({3, 15} <= set(fold) for fold in folds)
-
-
-def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_path):
-    rng = np.random.default_rng(0)
-    azimuth = np.arange(8)
-    labels = np.repeat([0, 1, 2], 5)
-    values = []
-    # class k is its own mirror image in the plane at k steps: values depend on the distance to it
-    for plane in labels:
-        profile = rng.random((2, 5))
-        distance = np.minimum((azimuth - plane) % 8, (plane - azimuth) % 8)
-        values.append(profile[:, distance].ravel())
-    names = [f"object_{i}" for i in range(15)]
-    store = store_of(
-        tmp_path / "views.zarr", names, labels, SPHERE, depth_entropy=np.array(values)
-    )
-    assert training.mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
-    bins = training.azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)
-    assert bins[:, :, 0].tolist() == [[(-label) % 8] * 2 for label in labels]
-
-
-def test_the_side_between_two_steps_counts_by_nearness():
-    torch.manual_seed(0)
-    likely = torch.randn(3, 4, 8).log_softmax(2)
-    label, side = torch.tensor([0, 3, 1]), torch.tensor([2.0, 5.25, 7.5])
-    between = (
-        0.75 * likely[1, 3, 5]
-        + 0.25 * likely[1, 3, 6]
-        + 0.5 * likely[2, 1, 7]
-        + 0.5 * likely[2, 1, 0]
-    )
-    assert training.side_loss(likely, label, side) == pytest.approx(
-        -float(likely[0, 0, 2] + between) / 3, rel=1e-5
-    )
 
 
 # Runs
@@ -287,18 +185,6 @@ def test_the_best_epoch_is_kept(tmp_path, mode, best):
     fit(module, One(), One(), tmp_path, "score", mode, EXACT)
     assert module.weight.item() == best  # after as many steps
     assert log_of(tmp_path)["score"] == pytest.approx([0.5, 0.9, 0.7, 0.1])
-
-
-def test_a_run_without_progress_stops_and_stays_stopped(tmp_path):
-    scores = [0.5, 0.9, 0.7, 0.6, 1.0]
-    module = Scripted(scores, patience=2)
-    fit(module, One(), One(), tmp_path, "score", "max", EXACT)
-    assert module.trained == [0, 1, 2, 3]
-    assert module.weight.item() == 2  # after as many steps
-    again = Scripted(scores, patience=2)
-    fit(again, One(), One(), tmp_path, "score", "max", EXACT)
-    assert again.trained == []
-    assert again.weight.item() == 2
 
 
 # From views to models

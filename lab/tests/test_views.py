@@ -46,16 +46,14 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
         for name in NAMES:
             for column in ("value", "low", "high"):
                 assert found.loc[name, n_views, ours][column] == pytest.approx(
-                    summary.loc[name, column],
-                    abs=1e-9,
+                    summary.loc[name, column], abs=1e-9
                 )
     tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
     after = apart[apart["views"] == n_views].set_index("policy")
     for name in NAMES[1:]:
         for column in ("difference", "low", "high"):
             assert after.loc[name, column] == pytest.approx(
-                tests.loc[name, column],
-                abs=1e-9,
+                tests.loc[name, column], abs=1e-9
             )
         if name == "oracle-gain":  # it is no rival
             assert np.isnan(after.loc[name, "p"])
@@ -77,13 +75,6 @@ def test_the_report_draws_figures_and_tables_for_papers(made):
 
 def test_more_views_than_are_taken_are_refused(made, capsys):
     words = refused(
-        capsys,
-        "benchmark",
-        "classes",
-        made / "p.npz",
-        made / "no",
-        "--views",
-        "3",
-        "7",
+        capsys, "benchmark", "classes", made / "p.npz", made / "no", "--views", "3", "7"
     )
     assert "policies take 1 to 5 views (--max-views), and --views asks for 3 7" in words
