@@ -20,13 +20,16 @@ THING_POINTS = 80  # of each thing
 DRAWN_POINTS = 1500  # of each thing, from which these are chosen
 SEEN_POINTS = 100  # of a segment
 REFERENCES = 25  # of these, whose pairs are compared
-DISTANCE_STEP = 0.008  # metres
+# metres: steps of short distances, and the distance from which on they grow with it
+DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.06
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
 MOST_ALIKE = 600  # pairs of the things that one pair of a view votes for, at most
 FEWEST_VOTES = 3  # of a pose that is proposed
-PATCH = 0.009  # metres, half the side of the patch around a point that gives its normal
+# half the side of the patch around a point that gives its normal: metres and standard deviations of
+# the depth at least, pixels of the grid at most
+PATCH, PATCH_SIGMAS, MOST_REACH = 0.009, 4, 8
 FEWEST = 12  # points of such a patch
 
 
@@ -151,8 +154,10 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
     drawn = rng.permutation(cells)[: 4 * SEEN_POINTS]
     drawn = drawn[spread(view.points(drawn)[None], SEEN_POINTS)[0]]
     line, column = np.divmod(drawn, own.shape[1])
-    middle = float(np.median(grid.depth.ravel()[drawn]))
-    reach = int(np.clip(round(PATCH / middle / grid.pitch), 2, 8))
+    apart = float(np.median(grid.depth.ravel()[drawn])) * grid.pitch
+    sigma = float(np.median(grid.sigma.ravel()[drawn]))
+    size = max(PATCH, PATCH_SIGMAS * sigma, 2 * apart)
+    reach = min(round(size / apart), MOST_REACH)
     step = np.arange(-reach, reach + 1)
     lines = (line[:, None, None] + step[:, None]).clip(0, own.shape[0] - 1)
     columns = (column[:, None, None] + step).clip(0, own.shape[1] - 1)
@@ -160,7 +165,7 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
     points = view.points(around.ravel()).reshape(len(drawn), -1, 3)
     here = view.points(drawn)
     near = own.ravel()[around] & (
-        np.linalg.norm(points - here[:, None], axis=2) < 2 * PATCH
+        np.linalg.norm(points - here[:, None], axis=2) < 2 * size
     )
     count = np.maximum(near.sum(1), 1)[:, None]
     mean = (points * near[..., None]).sum(1) / count
@@ -197,7 +202,8 @@ def keys_of(points: Float, normals: Float, one: Index, two: Index) -> Index:
     way = points[two] - points[one]
     length = np.linalg.norm(way, axis=1)
     way = way / np.maximum(length, 1e-9)[:, None]
-    key = np.rint(length / DISTANCE_STEP).astype(np.int64)
+    steps = LONG_DISTANCE / DISTANCE_STEP * np.arcsinh(length / LONG_DISTANCE)
+    key = np.rint(steps).astype(np.int64)
     for a, b in (
         (normals[one], way),
         (normals[two], way),
