@@ -22,6 +22,7 @@ CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.6, 12.3, 0.5, 32.8
 LARGEST_LEAD = 0.1
 CONFIDENT = 0.97  # belief from which on a name is confident
 LIKELY = 0.4  # belief below which an object is unknown
+OUTLINE_PIXELS = 2.0  # of the grid, within which an outline is where it is measured
 SYMMETRIC = 1e9  # information about a turn that changes nothing, 1/radians^2
 LEAST_LISTED = 0.01  # belief in a pose that is listed beside the likeliest
 
@@ -127,6 +128,20 @@ def pose_candidates(
         left += normal_equations(world.library, view, some, 0.03, 96)[0]
     radius = world.library.radii[some.things]
     left *= 1 / MATCHING_ERROR**2 / ALIKE_POINTS
+    for number, view in enumerate(world.views):
+        # what is not hidden of its outline lies within pixels of the grid
+        scores = [world.scores[row][number] for row in rows]
+        shown = np.array(
+            [
+                0.0 if one is None else one.seen / (one.seen + one.hidden + 1)
+                for one in scores
+            ]
+        )
+        ray = some.centres - view.camera[:3, 3]
+        square = (ray**2).sum(1)[:, None, None]
+        across = np.eye(3) - ray[:, :, None] * ray[:, None] / square
+        error = OUTLINE_PIXELS * view.grid().pitch
+        left[:, 3:, 3:] += shown[:, None, None] * across / (square * error**2)
     # a pose is known to its thing's own size, at least
     left[:, range(3), range(3)] += 1.0
     left[:, range(3, 6), range(3, 6)] += 1 / radius[:, None] ** 2

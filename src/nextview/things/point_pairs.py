@@ -21,7 +21,7 @@ DRAWN_POINTS = 1500  # of each thing, from which these are chosen
 SEEN_POINTS = 100  # of a segment
 REFERENCES = 25  # of these, whose pairs are compared
 # metres: steps of short distances, and the distance from which on they grow with it
-DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.06
+DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.15
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
@@ -29,7 +29,7 @@ MOST_ALIKE = 600  # pairs of the things that one pair of a view votes for, at mo
 FEWEST_VOTES = 3  # of a pose that is proposed
 # half the side of the patch around a point that gives its normal: metres and standard deviations of
 # the depth at least, pixels of the grid at most
-PATCH, PATCH_SIGMAS, MOST_REACH = 0.009, 4, 8
+PATCH, PATCH_SIGMAS, MOST_REACH = 0.009, 3, 8
 FEWEST = 12  # points of such a patch
 
 

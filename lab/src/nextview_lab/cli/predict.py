@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from nextview.cli.common_options import NamedSplit, Workers
 from nextview.cli.progress import console, follow
 from nextview.errors import ModelError, UsageError
 from nextview.recognition.model_card import find_card, find_models
 from nextview_lab.data import predicting
+from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.store import ViewStore
 
 
@@ -79,8 +82,37 @@ def predict(
         f"predicting {store.name}",
     )
 
+    for line in summed_up(Predictions.load(out)):
+        console.print(line)
     console.print(
         f"predictions in {out}; compare policies with: nextview-lab benchmark classes {out}"
         " RESULTS",
         soft_wrap=True,
     )
+
+
+def summed_up(p: Predictions) -> list[str]:
+    """Describe the accuracy in each split, for single views and for all views together."""
+    lines: list[str] = []
+    answers = p.logits.argmax(2)
+    of_all = p.logits.sum(1).argmax(1)
+    if p.calibration.hypotheses:  # taught things: sum the belief over azimuths
+        classes = len(p.classes)
+        answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
+        of_all = p.calibration.log_belief(
+            p.log_evidence.sum(1),
+            len(p.sphere),
+            classes,
+        ).argmax(1)
+    right = answers == p.labels[:, None]
+    fused = of_all == p.labels
+
+    for split in np.unique(p.splits):
+        here = p.splits == split
+        shares = (
+            f"right from one view {right[here].mean():.3f}, from all {len(p.sphere)}"
+            f" {fused[here].mean():.3f}"
+        )
+        lines.append(f"{here.sum()} {split} objects: {shares}".replace("  ", " "))
+
+    return lines
