@@ -25,7 +25,7 @@ DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.15
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
-MOST_ALIKE = 600  # pairs of the things that one pair of a view votes for, at most
+COMMONEST = 600  # pairs of the things that are alike, above which they tell nothing
 FEWEST_VOTES = 3  # of a pose that is proposed
 # half the side of the patch around a point that gives its normal: metres and standard deviations of
 # the depth at least, pixels of the grid at most
@@ -106,14 +106,10 @@ class PointPairs:
             one = np.full(len(two), reference)
             keys = keys_of(points, normals, one, two)
             start = np.searchsorted(self.keys, keys)
-            every = np.searchsorted(self.keys, keys, "right") - start
-            lengths = np.minimum(every, MOST_ALIKE)
-            pairs = np.arange(lengths.sum()) - np.repeat(
-                np.cumsum(lengths) - lengths, lengths
-            )
-            # of too many pairs that are alike, some of all of them
-            pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
-            pairs += np.repeat(start, lengths)
+            lengths = np.searchsorted(self.keys, keys, "right") - start
+            lengths[lengths > COMMONEST] = 0
+            pairs = np.repeat(start - np.cumsum(lengths) + lengths, lengths)
+            pairs += np.arange(len(pairs))
             turn = np.repeat(turns_of(points, normals, one, two), lengths)
             turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
             bins = np.rint(turn).astype(np.int64) % TURNS
