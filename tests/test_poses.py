@@ -189,6 +189,9 @@ def test_simulated_cameras_give_it_in_the_object_frame(system, meshes, name):
     # A bottle looks the same from all azimuths, a carton after half a turn about each of its axes.
     orders = {"block": [], "bottle": [0], "carton": [2, 2, 2], "mug": []}
     assert sorted(symmetry.order for symmetry in result.symmetry) == orders[name]
+    if name == "mug":  # one view is enough for its name, and leaves a second pose
+        assert result.pose_candidates[0].probability > 0.5
+        return
     # Those of a carton look the same.
     assert len(result.pose_candidates) == 1 or name == "carton"
     assert share_of_likeliest(result.pose_candidates) == pytest.approx(1)

@@ -25,8 +25,8 @@ DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.15
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
-COMMONEST = 600  # pairs of the things that are alike, above which they tell nothing
-FEWEST_VOTES = 3  # of a pose that is proposed
+COMMONEST, COMMON_WEIGHT = 600, 0.25  # pairs that are alike at most, and what more tell
+FEWEST_VOTES = 2  # of a pose that is proposed
 # half the side of the patch around a point that gives its normal: metres and standard deviations of
 # the depth at least, pixels of the grid at most
 PATCH, PATCH_SIGMAS, MOST_REACH = 0.009, 3, 8
@@ -106,14 +106,19 @@ class PointPairs:
             one = np.full(len(two), reference)
             keys = keys_of(points, normals, one, two)
             start = np.searchsorted(self.keys, keys)
-            lengths = np.searchsorted(self.keys, keys, "right") - start
-            lengths[lengths > COMMONEST] = 0
-            pairs = np.repeat(start - np.cumsum(lengths) + lengths, lengths)
-            pairs += np.arange(len(pairs))
+            every = np.searchsorted(self.keys, keys, "right") - start
+            lengths = np.minimum(every, COMMONEST)
+            pairs = np.arange(lengths.sum()) - np.repeat(
+                np.cumsum(lengths) - lengths, lengths
+            )
+            # of pairs that are everywhere, some of all of them, and they tell less
+            pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
+            pairs += np.repeat(start, lengths)
+            weights = np.repeat(np.where(every > COMMONEST, COMMON_WEIGHT, 1), lengths)
             turn = np.repeat(turns_of(points, normals, one, two), lengths)
             turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
             bins = np.rint(turn).astype(np.int64) % TURNS
-            votes = np.bincount(self.first[pairs] * TURNS + bins)
+            votes = np.bincount(self.first[pairs] * TURNS + bins, weights)
             leading = np.flatnonzero(votes >= FEWEST_VOTES)
             found.append((np.full(len(leading), reference), leading, votes[leading]))
         references, places, values = (
