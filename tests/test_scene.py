@@ -18,6 +18,7 @@ from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
+from nextview.things.world import MOST_VIEWS
 
 
 def by_name(scene) -> dict:
@@ -37,6 +38,44 @@ def seen_once(first_look):
     """The camera and the scene after that frame, for one test."""
     camera, scene, _ = first_look
     return camera.again(), copy(scene)
+
+
+def test_a_frame_from_the_same_place_that_shows_nothing_new_is_not_kept(seen_once):
+    _, scene = seen_once
+    before = scene.objects
+    (first,) = scene.frames
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        noise = rng.normal(0, 5e-4, first.shape).astype(np.float32)
+        depth = np.where(first.depth > 0, first.depth + noise, 0)
+        look = scene.update(first.with_depth(depth))
+        assert look.taken
+        assert look.appeared == look.moved == look.gone == ()
+        assert scene.objects is before
+        assert len(scene.frames) == 1
+
+
+def test_of_many_frames_some_from_different_places_are_kept(seen_once):
+    camera, scene = seen_once
+    numbers = {one.name: one.number for one in scene.objects}
+    seen = {20: camera.owner}
+    for degrees in range(60, 380, 40):
+        look = scene.update(camera.frame(view(degrees)))
+        seen[degrees] = camera.owner
+        assert look.taken
+        assert look.moved == look.gone == look.joined == ()
+    assert len(scene.frames) == MOST_VIEWS
+    places = np.array([one.pose[:3, 3] for one in scene.frames])
+    assert np.linalg.norm(places[:, None] - places, axis=2)[0, 1:].min() > 0.2
+
+    found = by_name(scene)
+    assert {name: found[name].number for name in numbers} == numbers
+    for number, thing in enumerate(camera.table.things):
+        for k, mask in found[thing.name].pixels.items():
+            pose = scene.frames[k].pose
+            (owner,) = (seen[one] for one in seen if np.allclose(view(one), pose))
+            true = owner == number
+            assert (mask & true).sum() > 0.7 * mask.sum()
 
 
 def test_all_things_are_found_named_and_placed_in_one_frame(first_look, ycb_meshes):

@@ -596,7 +596,8 @@ class Scene:
         """
         # the pose of a camera that has not moved is as right as before
         stands = self._known_frames.stands(top.frame)
-        told = changes(before.world, view, stands)
+        kept = before.with_room()
+        told = changes(kept.world, view, stands)
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
         if told.wrong_pose:
@@ -607,10 +608,10 @@ class Scene:
         world = told.world.with_view(told.view, told.held)
         world = world.searched(np.ones(len(world.library), bool)).numbered()
         gone = {one.number: one for one in told.gone}
-        world, moved = _found_again(world, before.world, gone)
-        state = replace(before, world=world, tops=(*before.tops, top)).settled()
+        world, moved = _found_again(world, kept.world, gone)
+        state = replace(kept, world=world, tops=(*kept.tops, top))
         state = self._ruled(state.named({}))
-        look = _look(before, state, (*told.moved, *moved), gone)
+        look = _look(kept, state, (*told.moved, *moved), gone)
         if look.moved and not (told.stand or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look

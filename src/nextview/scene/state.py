@@ -56,8 +56,8 @@ class SceneState:
         objects = objects_of(self.world, self.tops, ruled_out)
         return replace(self, objects=objects, ruled_out=ruled_out)
 
-    def settled(self) -> SceneState:
-        """Return the scene without a frame that tells little, if there are many."""
+    def with_room(self) -> SceneState:
+        """Return the scene with room for another frame, if need be without an earlier one."""
         number = self.world.redundant()
         if number is None:
             return self

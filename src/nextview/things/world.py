@@ -344,11 +344,11 @@ class World:
         )
 
     def redundant(self) -> int | None:
-        """Return the number of the view that tells least beside the others; None if all are kept.
+        """Return the number of the view that has to go for another one; None for none.
 
         It is the one taken nearest to another one. What shows a thing alone is kept.
         """
-        if len(self.views) <= MOST_VIEWS:
+        if len(self.views) < MOST_VIEWS:
             return None
         places = np.array([view.camera[:3, 3] for view in self.views])
         apart = np.linalg.norm(places[:, None] - places, axis=2)
