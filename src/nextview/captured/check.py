@@ -237,14 +237,16 @@ def _disagree(capture: Capture, looks: str) -> DatasetError:
 def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
     """Return the mistake without which frames agree much better; single ones before pairs."""
     as_read = compare(posed.views, posed.poses)
+    # correct poses of a real camera leave half of this share contradicted
     if as_read.judged > 0.25 * _judgeable(posed.views) and as_read.wrong < 0.05:
-        return (
-            None  # correct poses of a real camera leave half of this share contradicted
-        )
+        return None
+
     single = mistakes(stored)
     found = _likeliest(posed, single, stored.median_depth)
     if found is not None:
         return found
+
+    # pairs take longer: among few frames first
     pairs = (
         one.with_another(other)
         for one, other in combinations([one for one in single if one.combines], 2)
@@ -357,6 +359,7 @@ def _to_blame(agreements: Sequence[Agreement]) -> dict[int, float]:
                 for row in own
             ]
         )
+
         usual = float(np.median(wrong[kept]))
         worst = int(wrong.argmax())
         if wrong[worst] <= np.clip(TIMES_USUAL * usual, MUCH_CONTRADICTED, 0.5):

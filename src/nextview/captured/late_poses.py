@@ -69,6 +69,7 @@ class _Delayed:
                         self.poses[np.clip(self.indices + here, 0, last)],
                         self.poses[np.clip(self.indices + there, 0, last)],
                     )
+
                 pairs = np.ix_(late == here, late_there == there)
                 known = self._known[here, there]
                 found[0][pairs] = known.confirmed[pairs]

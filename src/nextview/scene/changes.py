@@ -132,6 +132,7 @@ def _still(world: World, view: View) -> Changes | None:
         numbers = [one.number for one in world.things if counts[one.number]]
         if any(same[number] < STILL * counts[number] for number in numbers):
             return None
+
         held = np.zeros(len(owner), np.int32)
         stride = view.stride
         nothing = before is world.views[-1] and all(
@@ -172,6 +173,8 @@ def _unnamed(world: World, view: View, others: Sequence[_Compared]) -> list[_Com
             surfaces.append(surface)
     if not things:
         return []
+
+    # points that these cameras may see are enough
     cameras = np.array([one.camera[:3, 3] for one in (*world.views, view)])
     away = np.concatenate([cameras - surface.centre for surface in surfaces])
     nearest = np.unique((away @ ALL_AROUND.T).argmax(1))

@@ -67,6 +67,7 @@ class PointPairs:
         )
         own = points[row, some].astype(np.float64)
         facing = normals[row, some].astype(np.float64)
+
         one, two = np.nonzero(~np.eye(THING_POINTS, dtype=bool))
         keys, turns = [], []
         for at, away in zip(own, facing, strict=True):
@@ -98,37 +99,23 @@ class PointPairs:
         points, normals = oriented(view, mask)
         if len(points) < FEWEST:
             return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
-        found: list[tuple[Index, Index, Index]] = []
-        for reference in spread(points[None], REFERENCES)[0]:
-            two = np.flatnonzero(
-                np.linalg.norm(points - points[reference], axis=1) > DISTANCE_STEP
-            )
-            one = np.full(len(two), reference)
-            keys = keys_of(points, normals, one, two)
-            start = np.searchsorted(self.keys, keys)
-            every = np.searchsorted(self.keys, keys, "right") - start
-            lengths = np.minimum(every, COMMONEST)
-            pairs = np.arange(lengths.sum()) - np.repeat(
-                np.cumsum(lengths) - lengths, lengths
-            )
-            # of pairs that are everywhere, some of all of them, and they tell less
-            pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
-            pairs += np.repeat(start, lengths)
-            weights = np.repeat(np.where(every > COMMONEST, COMMON_WEIGHT, 1), lengths)
-            turn = np.repeat(turns_of(points, normals, one, two), lengths)
-            turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
-            bins = np.rint(turn).astype(np.int64) % TURNS
-            votes = np.bincount(self.first[pairs] * TURNS + bins, weights)
-            leading = np.flatnonzero(votes >= FEWEST_VOTES)
-            found.append((np.full(len(leading), reference), leading, votes[leading]))
-        references, places, values = (
+        found = [
+            (np.full(len(places), reference), places, votes)
+            for reference in spread(points[None], REFERENCES)[0]
+            for places, votes in [self._votes(points, normals, reference)]
+        ]
+        references, places, votes = (
             np.concatenate(each) for each in zip(*found, strict=True)
         )
         things, places = np.divmod(places, THING_POINTS * TURNS)
-        order = np.argsort(-values, kind="stable")
+
+        # the most votes of each thing first
+        order = np.argsort(-votes, kind="stable")
         order = order[rank_within(things[order]) < most]
         things, references, places = things[order], references[order], places[order]
         own, turn = np.divmod(places, TURNS)
+
+        # both normals are turned to one axis, and the thing about that axis
         to_scan = frames(self.normals[things, own])
         to_view = frames(normals[references])
         angle = turn * (2 * np.pi / TURNS)
@@ -138,10 +125,46 @@ class PointPairs:
         about[:, 2, 1] = np.sin(angle)
         about[:, 1, 2] = -np.sin(angle)
         rotations = to_view.swapaxes(1, 2) @ about @ to_scan
-        centres = points[references] - np.einsum(
-            "nij,nj->ni", rotations, self.points[things, own]
-        )
-        return things, rotations, centres
+        middles = np.einsum("nij,nj->ni", rotations, self.points[things, own])
+        return things, rotations, points[references] - middles
+
+    def _votes(
+        self, points: Float, normals: Float, reference: int
+    ) -> tuple[Index, Float]:
+        """Return what a point of a view may be, and how many of its pairs say so.
+
+        Args:
+            points: of the view, (N, 3), metres.
+            normals: their unit normals, (N, 3).
+            reference: number of the point.
+
+        Returns:
+            Points of things, counted over all, times TURNS, plus the step of the turn about the
+            normal, (K,); and the votes of each, (K,).
+        """
+        away = np.linalg.norm(points - points[reference], axis=1)
+        two = np.flatnonzero(away > DISTANCE_STEP)
+        one = np.full(len(two), reference)
+        keys = keys_of(points, normals, one, two)
+        start = np.searchsorted(self.keys, keys)
+        every = np.searchsorted(self.keys, keys, "right") - start
+
+        # of pairs that are everywhere, some of all of them, and they tell less
+        lengths = np.minimum(every, COMMONEST)
+        before = np.cumsum(lengths) - lengths
+        pairs = np.arange(lengths.sum()) - np.repeat(before, lengths)
+        pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
+        pairs += np.repeat(start, lengths)
+        tells = np.where(every > COMMONEST, COMMON_WEIGHT, 1.0)
+
+        turn = np.repeat(turns_of(points, normals, one, two), lengths)
+        turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
+        bins = np.rint(turn).astype(np.int64) % TURNS
+        votes: Float = np.bincount(
+            self.first[pairs] * TURNS + bins, np.repeat(tells, lengths)
+        ).astype(np.float64)
+        leading = np.flatnonzero(votes >= FEWEST_VOTES)
+        return leading, votes[leading]
 
 
 def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
@@ -154,6 +177,8 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
     rng = np.random.default_rng(0)
     drawn = rng.permutation(cells)[: 4 * SEEN_POINTS]
     drawn = drawn[spread(view.points(drawn)[None], SEEN_POINTS)[0]]
+
+    # the pixels of a patch around each
     line, column = np.divmod(drawn, own.shape[1])
     apart = float(np.median(grid.depth.ravel()[drawn])) * grid.pitch
     sigma = float(np.median(grid.sigma.ravel()[drawn]))
@@ -164,6 +189,8 @@ def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
     columns = (column[:, None, None] + step).clip(0, own.shape[1] - 1)
     around = (lines * own.shape[1] + columns).reshape(len(drawn), -1)
     points = view.points(around.ravel()).reshape(len(drawn), -1, 3)
+
+    # a plane through those that are near
     here = view.points(drawn)
     near = own.ravel()[around] & (
         np.linalg.norm(points - here[:, None], axis=2) < 2 * size

@@ -68,6 +68,8 @@ def _of_segment(
     found = found[np.flatnonzero(among[found.things])]
     if not len(found):
         return None
+
+    # many at first, with few points each
     outline = Outline.of(mask)
     found = register(library, [view], found, (0.3,), 32, outline)
     match = matched(library, view, found, mask, 32)
@@ -77,6 +79,8 @@ def _of_segment(
     if match.max() < LEAST_MATCH:
         return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
+
+    # fewer closer, then by their score
     closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
     found = register(library, [view], found, closer, 96, instances)
     totals = _totals(library, view, found, COARSEST)
