@@ -21,8 +21,31 @@ from nextview.types import Float, Float32, Index, Mask
 CAMERA_ERROR = 0.006, 0.004
 LEAST_CAMERA_ERROR = 1e-4  # metres: a more accurate camera counts as exact
 OTHER_SIZE = 1.12  # factor by which what looks alike differs in size, at least
+AS_LARGE = 1.3  # factor of the extents, within which two things may look alike
 TURNS = 24  # rotations that are tried of what is nearly round
+# none, and half turns about each axis
+HALF_TURNS = np.array([np.diag(one) for one in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))])
 PARALLEL = 0.99  # cosine of the angle between two axes that are one
+
+
+@dataclass(frozen=True, eq=False)
+class Principal:
+    """Principal axes of T things.
+
+    Attributes:
+        middles: mean of the visible points of each, relative to its centre, (T, 3), metres.
+        axes: of each, the shortest first, as rows of a rotation, (T, 3, 3).
+        extents: of each along these axes, (T, 3), metres.
+    """
+
+    middles: Float
+    axes: Float
+    extents: Float
+
+    def alike(self, thing: int) -> Index:
+        """Return the things that are about as large as one along each axis, itself among them."""
+        factors = self.extents / self.extents[thing]
+        return np.flatnonzero((np.abs(np.log(factors)) < np.log(AS_LARGE)).all(1))
 
 
 class Library:
@@ -80,12 +103,15 @@ class Library:
         )
 
     @cached_property
-    def half_turns(self) -> Float:
-        """Half turns about the principal axes of each thing, (T, 3, 3, 3)."""
+    def principal(self) -> Principal:
+        """Principal axes of the things."""
         points = self.visible.points.reshape(len(self), -1, 3).astype(np.float64)
-        points -= points.mean(1, keepdims=True)
+        middles = points.mean(1)
+        points -= middles[:, None]
         axes = np.linalg.eigh(points.swapaxes(1, 2) @ points)[1].swapaxes(1, 2)
-        return 2 * axes[..., :, None] * axes[..., None, :] - np.eye(3)
+        axes[:, 2] *= np.linalg.det(axes)[:, None]
+        along = np.einsum("tij,tnj->tin", axes, self.corners - middles[:, None])
+        return Principal(middles, axes, np.ptp(along, axis=2))
 
     def for_cameras(self, place: float, aim: float) -> Library:
         """Return the library for cameras with another accuracy of their poses.
@@ -212,20 +238,26 @@ class Hypotheses:
         sizes = self.sizes[:, None] * factors
         return replace(self[rows], sizes=sizes.reshape(-1, 3))
 
-    def lookalikes(self, library: Library) -> Hypotheses:
-        """Return poses in which these may look nearly the same, turned about their centroids."""
-        turned = [self[:0]]
-        for row, thing in enumerate(self.things):
+    def lookalikes(self, library: Library) -> list[Hypotheses]:
+        """Return for each of these what may look nearly the same in its place.
+
+        That is the thing after turns of near symmetries, and all things that are about as large,
+        with their principal axes along its own.
+        """
+        own = library.principal
+        found = []
+        for thing, rotation, centre in zip(
+            self.things, self.rotations, self.centres, strict=True
+        ):
             near = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
-            turns = np.concatenate([near, library.half_turns[thing]])
-            some = self[np.full(len(turns), row)]
-            arm = library.caster.surfaces[thing].centroid - library.centres[thing]
-            rotations = some.rotations @ turns
-            moved = (some.rotations - rotations) @ arm
-            turned.append(
-                replace(some, rotations=rotations, centres=some.centres + moved)
-            )
-        return Hypotheses.joined(turned)
+            others = own.alike(thing)
+            turned = own.axes[thing].T @ HALF_TURNS @ own.axes[others][:, None]
+            things = np.append(np.full(len(near), thing), np.repeat(others, 4))
+            rotations = rotation @ np.concatenate([near, turned.reshape(-1, 3, 3)])
+            arms = np.einsum("nij,nj->ni", rotations, own.middles[things])
+            centres = centre + rotation @ own.middles[thing] - arms
+            found.append(Hypotheses.of(things, rotations, centres))
+        return found
 
     def pose(self, row: int, library: Library) -> Float:
         """Return the pose of the scan of one, scan-to-world, (4, 4) float64, metres."""

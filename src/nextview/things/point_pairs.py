@@ -20,8 +20,8 @@ THING_POINTS = 80  # of each thing
 DRAWN_POINTS = 1500  # of each thing, from which these are chosen
 SEEN_POINTS = 100  # of a segment
 REFERENCES = 25  # of these, whose pairs are compared
-# metres: steps of short distances, and the distance from which on they grow with it
-DISTANCE_STEP, LONG_DISTANCE = 0.008, 0.15
+# metres: steps of short distances, and the distance from which on they grow with it; and their number
+DISTANCE_STEP, LONG_DISTANCE, DISTANCES = 0.008, 0.15, 64
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
@@ -40,14 +40,16 @@ class PointPairs:
     Attributes:
         points: of each thing, relative to its centre, (T, N, 3) float64, metres.
         normals: their unit normals, (T, N, 3) float64.
-        keys: of each pair what no motion changes, rounded, in ascending order, (P,) int64.
-        first: number of its first point, counted over all things, (P,) int32.
-        turns: of its second point about the normal of the first one, radians, (P,) float32.
+        starts: of the pairs with each key, in the order of all pairs, (K + 1,) int64.
+        common: keys of which only some pairs are kept, (K,) bool.
+        first: number of the first point of each pair, counted over all things, (P,) int32.
+        turns: of its second point about the normal of the first one, steps, (P,) float32.
     """
 
     points: Float
     normals: Float
-    keys: Index
+    starts: Index
+    common: Mask
     first: NDArray[np.int32]
     turns: Float32
 
@@ -72,46 +74,67 @@ class PointPairs:
         keys, turns = [], []
         for at, away in zip(own, facing, strict=True):
             keys.append(keys_of(at, away, one, two))
-            turns.append(turns_of(at, away, one, two).astype(np.float32))
-        first = (one + THING_POINTS * row).astype(np.int32)
+            turns.append(turns_of(at, away, one, two))
+        first = (one + THING_POINTS * row).astype(np.int32).ravel()
         every = np.concatenate(keys)
-        order = np.argsort(every, kind="stable")
+        counts = np.bincount(every, minlength=DISTANCES * ANGLES**3)
+
+        # of pairs that are everywhere, some of all of them
+        lengths = np.minimum(counts, COMMONEST)
+        starts = np.append(0, np.cumsum(lengths))
+        place = np.arange(starts[-1]) - np.repeat(starts[:-1], lengths)
+        place = place * np.repeat(counts, lengths) // np.repeat(lengths, lengths)
+        place += np.repeat(np.cumsum(counts) - counts, lengths)
+        kept = np.argsort(every, kind="stable")[place]
         return cls(
             own,
             facing,
-            every[order],
-            first.ravel()[order],
-            np.concatenate(turns)[order],
+            starts,
+            counts > COMMONEST,
+            first[kept],
+            np.concatenate(turns)[kept],
         )
 
-    def propose(self, view: View, mask: Mask, most: int) -> tuple[Index, Float, Float]:
+    def propose(
+        self, view: View, mask: Mask, among: Mask, most: int, of_one: int
+    ) -> tuple[Index, Float, Float]:
         """Propose poses of things that a segment may show a part of.
 
         Args:
             view: the view.
             mask: pixels of the segment, (H, W) bool.
-            most: number of poses of one thing, at most.
+            among: things that it may show, (T,) bool.
+            most: number of poses, at most.
+            of_one: number of poses of one thing, at most.
 
         Returns:
-            M poses: the number of the thing, (M,) int64; its rotation from the axes of its scan to
+            M poses, the most votes first: the number of the thing, (M,) int64; its rotation from the axes of its scan to
             the world, (M, 3, 3); and its centre in the world, (M, 3), metres.
         """
         points, normals = oriented(view, mask)
         if len(points) < FEWEST:
             return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        # what no motion changes of the pairs of each reference
+        some = spread(points[None], REFERENCES)[0]
+        one, two = np.repeat(some, len(points)), np.tile(np.arange(len(points)), len(some))
+        keys = keys_of(points, normals, one, two).reshape(len(some), -1)
+        turns = turns_of(points, normals, one, two).reshape(len(some), -1)
+        apart = np.linalg.norm(points[one] - points[two], axis=1).reshape(keys.shape)
         found = [
             (np.full(len(places), reference), places, votes)
-            for reference in spread(points[None], REFERENCES)[0]
-            for places, votes in [self._votes(points, normals, reference)]
+            for reference, key, turn, far in zip(
+                some, keys, turns, apart > DISTANCE_STEP, strict=True
+            )
+            for places, votes in [self._votes(key[far], turn[far])]
         ]
         references, places, votes = (
             np.concatenate(each) for each in zip(*found, strict=True)
         )
         things, places = np.divmod(places, THING_POINTS * TURNS)
 
-        # the most votes of each thing first
         order = np.argsort(-votes, kind="stable")
-        order = order[rank_within(things[order]) < most]
+        order = order[among[things[order]]]
+        order = order[rank_within(things[order]) < of_one][:most]
         things, references, places = things[order], references[order], places[order]
         own, turn = np.divmod(places, TURNS)
 
@@ -128,41 +151,25 @@ class PointPairs:
         middles = np.einsum("nij,nj->ni", rotations, self.points[things, own])
         return things, rotations, points[references] - middles
 
-    def _votes(
-        self, points: Float, normals: Float, reference: int
-    ) -> tuple[Index, Float]:
+    def _votes(self, keys: Index, turns: Float32) -> tuple[Index, Float]:
         """Return what a point of a view may be, and how many of its pairs say so.
 
         Args:
-            points: of the view, (N, 3), metres.
-            normals: their unit normals, (N, 3).
-            reference: number of the point.
+            keys: of its pairs, (N,) int64.
+            turns: of the second point of each about the normal of the first one, steps, (N,).
 
         Returns:
             Points of things, counted over all, times TURNS, plus the step of the turn about the
             normal, (K,); and the votes of each, (K,).
         """
-        away = np.linalg.norm(points - points[reference], axis=1)
-        two = np.flatnonzero(away > DISTANCE_STEP)
-        one = np.full(len(two), reference)
-        keys = keys_of(points, normals, one, two)
-        start = np.searchsorted(self.keys, keys)
-        every = np.searchsorted(self.keys, keys, "right") - start
-
-        # of pairs that are everywhere, some of all of them, and they tell less
-        lengths = np.minimum(every, COMMONEST)
-        before = np.cumsum(lengths) - lengths
-        pairs = np.arange(lengths.sum()) - np.repeat(before, lengths)
-        pairs = pairs * np.repeat(every, lengths) // np.repeat(lengths, lengths)
-        pairs += np.repeat(start, lengths)
-        tells = np.where(every > COMMONEST, COMMON_WEIGHT, 1.0)
-
-        turn = np.repeat(turns_of(points, normals, one, two), lengths)
-        turn = (turn - self.turns[pairs]) / (2 * np.pi) * TURNS
-        bins = np.rint(turn).astype(np.int64) % TURNS
-        votes: Float = np.bincount(
-            self.first[pairs] * TURNS + bins, np.repeat(tells, lengths)
-        ).astype(np.float64)
+        start = self.starts[keys]
+        lengths = self.starts[keys + 1] - start
+        ends = np.cumsum(lengths)
+        pairs = np.repeat(start - ends + lengths, lengths) + np.arange(lengths.sum())
+        steps = np.rint(np.repeat(turns, lengths) - self.turns[pairs]).astype(np.int32)
+        places = self.first[pairs] * TURNS + steps % TURNS
+        tells = np.where(self.common[keys], COMMON_WEIGHT, 1.0)
+        votes = np.bincount(places, np.repeat(tells, lengths))
         leading = np.flatnonzero(votes >= FEWEST_VOTES)
         return leading, votes[leading]
 
@@ -231,7 +238,7 @@ def keys_of(points: Float, normals: Float, one: Index, two: Index) -> Index:
     length = np.linalg.norm(way, axis=1)
     way = way / np.maximum(length, 1e-9)[:, None]
     steps = LONG_DISTANCE / DISTANCE_STEP * np.arcsinh(length / LONG_DISTANCE)
-    key = np.rint(steps).astype(np.int64)
+    key = np.minimum(np.rint(steps), DISTANCES - 1).astype(np.int64)
     for a, b in (
         (normals[one], way),
         (normals[two], way),
@@ -251,10 +258,11 @@ def frames(normals: Floats) -> Float:
     return np.stack([x, y, np.cross(x, y)], 1)
 
 
-def turns_of(points: Float, normals: Float, one: Index, two: Index) -> Float:
-    """Return the turn of the second point of each pair about the normal of the first, radians."""
+def turns_of(points: Float, normals: Float, one: Index, two: Index) -> Float32:
+    """Return the turn of the second point of each pair about the normal of the first, steps."""
     way = np.einsum("nij,nj->ni", frames(normals)[one], points[two] - points[one])
-    return np.arctan2(way[:, 2], way[:, 1])
+    turn = np.arctan2(way[:, 2], way[:, 1]) * (TURNS / (2 * np.pi))
+    return turn.astype(np.float32)
 
 
 def rank_within(things: Index) -> Index:

@@ -16,15 +16,16 @@ from nextview.things.register import Outline, Projected, register
 from nextview.things.score import score
 from nextview.types import Float, Mask
 
-PROPOSED = 30  # poses of one thing that pairs of points propose, at most
-REGISTERED = 700  # poses that are registered after a first look, at most
+PROPOSED = 600  # poses that pairs of points propose, at most
+PROPOSED_OF_ONE = 20  # the same of one thing
+REGISTERED = 120  # poses that are registered after a first look, at most
 LEAST_MATCH = (
     0.1  # of the best hypothesis of a segment, below which it shows none of the things
 )
-MATCHED = 80  # hypotheses that are registered more closely, at most
-MATCHED_OF_ONE = 6  # the same of one thing
-SCORED = 24  # hypotheses that are rendered, at most
-SCORED_OF_ONE = 4
+MATCHED = 40  # hypotheses that are registered more closely, at most
+MATCHED_OF_ONE = 4  # the same of one thing
+SCORED = 16  # hypotheses that are rendered, at most
+SCORED_OF_ONE = 3
 KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2
 SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
@@ -64,8 +65,8 @@ def _of_segment(
 
     A thing may go on in other instances, so at last it is drawn into these, too.
     """
-    found = Hypotheses.of(*library.visible.pairs.propose(view, mask, PROPOSED))
-    found = found[np.flatnonzero(among[found.things])]
+    pairs = library.visible.pairs
+    found = Hypotheses.of(*pairs.propose(view, mask, among, PROPOSED, PROPOSED_OF_ONE))
     if not len(found):
         return None
 

@@ -34,6 +34,7 @@ EXPLAINED_OF_UNION = (
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
 RIVALS_OF_ONE = 2
+LOOKALIKES, LOOKALIKES_OF_ONE = 4, 2  # of a new or doubtful thing that are kept
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
@@ -213,14 +214,19 @@ class World:
         return np.array(rows, np.int64)
 
     def with_lookalikes(self) -> World:
-        """Return the world with the poses in which new or doubtful things look nearly the same."""
-        rows = self._doubtful()
-        new = self.hypotheses[rows].lookalikes(self.library)
-        if not len(new):
+        """Return the world with what may look nearly the same as new or doubtful things."""
+        groups = self.hypotheses[self._doubtful()].lookalikes(self.library)
+        if not groups:
             return self
+        new = Hypotheses.joined(groups)
         new = register(self.library, self.views, new, (0.2, 0.15, 0.1, 0.06, 0.03), 96)
-        some = best(self.library, new, self._coarse_totals(new), 3 * len(rows), 3)
-        return self.with_hypotheses(some).chosen()
+        totals = self._coarse_totals(new)
+        ends = np.cumsum([len(one) for one in groups])
+        some = [
+            best(self.library, new[rows], totals[rows], LOOKALIKES, LOOKALIKES_OF_ONE)
+            for rows in np.split(np.arange(len(new)), ends[:-1])
+        ]
+        return self.with_hypotheses(Hypotheses.joined(some)).chosen()
 
     def _coarse_totals(self, some: Hypotheses) -> Float:
         """Score hypotheses on a coarser grid of all views, nats, (M,)."""
