@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from nextview.sensing.view import View
 from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
-from nextview.things.propose import COARSER, best, propose
+from nextview.things.propose import COARSER, COARSEST, best, propose
 from nextview.things.register import camera_error, register
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
@@ -230,7 +230,7 @@ class World:
 
     def _coarse_totals(self, some: Hypotheses) -> Float:
         """Score hypotheses on a coarser grid of all views, nats, (M,)."""
-        columns = [score(self.library, one, some, COARSER) for one in self.views]
+        columns = [score(self.library, one, some, COARSEST) for one in self.views]
         return np.array([total(row) for row in zip(*columns, strict=True)])
 
     def with_hypotheses(self, new: Hypotheses) -> World:
@@ -478,7 +478,8 @@ def corrected(world: World, view: View) -> View:
     values = []
     for one in tried:
         value = -_cost(view, one, world.library.camera)
-        for found, most in zip(score(world.library, one, some), usual, strict=True):
+        scores = score(world.library, one, some, COARSER)
+        for found, most in zip(scores, usual, strict=True):
             if found is not None:
                 value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
         values.append(value)
