@@ -20,6 +20,7 @@ from nextview.sensing.view import View
 from nextview.things.point_pairs import (
     ANGLE_STEP,
     DISTANCE_STEP,
+    TURNS,
     frames,
     keys_of,
     oriented,
@@ -27,7 +28,7 @@ from nextview.things.point_pairs import (
     spread,
     turns_of,
 )
-from nextview.things.propose import PROPOSED
+from nextview.things.propose import PROPOSED, PROPOSED_OF_ONE
 from nextview.things.target import view_of
 from nextview.things.visible_points import looking_from, spread_directions
 
@@ -42,7 +43,9 @@ def library():
 
 
 def proposed(library, view: View):
-    return library.visible.pairs.propose(view, view.labels > 0, PROPOSED)
+    among = np.ones(len(library), bool)
+    pairs = library.visible.pairs
+    return pairs.propose(view, view.labels > 0, among, PROPOSED, PROPOSED_OF_ONE)
 
 
 def test_a_motion_changes_no_key_and_no_turn():
@@ -59,8 +62,8 @@ def test_a_motion_changes_no_key_and_no_turn():
     # the turns of all partners of a point change by the same angle
     change = turns_of(*moved, one, two) - turns_of(points, normals, one, two)
     for first in range(30):
-        angles = np.exp(1j * change[one == first])
-        np.testing.assert_allclose(angles, angles[0], atol=1e-6)
+        angles = np.exp(2j * np.pi / TURNS * change[one == first])
+        np.testing.assert_allclose(angles, angles[0], atol=1e-5)
 
 
 def test_a_key_tells_pairs_of_another_distance_or_angle_apart():

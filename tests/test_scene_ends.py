@@ -57,6 +57,16 @@ def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
     assert scene.target is not None
 
 
+def test_what_the_empty_place_shows_is_known(ycb):
+    empty = sunk_bin(False)
+    scene = nextview.Scene(ycb, region=around(0.15), background=[empty])
+    look = scene.update(Frame(empty.depth + 1e-5, K, FROM_ABOVE))
+    assert scene.objects == ()
+    assert "unexplained" not in names(look)
+    look = scene.update(sunk_bin(True))
+    assert scene.objects or "unexplained" in names(look)
+
+
 @pytest.fixture(scope="module")
 def first_look(ycb):
     """A camera over a box and a plate, and a scene that has taken one low frame of it."""

@@ -13,9 +13,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from nextview.scene.followed import SURPRISE
-from nextview.sensing.view import LEAST_ERROR, View
+from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
@@ -134,11 +135,11 @@ def _still(world: World, view: View) -> Changes | None:
             return None
 
         held = np.zeros(len(owner), np.int32)
-        stride = view.stride
-        nothing = before is world.views[-1] and all(
-            alike[mask[::stride, ::stride].ravel()].mean() > EXPLAINED
-            for mask in view.instances()
-        )
+        depth = view.grid().depth
+        new = (depth > 0) & ~alike.reshape(depth.shape)
+        new = ndimage.binary_opening(new, np.ones((3, 3), bool))
+        few = int(np.count_nonzero(new)) < FEWEST_PIXELS
+        nothing = before is world.views[-1] and few
         view = view.seen_from(before.camera)
         return Changes(world, view, held, stand=tuple(numbers), nothing=nothing)
     return None

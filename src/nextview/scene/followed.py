@@ -53,8 +53,7 @@ def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
         noise: of its depth.
         ground: on which things stand; None if it is not known.
     """
-    none = np.zeros(frame.shape, bool)
-    surface = none
+    surface = np.zeros(frame.shape, bool)
     if ground is not None:
         height = np.abs(frame.along(ground.normal, ground.offset))
         surface = (
@@ -62,7 +61,7 @@ def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
         )
     labels = np.zeros(frame.shape, np.int32)
     camera = frame.camera_to_world
-    return View(frame, camera, noise, labels, labels, surface, none, frame.depth > 0)
+    return View(frame, camera, noise, labels, labels, surface, frame.depth > 0)
 
 
 def followed(library: Library, view: View, body: Body) -> Followed:

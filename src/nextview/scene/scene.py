@@ -36,7 +36,7 @@ from nextview.scene.view_policies import (
     SceneChoice,
     ScenePolicy,
 )
-from nextview.segmentation.instances import Instances, Segmenter, instances_of
+from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import (
     REPEATED,
@@ -49,7 +49,7 @@ from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
-from nextview.sensing.view import View
+from nextview.sensing.view import View, shown_before
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.reach import (
@@ -156,6 +156,8 @@ class Scene:
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
+        background: frames of the empty place, before anything was put there, such as a cell or a
+            bin: what they show, too, is no object.
         rule: rules out names of objects, given all objects, see ``scene.rule.SceneRule``.
 
     Raises:
@@ -174,6 +176,7 @@ class Scene:
         rng: np.random.Generator | None = None,
         travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
         rule: SceneRule | None = None,
+        background: Sequence[Frame] = (),
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -192,6 +195,7 @@ class Scene:
         self.travel_cost = travel_cost
         self.segmentation = segmentation
         self.rule = rule
+        self.background = tuple(background)
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
 
@@ -567,7 +571,11 @@ class Scene:
         if self.region is not None:
             inside = inside & inside_box(frame, self.region)
         instances = instances_of(self.segmentation, frame, self.up)
-        masks = tuple(mask & inside for mask in instances.masks)
+        known = np.zeros(frame.shape, bool)
+        for empty in self.background:
+            known |= shown_before(frame, empty)
+        masks = tuple(mask & inside & ~known for mask in instances.masks)
+        background = instances.background | known
 
         earlier = before[-1] if before else None
         up = None if frame.pose is None else self.up
@@ -575,15 +583,27 @@ class Scene:
             up = earlier.plane.normal
         seen = segmented_frame(
             frame,
-            replace(instances, masks=masks),
+            replace(instances, masks=masks, background=background),
             up,
             () if earlier is None else earlier.seen.levels,
         )
+        carried = seen.with_carried()
+        if self.background:
+            # what is not of the empty place is a thing, whatever carries it
+            seen = carried
+        else:
+            masks = carried.masks
         warnings = tuple(check_mistakes(seen, self._known_frames))
         ground = None if earlier is None else earlier.plane
         top = TableTop.of(seen, self.up, ground, inside, self._widest, warnings)
-        carried = _carried(instances, top)
-        view = View.of(frame, carried, inside, top.height, self._widest)
+        view = View.of(
+            frame,
+            replace(instances, masks=masks),
+            inside,
+            top.height,
+            self._widest,
+            known,
+        )
         return top, view
 
     def _after(
@@ -656,16 +676,6 @@ def _library_of(system: System) -> Library:
             " none; a session recognises one object by its class"
         )
     return recogniser.library
-
-
-def _carried(instances: Instances, top: TableTop) -> Instances:
-    """Return the instances that stand on something, and the pieces of these."""
-    kept = [
-        mask
-        for mask, carrier in zip(top.seen.masks, top.seen.carriers, strict=True)
-        if carrier is not None
-    ]
-    return replace(instances, masks=tuple(kept))
 
 
 def _found_again(

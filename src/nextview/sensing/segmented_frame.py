@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,6 +60,13 @@ class SegmentedFrame:
             for mask, carrier in pairs
             if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
         )
+
+    def with_carried(self) -> SegmentedFrame:
+        """Return the frame without the instances that have no supporting surface."""
+        pairs = zip(self.masks, self.carriers, strict=True)
+        kept = [(mask, carrier) for mask, carrier in pairs if carrier is not None]
+        masks, carriers = zip(*kept, strict=True) if kept else ((), ())
+        return replace(self, masks=masks, carriers=carriers)
 
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
         """Return the level that carries most pixels of candidate objects.

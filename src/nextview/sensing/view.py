@@ -72,7 +72,6 @@ class View:
         labels: number of the thing that each pixel shows, (H, W) int32; 0 for none.
         pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
         surface: pixels of what carries things, (H, W) bool.
-        background: pixels of walls and the like, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
     """
 
@@ -82,7 +81,6 @@ class View:
     labels: NDArray[np.int32]
     pieces: NDArray[np.int32]
     surface: Mask
-    background: Mask
     inside: Mask
     _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
 
@@ -94,6 +92,7 @@ class View:
         inside: Mask,
         height: Float32,
         widest: float,
+        known: Mask | None = None,
     ) -> View:
         """Return the view of a frame.
 
@@ -103,11 +102,14 @@ class View:
             inside: pixels that are to be explained, (H, W) bool.
             height: of each pixel above the plane that carries it, (H, W) float32, metres.
             widest: diameter of the largest thing, metres.
+            known: pixels that show what was there before all things, (H, W) bool; None for none.
         """
         noise = _as_on_plane(noise_of(frame), frame, height)
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         # what lies on a plane within the noise is explained by the plane
         level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
+        if known is not None:
+            level |= known
         inside = inside & ~level
         labels = np.zeros(frame.shape, np.int32)
         for number, mask in enumerate(instances.masks, 1):
@@ -128,7 +130,6 @@ class View:
             alone,
             pieces,
             surface,
-            instances.background,
             inside,
         )
 
@@ -291,6 +292,31 @@ def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:
         return noise
     half = np.partition(off, len(off) // 2)[: len(off) // 2]
     return replace(noise, sigmas=noise.sigmas * half.mean() / MEAN_OF_HALF)
+
+
+def shown_before(frame: Frame, empty: Frame) -> Mask:
+    """Return the pixels that show what a frame of the empty place shows, too, (H, W) bool."""
+    rows, columns = np.nonzero(frame.depth)
+    pose = empty.camera_to_world
+    points = (frame.positions(rows, columns) - pose[:3, 3]) @ pose[:3, :3]
+    ahead = points[:, 2] > 0
+    place = np.full((len(points), 2), -1.0)
+    place[ahead] = empty.pinhole.project(points[ahead])
+    column, row = np.floor(place).astype(int).T
+    height, width = empty.shape
+    seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+
+    # between the depths of neighbouring pixels: a surface may be steep
+    row, column = row[seen], column[seen]
+    nearest = ndimage.minimum_filter(np.where(empty.depth > 0, empty.depth, np.inf), 3)
+    farthest = ndimage.maximum_filter(empty.depth, 3)
+    rows, columns, z = rows[seen], columns[seen], points[seen, 2]
+    margin = ALIKE * np.hypot(noise_of(frame).at(z) * z**2, LEAST_ERROR * z)
+    found = np.zeros(frame.shape, bool)
+    found[rows, columns] = (z > nearest[row, column] - margin) & (
+        z < farthest[row, column] + margin
+    )
+    return found
 
 
 def _connected(

@@ -24,7 +24,9 @@ OTHER_SIZE = 1.12  # factor by which what looks alike differs in size, at least
 AS_LARGE = 1.3  # factor of the extents, within which two things may look alike
 TURNS = 24  # rotations that are tried of what is nearly round
 # none, and half turns about each axis
-HALF_TURNS = np.array([np.diag(one) for one in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))])
+HALF_TURNS = np.array(
+    [np.diag(one) for one in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+)
 PARALLEL = 0.99  # cosine of the angle between two axes that are one
 
 

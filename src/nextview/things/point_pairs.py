@@ -20,7 +20,8 @@ THING_POINTS = 80  # of each thing
 DRAWN_POINTS = 1500  # of each thing, from which these are chosen
 SEEN_POINTS = 100  # of a segment
 REFERENCES = 25  # of these, whose pairs are compared
-# metres: steps of short distances, and the distance from which on they grow with it; and their number
+# metres: steps of short distances, and the distance from which on they grow with it; and how many
+# steps there are
 DISTANCE_STEP, LONG_DISTANCE, DISTANCES = 0.008, 0.15, 64
 ANGLE_STEP = np.radians(15)
 ANGLES = 13  # steps of an angle
@@ -108,15 +109,19 @@ class PointPairs:
             of_one: number of poses of one thing, at most.
 
         Returns:
-            M poses, the most votes first: the number of the thing, (M,) int64; its rotation from the axes of its scan to
-            the world, (M, 3, 3); and its centre in the world, (M, 3), metres.
+            M poses, the most votes first: the number of the thing, (M,) int64; its rotation from
+            the axes of its scan to the world, (M, 3, 3); and its centre in the world, (M, 3),
+            metres.
         """
         points, normals = oriented(view, mask)
         if len(points) < FEWEST:
             return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
         # what no motion changes of the pairs of each reference
         some = spread(points[None], REFERENCES)[0]
-        one, two = np.repeat(some, len(points)), np.tile(np.arange(len(points)), len(some))
+        one, two = (
+            np.repeat(some, len(points)),
+            np.tile(np.arange(len(points)), len(some)),
+        )
         keys = keys_of(points, normals, one, two).reshape(len(some), -1)
         turns = turns_of(points, normals, one, two).reshape(len(some), -1)
         apart = np.linalg.norm(points[one] - points[two], axis=1).reshape(keys.shape)
@@ -169,7 +174,7 @@ class PointPairs:
         steps = np.rint(np.repeat(turns, lengths) - self.turns[pairs]).astype(np.int32)
         places = self.first[pairs] * TURNS + steps % TURNS
         tells = np.where(self.common[keys], COMMON_WEIGHT, 1.0)
-        votes = np.bincount(places, np.repeat(tells, lengths))
+        votes: Float = np.bincount(places, np.repeat(tells, lengths)).astype(float)
         leading = np.flatnonzero(votes >= FEWEST_VOTES)
         return leading, votes[leading]
 
