@@ -112,14 +112,7 @@ def library(things):
         (0, 0.1),
         (0, 0.5),
         (1, 0.1),
-        pytest.param(
-            1,
-            0.5,
-            marks=pytest.mark.xfail(
-                reason="half of it fits another thing of three, and the search misses its own pose",
-                strict=True,
-            ),
-        ),
+        (1, 0.5),
     ],
 )
 def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(

@@ -106,7 +106,7 @@ class PointPairs:
             mask: pixels of the segment, (H, W) bool.
             among: things that it may show, (T,) bool.
             most: number of poses, at most.
-            of_one: number of poses of one thing, at most.
+            of_one: number of poses of one thing, at most, unless there are few things.
 
         Returns:
             M poses, the most votes first: the number of the thing, (M,) int64; its rotation from
@@ -139,6 +139,7 @@ class PointPairs:
 
         order = np.argsort(-votes, kind="stable")
         order = order[among[things[order]]]
+        of_one = max(of_one, most // len(self.points))
         order = order[rank_within(things[order]) < of_one][:most]
         things, references, places = things[order], references[order], places[order]
         own, turn = np.divmod(places, TURNS)

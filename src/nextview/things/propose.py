@@ -115,8 +115,9 @@ def best(
         some: M hypotheses.
         values: of each, (M,).
         most: number that is returned, at most.
-        of_one: number of those of one thing, at most.
+        of_one: number of those of one thing, at most, unless there are few things.
     """
+    of_one = max(of_one, most // len(library))
     turns = some.rotations.reshape(-1, 9)
     left = np.ones(len(some), bool)
     counts = np.zeros(len(library), np.int64)
