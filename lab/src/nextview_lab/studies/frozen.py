@@ -5,7 +5,8 @@
 
 Each thing lies in some of the seven places of ``staged_things``, by its physics, and a stereo
 camera takes all candidate views of it: a grid of azimuths and elevations over where a camera can
-stand. Nothing of nextview's own simulation is used. docs/submit.md describes the files and how methods are compared on them.
+stand. Nothing of nextview's own simulation is used. docs/submit.md describes the files and how
+methods are compared on them.
 
 All that a method is told of the cameras is drawn before the scene, and without knowing the thing
 (``draw_views``); the scene is then placed so that a detector would have aimed the cameras there.
