@@ -8,7 +8,7 @@ from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import angle_between
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
-from nextview_lab.benchmark.published_policies import (
+from nextview_lab.benchmark.thing_policies import (
     PredictedEntropy,
     SampledInformation,
 )

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.errors import DatasetError, ResultsError
 from nextview_lab.benchmark.frozen import FrozenArchive
-from nextview_lab.benchmark.line_process import LineProcess
+from nextview_lab.benchmark.methods import LineProcess
 from nextview_lab.benchmark.standings import KnownShape, leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, submit
 from nextview_lab.cli.benchmark_tables import print_standings

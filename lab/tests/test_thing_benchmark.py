@@ -13,12 +13,15 @@ from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import UNITS
 from nextview_lab.benchmark import things as stage
-from nextview_lab.benchmark.confusable import Alikeness
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview_lab.benchmark.thing_policies import BLIND_RULES
 from nextview_lab.benchmark.thing_runs import EpisodeRuns, ThingRun
-from nextview_lab.benchmark.thing_tables import summarise_things
-from nextview_lab.benchmark.things import ThingSettings, benchmark_things
+from nextview_lab.benchmark.things import (
+    Alikeness,
+    ThingSettings,
+    benchmark_things,
+    summarise_things,
+)
 
 SETTINGS = ThingSettings(
     views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200
