@@ -10,7 +10,7 @@ demo: .venv/installed  ## name everything on a bundled table, with the base inst
 # One file is run by one process, of one thread; what it imports is compiled once.
 PYTEST = OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-test: .venv-test/installed  ## run the tests of both packages; NEXTVIEW_TESTS=all: also those that take long
+test: .venv-test/installed  ## run the tests of both packages
 	$(PYTEST)
 
 test-package: .venv-test/installed  ## run the tests of nextview alone

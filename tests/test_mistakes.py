@@ -34,6 +34,11 @@ def deeper(frame: Frame, times: float) -> Frame:
     return Frame(times * frame.depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
 
 
+def ranged(frame: Frame) -> Frame:
+    x, y = frame.rays
+    return frame.with_depth(frame.depth * np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2))
+
+
 def counted(frame: Frame, times: float) -> Frame:
     steps = np.rint(1000 * times * frame.depth).astype(np.uint16)
     return Frame(steps, frame.intrinsics, frame.pose, pixel_centre=0.5)
@@ -56,6 +61,7 @@ MISTAKES = {
         lambda first, second: [counted(first, 5)],
         "unit",
     ),
+    "range instead of depth": (lambda first, second: [ranged(first)], "refused"),
     "a second pose in millimetres": (
         lambda first, second: [first, in_millimetres(second)],
         "refused",

@@ -89,18 +89,3 @@ def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
             made / "views.zarr",
         )
     assert (made / "out" / "report.html").read_text().count("data:image/webp") > 8
-
-
-def test_no_name_is_markup_in_a_report(tmp_path):
-    strange = ("<!--<script>", "</script>", "<b>[red]")
-    p = replace(
-        some_predictions(24, seed=1), classes=strange, valley_classes={"lem": ()}
-    )
-    p.save(tmp_path / "p.npz")
-    benchmark(tmp_path / "p.npz", tmp_path / "out", runs=2, samples=50)
-    report(tmp_path / "out")
-    page = (tmp_path / "out/report.html").read_text()
-    assert "<script" not in page
-    assert "</script>" not in page
-    assert "<b>[red]" not in page
-    assert "&lt;b&gt;[red]" in page
