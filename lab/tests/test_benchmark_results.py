@@ -56,7 +56,7 @@ def test_a_line_that_a_kill_cut_off_is_run_again(tmp_path, left):
 
 
 def test_scans_are_found_by_their_names(tmp_path):
-    with pytest.raises(UsageError, match="holds no scan"):
+    with pytest.raises(UsageError):
         scans_in(tmp_path)
     for name in ("mug.ply", "bowl.OFF", "notes.txt"):
         (tmp_path / name).touch()

@@ -83,7 +83,7 @@ def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
     assert (
         pictures_of(replace(p, depth_entropy=other), made / "views.zarr")[0] is not None
     )
-    with pytest.raises(ResultsError, match="no views of these objects"):
+    with pytest.raises(ResultsError):
         pictures_of(
             replace(p, names=tuple(f"other {name}" for name in p.names)),
             made / "views.zarr",
