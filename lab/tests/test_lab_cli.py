@@ -109,8 +109,8 @@ PathFinder.find_spec = staticmethod(find)
 
 def test_help_needs_no_extra():
     """The packages are hidden from the search of installed ones."""
-    ask = "from nextview_lab.cli.main import main; main(['train', 'recogniser', '--help'])"
+    ask = "from nextview_lab.cli.main import main; main(['benchmark', 'classes', '--help'])"
     done = run_python(HIDDEN + ask)
     assert done.returncode == 0, done.stderr
-    assert "pip install 'nextview-lab[train]'" in done.stderr
+    assert "pip install 'nextview-lab[benchmark]'" in done.stderr
     assert done.stdout == run_python(ask).stdout
