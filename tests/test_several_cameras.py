@@ -375,11 +375,6 @@ def test_a_scene_takes_the_frames_of_a_standing_camera_over_time(tmp_path, capsy
     assert left["name"] == "tomato_soup_can"
     assert left["confident"]
 
-    main(["look", str(bag), "--at", "1.2", "--up", "z"])
-    said = capsys.readouterr()
-    assert "its image at 1.500 s is used" in " ".join(said.err.split())
-    assert "cracker_box" in said.out
-
 
 # Sets of frames
 
