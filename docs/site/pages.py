@@ -59,7 +59,8 @@ MADE = {
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the sections of the navigation whose pages are made."""
-    sections = dict(_sections(config.nav))
+    nav: Any = config.nav
+    sections = dict(_sections(nav))
     for name, pages in MADE.items():
         sections[name].extend(pages())
     return config
