@@ -28,7 +28,7 @@ def made(tmp_path_factory):
         {"image": image, "depth_entropy": p.depth_entropy},
     )
     store_of(folder / "views.zarr", p.names, labels, p.sphere, 32, **arrays)
-    report(folder / "out")
+    report(folder / "out", figures=folder / "figures")
     return folder
 
 
@@ -62,6 +62,8 @@ def test_the_page_is_whole_and_needs_nothing_from_outside(made):
     assert len(page.images) > 8
     assert all(len(image["alt"]) > 10 for image in page.images)
     assert not list((made / "out").glob("*.part"))
+    written = {path.name for path in (made / "figures").iterdir()}
+    assert {"accuracy.pdf", "accuracy.svg", "tests.csv", "tests.tex"} <= written
 
 
 def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
