@@ -249,7 +249,7 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
     """
     rng = np.random.default_rng(3)
     turns, places = [], []
-    for episode in range(8):
+    for episode in range(6):
         name = ("block", "mug")[episode % 2]
         true = placed(name, rng.uniform(-0.8, 0.8))  # the handle is seen
         session = session_of(system, 2, distance=0.5)

@@ -101,7 +101,7 @@ def test_the_whole_way_from_frames_to_a_name():
     assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
 
 
-@settings(deadline=None, max_examples=5)
+@settings(deadline=None, max_examples=3)
 @given(
     st.integers(5, 70),
     st.integers(0, 359),

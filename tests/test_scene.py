@@ -59,7 +59,7 @@ def test_of_many_frames_some_from_different_places_are_kept(seen_once):
     camera, scene = seen_once
     numbers = {one.name: one.number for one in scene.objects}
     seen = {20: camera.owner}
-    for degrees in range(60, 380, 40):
+    for degrees in range(65, 380, 55):
         look = scene.update(camera.frame(view(degrees)))
         seen[degrees] = camera.owner
         assert look.taken
