@@ -10,7 +10,7 @@ demo: .venv/installed  ## name everything on a bundled table, with the base inst
 # One file is run by one process, of one thread; what it imports is compiled once.
 PYTEST = OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv-test/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-test: .venv-test/installed  ## run the tests of both packages; NEXTVIEW_TESTS=all: also those that take long
+test: .venv-test/installed  ## run the tests of both packages
 	$(PYTEST)
 
 test-package: .venv-test/installed  ## run the tests of nextview alone
@@ -54,7 +54,7 @@ PYTHON_TEST = OMP_NUM_THREADS=1 .venv-test/bin/python
 FIRST_DRAW = --draws 2 --seed 61 --choose-seed 62 --views 1 2 --policies geometry sampled predicted --reference best-blind
 NEXT_DRAWS = --draws 2 --views 1 2 --policies geometry --reference
 
-reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$(seed)/memory.json)  ## next views, tables, places and the frozen archive of YCB; a night on two cores; resumes
+reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$(seed)/memory.json)  ## next views, tables and the frozen archive of YCB; a night on two cores; resumes
 	$(LAB) benchmark things $(THINGS)/look_alikes_60 $(THINGS)/pairs --models $(THINGS)/alike_60 --families $(FIRST_DRAW)
 	$(LAB) benchmark things $(YCB) $(THINGS)/heavy --models ycb --occlusion heavy $(FIRST_DRAW)
 	$(LAB) benchmark things $(THINGS)/look_alikes_70 $(THINGS)/pairs_two --models $(THINGS)/alike_70 --families --seed 71 $(NEXT_DRAWS) spread
@@ -66,7 +66,6 @@ reproduce-things: .venv-test/installed $(foreach seed,60 70 75,$(THINGS)/alike_$
 	$(LAB) benchmark things $(YCB) $(THINGS)/half_three --models ycb --occlusion half --seed 74 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark things $(YCB) $(THINGS)/clear_three --models ycb --seed 74 $(NEXT_DRAWS) furthest
 	$(LAB) benchmark tables $(YCB) $(PSB) $(THINGS)/tables --tables 10 --seed 10 --policies fixed --reference fixed
-	$(PYTHON_TEST) -m nextview_lab.studies.places $(YCB) $(THINGS)/places.jsonl --seed 3 --things 40 --workers 2 > $(THINGS)/places.md
 	test -f $(THINGS)/nextview-bench-small/manifest.json || \
 	$(PYTHON_TEST) -m nextview_lab.studies.frozen $(YCB) $(THINGS)/nextview-bench-small --things 12 --draws 3 --grid 3 8 --seed 411
 	mkdir -p $(THINGS)/small

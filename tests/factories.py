@@ -489,17 +489,6 @@ def camera_over(
     return TableCamera(table, SENSORS[sensor], rng)
 
 
-def leaning(mesh: Mesh, degrees: float, place: Sequence[float]) -> PlacedThing:
-    """A thing that touches the table at (x, y) around its middle, tilted about the y axis."""
-    metres = mesh.vertices * mesh.radius + mesh.centre
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-    turned = metres @ pose[:3, :3].T
-    middle = (turned.min(0) + turned.max(0)) / 2
-    pose[:3, 3] = place[0] - middle[0], place[1] - middle[1], -turned[:, 2].min()
-    return PlacedThing(mesh.name, metres, mesh.faces, pose)
-
-
 def view(degrees: float, elevation: float = 50.0, distance: float = 0.65) -> np.ndarray:
     """The pose of a camera that looks at the table's centre, (4, 4)."""
     return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[

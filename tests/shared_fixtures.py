@@ -2,7 +2,7 @@
 pytest-xdist workers.
 
 A test that alters a file of it copies the file first. And: the order of the files; Hypothesis
-without deadlines (slow is not wrong); tests that take long run where NEXTVIEW_TESTS=all.
+without deadlines (slow is not wrong).
 """
 
 import os
@@ -47,11 +47,6 @@ settings.load_profile("nextview")
 
 
 def pytest_collection_modifyitems(items):
-    for item in items if os.environ.get("NEXTVIEW_TESTS") != "all" else ():
-        if item.get_closest_marker("long"):
-            item.add_marker(
-                pytest.mark.skip(reason="takes long: NEXTVIEW_TESTS=all runs it")
-            )
     last = len(LONG)
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.name, last))

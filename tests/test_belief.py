@@ -69,7 +69,7 @@ def test_the_threshold_of_a_risk_is_the_lowest_that_promises_it(row, risk):
     if held:
         assert bounds.threshold(risk, 1) == min(held)
     else:
-        with pytest.raises(RiskError, match="cannot promise"):
+        with pytest.raises(RiskError):
             bounds.threshold(risk, 1)
 
 

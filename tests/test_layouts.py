@@ -225,15 +225,3 @@ def test_intrinsics_are_read_as_tools_write_them(name, tmp_path):
     np.testing.assert_allclose(camera.intrinsics, np.reshape(MATRIX, (3, 3)))
     assert camera.size == (640, 480)
     assert camera.scale == (None if scale is None else pytest.approx(scale))
-
-
-def test_intrinsics_of_zivid_are_read(tmp_path):
-    path = tmp_path / "camera.yml"
-    path.write_text(
-        "__version__: 5\nCameraIntrinsics:\n  CameraMatrix:\n    CX: 951.5\n    CY: 594.25\n"
-        "    FX: 1780.5\n    FY: 1781.5\n  Distortion:\n    K1: 0\n    K2: 0\n    P1: 0\n"
-    )
-    camera = read_camera_file(path)
-    expected = [[1780.5, 0, 951.5], [0, 1781.5, 594.25], [0, 0, 1]]
-    np.testing.assert_array_equal(camera.intrinsics, expected)
-    assert (camera.size, camera.scale) == (None, None)

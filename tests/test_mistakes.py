@@ -34,6 +34,11 @@ def deeper(frame: Frame, times: float) -> Frame:
     return Frame(times * frame.depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
 
 
+def ranged(frame: Frame) -> Frame:
+    x, y = frame.rays
+    return frame.with_depth(frame.depth * np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2))
+
+
 def counted(frame: Frame, times: float) -> Frame:
     steps = np.rint(1000 * times * frame.depth).astype(np.uint16)
     return Frame(steps, frame.intrinsics, frame.pose, pixel_centre=0.5)
@@ -42,27 +47,28 @@ def counted(frame: Frame, times: float) -> Frame:
 MISTAKES = {
     "a first pose in millimetres": (
         lambda first, second: [in_millimetres(first)],
-        "refused",
+        "refused: scale",
     ),
     "a first pose that is inverse": (
         lambda first, second: [posed(first, np.linalg.inv(first.pose))],
-        "refused",
+        "refused: inverse pose",
     ),
     "a first pose with OpenGL's axes": (
         lambda first, second: [replace(first, axes="opengl")],
-        "refused",
+        "refused: opengl axes",
     ),
     "first steps of a fifth of a millimetre": (
         lambda first, second: [counted(first, 5)],
         "unit",
     ),
+    "range instead of depth": (lambda first, second: [ranged(first)], "refused: range"),
     "a second pose in millimetres": (
         lambda first, second: [first, in_millimetres(second)],
-        "refused",
+        "refused: scale",
     ),
     "a second pose that is inverse": (
         lambda first, second: [first, posed(second, np.linalg.inv(second.pose))],
-        "refused",
+        "refused: inverse pose",
     ),
     "a second pose with the axes of ROS": (
         lambda first, second: [first, replace(second, axes="ros")],
@@ -160,9 +166,10 @@ def test_a_mistake_is_refused_or_told_whatever_takes_it_in(
         taker.update(frame)
     before = stands(taker)
 
-    if outcome == "refused":
+    if (outcome or "").startswith("refused"):
         with pytest.raises(NextviewError) as refused:
             taker.update(last)
+        assert refused.value.kind == outcome.partition(": ")[2]
         assert "\n" not in str(refused.value)
         assert stands(taker) == before
     else:
@@ -227,7 +234,7 @@ def test_a_frame_that_raises_leaves_no_trace(ycb, ycb_meshes):
 
     for what in ("segmentation", "rule"):
         failing[:] = [what]
-        with pytest.raises(NextviewError, match="it fails"):
+        with pytest.raises(NextviewError):
             scene.update(second)
         assert stands(scene) == before
         assert len(scene.frames) == 1

@@ -129,6 +129,6 @@ def test_a_file_that_contradicts_its_card_is_rejected(tmp_path, monkeypatch, cha
     with pytest.raises(ModelError):
         NetworkRecogniser(card, 1)
     change_card(card, sha256=sha256_of(file))
-    with pytest.raises(ModelError, match=r"tiny\.onnx: ") as refused:
+    with pytest.raises(ModelError) as refused:
         NetworkRecogniser(card, 1)([SEEN, SEEN])
     assert "\n" not in str(refused.value)

@@ -15,14 +15,11 @@ from factories import SAMPLE_FILES, camera_over, view
 from programs import main
 
 import nextview
-from nextview.cli.commands import NEXTVIEW
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "workflow"))
 import documented_commands
 import repeated
-
-README = (ROOT / "README.md").read_text()
 
 
 @pytest.mark.parametrize("page", ["add_a_policy", "add_a_recogniser"])
@@ -144,21 +141,6 @@ def test_each_page_names_what_its_commands_need():
     for command in documented_commands.PICTURES:
         needed |= documented_commands.needs_of(command)
     assert needed == set(documented_commands.NEEDS.values())
-
-
-# The README
-
-
-@pytest.mark.parametrize("line", re.findall(r"^nextview .*?(?=\s+#|$)", README, re.M))
-def test_its_options_are_there(line, capsys):
-    """Every option that a line gives stands in the help of its command."""
-    words = line.split()[1:]
-    group = 1 if words[0] in NEXTVIEW.commands else 2
-    with pytest.raises(SystemExit) as end:
-        main([*words[:group], "--help"])
-    assert end.value.code == 0
-    shown = capsys.readouterr().out
-    assert all(word in shown for word in words if word.startswith("--"))
 
 
 # From a RealSense

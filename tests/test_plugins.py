@@ -72,16 +72,6 @@ def test_a_policy_that_raises_is_one_sentence_that_says_where(name, sentence):
     assert (refused.value.__cause__ is None) == (name == "Flat")
 
 
-def test_the_whole_traceback_is_shown_where_it_is_asked_for(monkeypatch, capsys):
-    with pytest.raises(PolicyError):
-        asked("Leaves")
-    assert capsys.readouterr().err == ""
-    monkeypatch.setenv("NEXTVIEW_TRACEBACK", "1")
-    with pytest.raises(PolicyError):
-        asked("Leaves")
-    assert "raise self.raises  " in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("said", [None, "yes", np.nan])
 def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(
     said,

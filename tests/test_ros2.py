@@ -13,8 +13,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-import trimesh
-from factories import box, pose_at
+from factories import pose_at
 from ros_messages import (
     SHAPE,
     STORE,
@@ -26,7 +25,6 @@ from ros_messages import (
     transform_message,
 )
 from rosbags.rosbag2 import Reader, Writer
-from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 import nextview
@@ -201,17 +199,6 @@ def outputs(monkeypatch):
             hypothesis=SimpleNamespace(class_id="", score=0.0), pose=told
         )
 
-    def collision_object(**fields):
-        return SimpleNamespace(pose=pose_message(), **fields)
-
-    def scene(**fields):
-        return SimpleNamespace(
-            world=SimpleNamespace(),
-            robot_state=SimpleNamespace(is_diff=False),
-            **fields,
-        )
-
-    collision_object.ADD, collision_object.REMOVE = b"\x00", b"\x01"
     for name in ROS_MODULES.split():
         monkeypatch.setitem(sys.modules, name, MagicMock())
     stand_ins = {
@@ -220,8 +207,6 @@ def outputs(monkeypatch):
             "Pose": pose_message,
             "PoseArray": SimpleNamespace,
         },
-        "moveit_msgs": {"CollisionObject": collision_object, "PlanningScene": scene},
-        "shape_msgs": {"Mesh": SimpleNamespace, "MeshTriangle": SimpleNamespace},
         "vision_msgs": {
             "Detection3D": detection,
             "Detection3DArray": SimpleNamespace,
@@ -291,64 +276,6 @@ def replace_in(what, **fields):
     return SimpleNamespace(**(vars(what) | fields))
 
 
-def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(outputs):
-    seen = seen_at((0.3, 0.2, 0.1), answer="chair", pose_candidates=[])
-    seen.beliefs = {"table": 0.2, "chair": 0.795, "bed": 0.005}
-    told = outputs.detection_of(seen, "world")
-    assert [one.hypothesis.class_id for one in told.results] == ["chair", "table"]
-    variances = np.diag(told.results[0].pose.covariance.reshape(6, 6))
-    assert np.sqrt(variances[:3].sum()) == pytest.approx(0.05)
-    assert variances[3:] == pytest.approx(
-        [np.pi**2 / 3] * 3
-    )  # of an even angle, +- 180 degrees
-    np.testing.assert_allclose(
-        matrix_of(told.results[0].pose.pose)[:3, 3], (0.3, 0.2, 0.1)
-    )
-
-    told = outputs.detection_of(seen_at((0, 0, 0.2), answer=None), "world")
-    assert (told.id, told.results) == ("", [])
-    np.testing.assert_allclose(matrix_of(told.bbox.center)[:3, 3], (0, 0, 0.2))
-    assert told.bbox.size.x == told.bbox.size.z == pytest.approx(0.1)
-
-
-def test_a_planning_scene_holds_the_shapes_and_forgets_what_is_gone(outputs):
-    body = box((0.1, 0.06, 0.2), (0.3, 0.1, 0.1))  # in the frame of its scan
-    pose = pose_at(20, 70, 0.5, (0.1, 0.2, 0.3))
-    candidate = SimpleNamespace(vertices=body.vertices, faces=body.faces, pose=pose)
-    mug = SimpleNamespace(name="mug", number=3, pose=pose, candidates=[candidate])
-    corners = box((0.1, 0.1, 0.1), (0, 0, 0.05)).vertices
-    stranger = SimpleNamespace(
-        name="unknown",
-        number=4,
-        pose=None,
-        candidates=[],
-        seen_points=np.vstack([corners, corners.mean(0)]),
-    )
-    flat = SimpleNamespace(
-        **(vars(stranger) | {"number": 5, "seen_points": corners * [1, 1, 0]})
-    )
-    told = outputs.planning_scene([mug, stranger, flat], {"mug_3", "bowl_1"}, "world")
-    assert told.is_diff
-    assert told.robot_state.is_diff
-    first, second, gone = told.world.collision_objects
-    assert [first.id, second.id, gone.id] == ["mug_3", "unknown_4", "bowl_1"]
-    assert first.operation == second.operation == outputs.CollisionObject.ADD
-    assert gone.operation == outputs.CollisionObject.REMOVE
-    np.testing.assert_allclose(matrix_of(first.pose), pose, atol=1e-9)
-    made = mesh_of(first)
-    np.testing.assert_allclose(made.vertices, body.vertices, atol=1e-9)
-    assert made.volume == pytest.approx(0.1 * 0.06 * 0.2)
-    assert abs(mesh_of(second).volume) == pytest.approx(0.001)
-
-
-def mesh_of(told):
-    """The mesh of a collision object."""
-    (mesh,) = told.meshes
-    vertices = [[vertex.x, vertex.y, vertex.z] for vertex in mesh.vertices]
-    faces = [triangle.vertex_indices for triangle in mesh.triangles]
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
 # What cannot be run here is at least well formed
 
 
@@ -367,46 +294,3 @@ def test_the_node_compiles_and_its_imports_from_nextview_exist(path):
             and node.value.id == "nextview"
         ):
             assert hasattr(nextview, node.attr)
-
-
-def fields_of(path):
-    """Names of the fields in the parts of an action, a service or a message, by part."""
-    names = {
-        ".action": ("Goal", "Result", "Feedback"),
-        ".srv": ("Request", "Response"),
-        ".msg": ("Message",),
-    }[path.suffix]
-    parts = zip(names, path.read_text().split("---\n"), strict=True)
-    fields = {}
-    for name, text in parts:
-        kinds = get_types_from_msg(text, f"nextview_msgs/msg/{name}")
-        fields[name] = {field[0] for field in kinds[f"nextview_msgs/msg/{name}"][1]}
-    return fields
-
-
-def test_the_node_fills_all_fields_of_its_messages():
-    """Fields that the node reads and writes are those of the files of nextview_msgs."""
-    folder = ROS / "nextview_msgs"
-    actions = {
-        name: fields_of(folder / f"action/{name}.action")
-        for name in ("LookUntilSettled", "Recognise")
-    }
-    tree = ast.parse((ROS / "nextview_ros/nextview_ros/node.py").read_text())
-    read = {"asked": set(), "request": set()}
-    filled = {}
-    for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Name)
-            and node.value.id in read
-        ):
-            read[node.value.id].add(node.attr)
-        if isinstance(node, ast.Call) and node.keywords:
-            words = {word.arg for word in node.keywords}
-            filled.setdefault(ast.unparse(node.func), set()).update(words)
-    goals = [parts["Goal"] for parts in actions.values()]
-    assert read["asked"] == set.union(*goals)
-    assert read["request"] == fields_of(folder / "srv/Learn.srv")["Request"]
-    for name, parts in actions.items():
-        for part in ("Result", "Feedback"):
-            assert filled[f"{name}.{part}"] == parts[part]

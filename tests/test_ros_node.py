@@ -5,7 +5,6 @@ Runs where rclpy and nextview_msgs are, in the environment of ``make test-ros``.
 
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -235,24 +234,6 @@ def started(*options):
     return subprocess.Popen(
         [sys.executable, "-c", code, *given], env=os.environ | {"PYTHONPATH": path}
     )
-
-
-def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
-    second = running.add(a_robot(namespace="/second"))
-    process = started()
-    try:
-        second.goal(distance=0.7)
-        assert second.look_when_all_is_there().message == "view 1 is taken in"
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        until(lambda: not second.is_served, "the end of the services")
-        process = started()
-        handle, _ = second.goal(distance=0.7)
-        assert handle.accepted
-        assert second.look_when_all_is_there().message == "view 1 is taken in"
-    finally:
-        process.kill()
-        process.wait()
 
 
 def test_parameters_that_make_no_sense_end_the_node_with_a_sentence():

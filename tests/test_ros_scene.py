@@ -21,9 +21,7 @@ pytest.importorskip("rclpy")
 from factories import camera_over, view, without, write_scan
 from nextview_msgs.action import LookUntilSettled
 from nextview_ros.player import PlayerNode, RecordedFrames
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
 from ros_messages import (
     CAMERA_INFO,
     DEPTH,
@@ -35,9 +33,6 @@ from ros_messages import (
     write_bag,
 )
 from ros_robot import Robot, Running, matrix_of, node_with, until, wait
-from rosbags.rosbag2 import Reader
-from rosgraph_msgs.msg import Clock
-from rosidl_runtime_py.utilities import get_message
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import Image
 from test_scene_changes import shifted
@@ -423,62 +418,9 @@ def bag(see, intrinsics, tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp("bags") / "table", messages)
 
 
-class BagPlayer(Node):
-    """Publishes the messages of a bag and the clock, as ``ros2 bag play --clock`` does."""
-
-    def __init__(self, bag):
-        super().__init__("bag_player")
-        self.clock = self.create_publisher(Clock, "/clock", 10)
-        self.topics = {}
-        self.stopped = threading.Event()
-        with Reader(bag) as read:
-            self.recorded = [
-                (one.topic, get_message(one.msgtype), time, bytes(data))
-                for one, time, data in read.messages()
-            ]
-        for topic, kind, _, _ in self.recorded:
-            if topic not in self.topics:
-                quality = 10 if topic == "/tf" else qos_profile_sensor_data
-                self.topics[topic] = self.create_publisher(kind, topic, quality)
-
-    def play(self):
-        """Publish all at the rate at which they were recorded."""
-        last = self.recorded[0][2]
-        for topic, _, time_ns, data in self.recorded:
-            if self.stopped.wait((time_ns - last) / 1e9):
-                return
-            last = time_ns
-            now = Clock()
-            now.clock.sec, now.clock.nanosec = divmod(time_ns, 10**9)
-            self.clock.publish(now)
-            self.topics[topic].publish(data)
-
-
 def is_done(node):
     """Whether a node has looked, and its scene is done."""
     return node.scene is not None and node.scene.done
-
-
-def test_a_bag_is_played_to_the_node(running, mine, bag):
-    player = running.add(BagPlayer(bag))
-    namespace = DEPTH.rpartition("/")[0]
-    node = running.add(
-        node_with(
-            "/bag",
-            models=[str(mine)],
-            cameras=[namespace],
-            image=DEPTH.rpartition("/")[2],
-            period=0.5,
-            max_views=2,
-            use_sim_time=True,
-        )
-    )
-    end = time.monotonic() + 60
-    while not is_done(node) and time.monotonic() < end:
-        player.play()
-    player.stopped.set()
-    assert len(node.scene.frames) == 2
-    assert {thing.name for thing in node.scene.objects} >= set(TAUGHT)
 
 
 def test_a_recording_is_played_as_a_camera(running, mine, bag):

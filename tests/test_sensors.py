@@ -9,13 +9,11 @@ import pytest
 import trimesh
 from factories import box, cast, meshed, pose_at, rays
 
-import nextview
-from nextview import SimulatedCamera, ViewSphere
+from nextview import ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.errors import UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix, sensor_named
+from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix
 
 SPHERE, FEW = ViewSphere.named("40"), ViewSphere((20.0,), 3)
 BALL = meshed(trimesh.creation.icosphere(4))
@@ -184,21 +182,6 @@ def test_a_mix_is_another_sensor_for_every_object():
         assert [getattr(s, error) for s in weak] == pytest.approx(
             [getattr(s, error) / 2 for s in strong]
         )
-
-
-def test_recognise_through_a_sensor_of_a_name_or_an_object():
-    mesh, system = sample_mesh("chair"), nextview.load()
-    results = [
-        system.recognise(mesh, 3, 5, sensor=sensor)
-        for sensor in ("wrist:2", sensor_named("wrist:2"))
-    ]
-    assert results[0].confidence == results[1].confidence
-    assert (
-        results[0].views[0].belief.max()
-        != system.recognise(mesh, 3, 5).views[0].belief.max()
-    )
-    with pytest.raises(UsageError):
-        system.recognise(SimulatedCamera(mesh), sensor="kinect")
 
 
 @pytest.mark.parametrize("name", ["none", "stereo", "kinect"])

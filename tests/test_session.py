@@ -35,7 +35,7 @@ def test_it_asks_for_views_until_it_is_done(system, camera):
         assert (view.next_view is None) == session.done
     assert asked == [view.index for view in session.result.views]
     assert session.result.answer == "chair"
-    with pytest.raises(SessionError, match="has ended"):
+    with pytest.raises(SessionError):
         session.update(camera.observe(system.sphere.poses[0]))
 
 

@@ -38,7 +38,7 @@ def test_a_surface_keeps_the_scan_frame_and_drops_invisible_parts():
     assert np.abs(off).max() < 0.001
     block = Surface.from_mesh(l_block(), "block")
     assert block.simplified() is block  # it has no triangle too many
-    with pytest.raises(MeshError, match="unit of length is not known"):
+    with pytest.raises(MeshError):
         Surface.from_mesh(make_mesh(ball.vertices, ball.faces), "ball")
 
 

@@ -1,6 +1,5 @@
 """Policies of a whole table: built-in rules, rules of one's own, and what is wrong with them."""
 
-import traceback
 from dataclasses import replace
 
 import numpy as np
@@ -165,20 +164,6 @@ def test_a_scene_goes_where_its_policy_says(ycb, ycb_meshes):
 
 
 @pytest.mark.parametrize(
-    ("policy", "sentence"),
-    [
-        ("targt", "no policy of a scene is called 'targt'; did you mean 'target'"),
-        ("rules_of_mine:missing", r"cannot be made \(AttributeError: .*missing"),
-        ("rules_of_mine:OfOneObject", r"views of a single object \(next_views\)"),
-        ("rules_of_mine:number", "is no function"),
-    ],
-)
-def test_what_is_no_policy_is_refused_at_once(ycb, policy, sentence):
-    with pytest.raises(PolicyError, match=sentence):
-        nextview.Scene(ycb, policy=policy)
-
-
-@pytest.mark.parametrize(
     ("said", "sentence"),
     [
         (np.zeros(3), r"has to return \d+ numbers, .* not float64 of the shape \(3,\)"),
@@ -191,11 +176,3 @@ def test_what_is_no_policy_is_refused_at_once(ycb, policy, sentence):
 def test_what_is_no_choice_is_refused(seen, said, sentence):
     with pytest.raises(PolicyError, match=f"^policy mine {sentence}"):
         NamedPolicy("mine", lambda choice, rng: said).ranked(seen[1], rng())
-
-
-def test_an_error_in_a_policy_keeps_its_traceback(seen):
-    said = "policy rules_of_mine:raises raised AttributeError: .*nothing.*, at rules_of_mine.py:13"
-    with pytest.raises(PolicyError, match=said) as refused:
-        chosen(seen[1], "rules_of_mine:raises")
-    cause = refused.value.__cause__
-    assert "choice.nothing " in "".join(traceback.format_exception(cause))

@@ -83,7 +83,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs scans of all things that the bundled memory knows"
     ),
     r"^make ": "the workflow is run by lab/tests/test_workflow.py",
-    r"^(pip|python3 -m pip) ": "installs; lab/tests/test_wheel.py installs each extra",
+    r"^(pip|python3 -m pip) ": "installs; each command runs where only the extras of its page are",
     r"^nextview-lab download": (
         "473 MB from a server of others; lab/tests/test_download.py has a server of its own"
     ),
@@ -106,7 +106,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"studies\.frozen|nextview-bench|^for policy in": (
         "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
-    r"studies\.places": "needs the YCB scans, and an hour; lab/tests/test_places.py shows a thing",
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
     r"look_alikes|benchmark things (YCB|HALF_SCANS)": (

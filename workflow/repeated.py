@@ -2,9 +2,9 @@
 
     python workflow/repeated.py
 
-The table of ``workflow/measured.toml`` goes into README.md and docs/results.md, and an entry for
-BibTeX, made from CITATION.cff, into README.md, each between two comments that name it. The README
-is the home page of the site as well. ``tests/test_pages.py`` fails if a page differs.
+The table of ``workflow/measured.toml`` and an entry for BibTeX, made from CITATION.cff, go into
+README.md, each between two comments that name it. The README is the home page of the site as well.
+``tests/test_pages.py`` fails if it differs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 from nextview_lab.studies.shared import wilson
 
-PARTS = {"README.md": ("measured", "citation"), "docs/results.md": ("measured",)}
+PARTS = {"README.md": ("measured", "citation")}
 """What a page repeats."""
 
 MANY = 300

@@ -58,19 +58,11 @@ MADE = {
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Fill the navigation: pages that are made, and pages of docs/ that mkdocs.yml does not
-    name.
-    """
+    """Fill the sections of the navigation whose pages are made."""
     nav: Any = config.nav
-    sections = {name: pages for entry in nav for name, pages in entry.items()}
+    sections = dict(_sections(nav))
     for name, pages in MADE.items():
         sections[name].extend(pages())
-    named = set(_leaves(nav))
-    sections["Guides"].extend(
-        p.name
-        for p in sorted(Path(config.docs_dir).glob("*.md"))
-        if p.name not in named
-    )
     return config
 
 
@@ -122,13 +114,13 @@ def on_page_markdown(
     return "".join(texts)
 
 
-def _leaves(nav: Any) -> Iterator[str]:
-    """All pages that a navigation names."""
-    for entry in nav if isinstance(nav, list) else nav.values():
-        if isinstance(entry, str):
-            yield entry
-        else:
-            yield from _leaves(entry)
+def _sections(nav: list[Any]) -> Iterator[tuple[str, list[Any]]]:
+    """All sections of a navigation, those in other ones too, by name."""
+    for entry in nav:
+        for name, pages in entry.items() if isinstance(entry, dict) else ():
+            if isinstance(pages, list):
+                yield name, pages
+                yield from _sections(pages)
 
 
 def _summary(path: Path) -> str:

@@ -14,7 +14,7 @@ import pytest
 from bop_datasets import write_dataset
 from frozen_archives import write_archive
 
-from nextview_lab.benchmark import table_runs
+from nextview_lab.benchmark import tables
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -22,9 +22,9 @@ def kept_rests(shared):
     """Find the resting poses of each thing once in a run, as ``kept_things`` does."""
     folder = shared("kept", lambda folder: None)
     with pytest.MonkeyPatch.context() as patched:
-        function = table_runs.resting_poses
+        function = tables.resting_poses
         kept = kept_results.Kept(function, folder, kept_results.of_mesh)
-        patched.setattr(table_runs, "resting_poses", kept)
+        patched.setattr(tables, "resting_poses", kept)
         yield
 
 

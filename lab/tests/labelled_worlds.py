@@ -42,27 +42,6 @@ def drawn(
     ]
 
 
-def box_bin(half: float, tall: float, base: float) -> list:
-    """A bin whose bottom is a surface and whose sides are background.
-
-    Args:
-        half: of its sides, metres.
-        tall: its height, metres.
-        base: height of what it stands on, metres.
-    """
-    wall = 0.006
-    found = [(slab((2 * half, 2 * half, wall), (0, 0), base + wall), SURFACE)]
-    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        size = (
-            wall if x else 2 * half + 2 * wall,
-            wall if y else 2 * half + 2 * wall,
-            tall,
-        )
-        side = slab(size, (x * half, y * half), base + tall)
-        found.append((side, BACKGROUND))
-    return found
-
-
 class LabelledCamera:
     """A camera that looks at solids through a sensor, and knows what it sees.
 

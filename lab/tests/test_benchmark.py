@@ -8,12 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 import pytest
-from lab_programs import main, refused
+from lab_programs import refused
 from pipeline import benchmark
 
-from nextview.recognition.belief import Calibration, Stopping
 from nextview_lab.benchmark.classes import load
-from nextview_lab.benchmark.replay import make_specs, replay, truncate
 from nextview_lab.data.metrics import calibration_error
 from nextview_lab.data.predictions import Predictions
 
@@ -92,33 +90,6 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
             assert summary[policy, threshold, measure] == pytest.approx(
                 value, nan_ok=True
             ), (policy, measure)
-
-
-def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
-    """Replay cut by the rule of the recogniser's calibration is what the command writes, the
-    threshold's decay too.
-    """
-    p = replace(predictions, calibration=Calibration(0.8, 0.5))
-    p.save(tmp_path / "p.npz")
-    line = f"benchmark classes {tmp_path / 'p.npz'} {tmp_path / 'out'} --runs 3"
-    line += " --samples 20 --thresholds 0.7 --policies lem spread"
-    main(line.split())
-    found, specs = load(tmp_path / "out"), make_specs(p, runs=3, seed=0)
-    stopping = Stopping.of(p.calibration, 0.7, max_views=5)
-    assert stopping.threshold_decay == 0.5
-    for name in ("random", "lem", "spread"):
-        paths, rows = (
-            replay(name, specs, stopping.max_views, seed=0),
-            found.episodes(name, 0.7),
-        )
-        ends = truncate(paths, stopping)
-        for column in ("n_views", "confidence", "travel", "arc"):
-            np.testing.assert_array_equal(getattr(ends, column), rows[column])
-        np.testing.assert_array_equal(
-            np.array(p.classes)[ends.answer], rows["answer"].astype(str)
-        )
-        # a threshold that stays
-        assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()
 
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(

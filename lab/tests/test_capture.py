@@ -1,12 +1,7 @@
 """Captures that are written of a mesh, and recognised: the nearest view, the way there and back."""
 
-import re
-import shutil
-from pathlib import Path
-
 import numpy as np
 import pytest
-from lab_programs import main
 
 import nextview
 from nextview.captured.camera import CapturedCamera
@@ -70,23 +65,3 @@ def test_the_object_is_found_without_a_box(captured, system):
     assert result.answer == "chair"
     assert all(view.degrees_off < 3 for view in result.views)
     assert result.views[0].observation.radius == pytest.approx(RADIUS, rel=0.1)
-
-
-# The nearest view
-
-
-def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
-    root = Path(__file__).parents[2]
-    section = (
-        (root / "docs" / "your_camera.md")
-        .read_text()
-        .split("## Captured images\n")[1]
-        .split("\n## ")[0]
-    )
-    shutil.copytree(root / "samples", tmp_path / "samples")
-    monkeypatch.chdir(tmp_path)
-    for line in re.search(r"```sh\n(.*?)```", section, re.S)[1].splitlines():
-        main(line.partition("#")[0].split()[1:])
-    assert "It is a chair" in capsys.readouterr().out
-    exec(re.search(r"```python\n(.*?)```", section, re.S)[1], {"nextview": nextview})
-    assert "chair (belief" in capsys.readouterr().out

@@ -2,7 +2,6 @@
 not.
 """
 
-import gc
 import hashlib
 import io
 import threading
@@ -108,21 +107,3 @@ def test_a_download_with_a_wrong_hash_leaves_no_files(
         download(server.archive(published), tmp_path)
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
-
-
-# of a refused answer, closed when collected
-@pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")
-@pytest.mark.parametrize("there", [(), ("mine",)])
-def test_a_download_that_fails_leaves_no_folder_of_its_own(tmp_path, there):
-    for name in there:
-        (tmp_path / name).mkdir()
-    with Server(GOOD, status=500) as server, pytest.raises(DatasetError):
-        download(
-            Archive(server.url, "0" * 64, "Shapes"),
-            tmp_path / "mine" / "data",
-            timeout=5,
-        )
-    assert sorted(
-        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")
-    ) == list(there)
-    gc.collect()

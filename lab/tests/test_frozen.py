@@ -5,17 +5,24 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
 
 from nextview_lab.benchmark.frozen import FrozenArchive
 from nextview_lab.benchmark.submit import SubmitOptions, submit
+from nextview_lab.studies.staged_things import (
+    FOCAL,
+    IMAGE,
+    STEPS_PER_METRE,
+    STEREO_BASE,
+    as_measured,
+)
 
 ROOT = Path(__file__).parents[2]
 OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
 SURROUNDINGS = {**os.environ, "OMP_NUM_THREADS": "1"}
-# what OpenBLAS, NumPy and the C library do on a processor without AVX2
 
 
 def make(scans, out, options=OPTIONS, **surroundings):
@@ -66,3 +73,17 @@ def test_the_same_seed_gives_the_same_bytes_after_a_stop_too(household, tmp_path
 
     run = submit(out, tmp_path / "out.json", SubmitOptions("fixed"))
     assert run.whole
+
+
+def test_the_noise_of_a_wall_is_that_of_its_disparities():
+    rng = np.random.default_rng(0)
+    depth = as_measured(np.full(IMAGE, 0.6), rng) / STEPS_PER_METRE
+
+    seen = depth[:, 100:]
+    assert (seen > 0).mean() > 0.999
+    assert abs(np.median(seen) - 0.6) < 0.001
+    # Gaussian noise, steps of 1/16 pixel, and steps of the image
+    per_pixel = 0.6**2 / (FOCAL * STEREO_BASE)
+    disparity = per_pixel**2 * (0.08**2 + 1 / (12 * 16**2))
+    expected = np.sqrt(disparity + 1 / (12 * STEPS_PER_METRE**2))
+    assert seen.std() == pytest.approx(expected, rel=0.05)

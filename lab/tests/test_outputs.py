@@ -5,9 +5,7 @@ Commands that write into what they are given (measure, fit into a card) and down
 """
 
 import os
-import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -144,22 +142,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_an_input_is_read(
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize(
-    ("line", "package"),
-    [
-        ("recognise none.off --record e.rrd", "rerun"),
-        ("look none --record e.rrd", "rerun"),
-        ("look none --explorer e.html", "viser"),
-    ],
-)
-def test_a_package_that_an_output_needs_is_missed_before_an_input_is_read(
-    line, package, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, package, None)
-    assert f"needs the package {package}" in refused(capsys, *line.split())
-
-
 @pytest.mark.parametrize("name", WRITES)
 def test_what_exists_is_refused_and_overwritten_on_demand_only(
     name, made, tmp_path, monkeypatch, capsys
@@ -244,21 +226,3 @@ def test_a_run_writes_nothing_in_the_home_folder(job, made, tmp_path):
     }
     # its list of fonts
     assert written <= ({(".cache", "matplotlib")} if job == "pictures" else set())
-
-
-def test_who_wants_telemetry_keeps_it():
-    code = "import os, nextview.runtime; print(os.environ['ORT_DISABLE_TELEMETRY'])"
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if name != "ORT_DISABLE_TELEMETRY"
-    }
-    assert run_python(code, env=environment).stdout.strip() == "1"
-    tops = ("src", "lab/src", "examples", "docs", "workflow")
-    sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
-    with_it = {
-        path.name
-        for path in sources
-        if re.search(r"^\s*(import|from) onnxruntime", path.read_text(), re.M)
-    }
-    assert with_it == {"runtime.py"}  # all others take it from there

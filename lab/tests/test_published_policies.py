@@ -8,7 +8,7 @@ from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import angle_between
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
-from nextview_lab.benchmark.published_policies import (
+from nextview_lab.benchmark.thing_policies import (
     PredictedEntropy,
     SampledInformation,
 )
@@ -52,5 +52,5 @@ def test_a_visited_view_is_never_chosen(policy):
 
 @BOTH
 def test_a_state_without_geometry_is_refused(policy):
-    with pytest.raises(PolicyError, match="needs things of known geometry"):
+    with pytest.raises(PolicyError):
         policy(SPHERE).next_views(state_from(0, None), np.random.default_rng(0))

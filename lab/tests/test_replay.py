@@ -19,9 +19,8 @@ from nextview.recognition.own_stopping import own_stopping
 from nextview.session.episode import run_episodes
 from nextview.session.session import Session
 from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.benchmark.replay import Grid, make_specs, replay, run_grid, truncate
+from nextview_lab.benchmark.replay import make_specs, replay, truncate
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.errors import EntryError
 
 
 @pytest.fixture(scope="module")
@@ -151,28 +150,6 @@ def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike
     np.testing.assert_array_equal(live.n_views, expected)
     with pytest.raises(UsageError):
         truncate(replay("lem", specs, 9, 0), rule)
-
-
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        (
-            "Raises",
-            r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)",
-        ),
-        ("Missing", "cannot be made"),
-    ],
-)
-def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(
-    specs, name, sentence
-):
-    grid = Grid(specs, 4, (0.9,), 5, 0)
-    path = f"test_replay:{name}"
-    assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]
-    assert set(grid.paths) == {"furthest", "test_replay:Asked"}
-    with pytest.raises(ValueError, match=sentence):
-        raise EntryError(grid.failures[path])
-    assert path in grid.failures[path]
 
 
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(

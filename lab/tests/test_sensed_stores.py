@@ -34,7 +34,7 @@ def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp
     begun.close()
     assert int(ViewStore.open(resumed).done.sum()) == 1
     for other in ("wrist", None):
-        with pytest.raises(DatasetError, match="begun with other sensor"):
+        with pytest.raises(DatasetError):
             list(rendered(furniture, resumed, other))
     list(rendered(furniture, resumed, "wrist:2", workers=2))
     a, b = ViewStore.open(whole), ViewStore.open(resumed)

@@ -6,7 +6,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from symmetric_parts import degrees_off, parts, turns_of
 
-from nextview.errors import UsageError
 from nextview.recognition.model_card import Symmetry
 from nextview.recognition.poses import PoseCandidate, turn_apart
 from nextview.teaching.symmetries import named_symmetries
@@ -81,23 +80,3 @@ def test_a_person_names_symmetries():
         "ball": tuple(Symmetry(tuple(axis), 0) for axis in np.eye(3)),
         "bar": (Symmetry((half, 0, half), 2),),
     }
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "mug",
-        "=z",
-        "mug=",
-        "mug=w",
-        "mug=z:1",
-        "mug=z:x",
-        "mug=0/0/0",
-        "mug=1/2",
-        "mug=nan/0/0",
-    ],
-)
-def test_an_invalid_symmetry_is_rejected_with_advice(text):
-    with pytest.raises(UsageError, match="a symmetry is NAME=none") as error:
-        named_symmetries([text])
-    assert repr(text) in str(error.value)

@@ -10,8 +10,13 @@ from lab_programs import main
 from nextview.errors import ResultsError, UsageError
 from nextview_lab.benchmark import tables as stage
 from nextview_lab.benchmark.results import compared_markdown, latex
-from nextview_lab.benchmark.table_runs import TableRun, TableRuns, TableSettings
-from nextview_lab.benchmark.tables import benchmark_tables, summarise_tables
+from nextview_lab.benchmark.tables import (
+    TableRun,
+    TableRuns,
+    TableSettings,
+    benchmark_tables,
+    summarise_tables,
+)
 
 SIX = 11  # the seed of a table with six things
 SETTINGS = TableSettings(

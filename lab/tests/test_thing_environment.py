@@ -8,7 +8,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env
 
 import nextview_lab.benchmark.environments  # noqa: F401
-from nextview.errors import DatasetError, SessionError, UsageError
+from nextview.errors import SessionError
 from nextview.policies.learned_tables import cells_from
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE
 
@@ -81,14 +81,3 @@ def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
     )
     with pytest.raises(SessionError):
         env.unwrapped.step(0)
-
-
-def test_invalid_settings_are_rejected(knobs, knobs_memory, tmp_path):
-    given = {"scans": knobs, "models": str(knobs_memory)}
-    with pytest.raises(UsageError):
-        gymnasium.make(NAME, **given, max_views=1)
-    with pytest.raises(UsageError):
-        gymnasium.make(NAME, **given, objective="speed")
-    (tmp_path / "can.ply").write_bytes((knobs / "can.ply").read_bytes())
-    with pytest.raises(DatasetError):
-        gymnasium.make(NAME, scans=tmp_path, models=str(knobs_memory))

@@ -5,7 +5,7 @@ a time.
 import numpy as np
 import pandas as pd
 import pytest
-from lab_programs import main, refused
+from lab_programs import main
 from pipeline import benchmark, some_predictions
 
 NAMES = ("random", "lem", "furthest", "spread", "oracle-gain")
@@ -59,22 +59,3 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
             assert np.isnan(after.loc[name, "p"])
         else:
             assert after.loc[name, "p"] == pytest.approx(tests.loc[name, "p"], abs=1e-9)
-
-
-def test_the_report_draws_figures_and_tables_for_papers(made):
-    assert (made / "out/views.md").read_text().startswith("| policy | 2 views")
-    main(["report", str(made / "out"), "--figures", str(made / "figures")])
-    written = {path.name for path in (made / "figures").iterdir()}
-    for name in ("accuracy", "n_views", "reliability"):
-        assert (made / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
-        assert "<svg" in (made / "figures" / f"{name}.svg").read_text()
-    for name in ("leaderboard", "tests", "views"):
-        assert {f"{name}.csv", f"{name}.tex"} <= written
-        assert (made / "figures" / f"{name}.tex").read_text().count("oracle-gain") >= 1
-
-
-def test_more_views_than_are_taken_are_refused(made, capsys):
-    words = refused(
-        capsys, "benchmark", "classes", made / "p.npz", made / "no", "--views", "3", "7"
-    )
-    assert "policies take 1 to 5 views (--max-views), and --views asks for 3 7" in words

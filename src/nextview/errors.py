@@ -85,13 +85,18 @@ def printable(text: str) -> str:
 class NextviewError(ValueError):
     """The base class of all errors that nextview raises on purpose.
 
+    Attributes:
+        kind: name of the mistake that a frame, or the frames of a capture, were read with, such as
+            "inverse pose"; "" where the class says it all.
+
     Example:
         >>> issubclass(nextview.MeshError, nextview.NextviewError)
         True
     """
 
-    def __init__(self, message: str = "") -> None:
+    def __init__(self, message: str = "", kind: str = "") -> None:
         super().__init__(printable(message))
+        self.kind = kind
 
 
 class UsageError(NextviewError):

@@ -151,7 +151,7 @@ def _contradicting(
     posed = PosedViews(views, poses[compared])
     found = _find_mistake(posed, _stored(capture, frames))
     if found is not None:
-        raise _disagree(capture, found.sentence)
+        raise _disagree(capture, found.sentence, found.name)
 
     most = max(1, int(MOST_REFUSED * len(frames)))
     late = find_late(views, compared, poses)
@@ -159,9 +159,8 @@ def _contradicting(
     parts = [(first, end) for first, end in pairwise(ends) if late[first]]
     names = [capture.frames[i].name for i in compared]
     if np.count_nonzero(late) > most:
-        raise _disagree(
-            capture, " and ".join(_in_words(late, names, *part) for part in parts)
-        )
+        words = " and ".join(_in_words(late, names, *part) for part in parts)
+        raise _disagree(capture, words, "late poses")
     refused = {
         capture.frames[i].name: f"its pose is {_frames_late(late[first])}"
         for first, end in parts
@@ -187,7 +186,7 @@ def _contradicting(
     if too_many or blamed:
         offset = _find_offset(posed)
         if offset:
-            raise _disagree(capture, offset)
+            raise _disagree(capture, offset, "camera offset")
     if too_many:
         wrong = max(one.wrong for one in agreements)
         first, _ = _break(agreements[1])
@@ -228,10 +227,10 @@ def _stored(capture: Capture, frames: Sequence[Frame]) -> Stored:
     )
 
 
-def _disagree(capture: Capture, looks: str) -> DatasetError:
+def _disagree(capture: Capture, looks: str, kind: str) -> DatasetError:
     """Return the error for contradictions that a mistake explains."""
     problem = "its frames do not agree about one rigid object, and without this mistake they would"
-    return DatasetError(f"{capture.folder}: {problem}: {looks}")
+    return DatasetError(f"{capture.folder}: {problem}: {looks}", kind)
 
 
 def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:

@@ -45,7 +45,9 @@ def no_faces(n_points: int, with_normals: bool = False) -> str:
     else:
         what = f"{n_points:,} points and no faces"
         how = "MeshLab's Compute Normals for Point Sets, then Screened Poisson reconstruction"
-    return f"it holds {what}; make a surface of them first, by {how} (docs/your_objects.md)"
+    return (
+        f"it holds {what}; make a surface of them first, by {how} (docs/get_a_scan.md)"
+    )
 
 
 def triangulate(

@@ -549,9 +549,9 @@ def check_mistakes(seen: SegmentedFrame, known: KnownFrames) -> list[ViewWarning
 
     told = _told(read, others)
     if told is not None:
-        right, warning = told
+        right, warning, kind = told
         if right < REFUSED:
-            raise ObservationError(warning.message)
+            raise ObservationError(warning.message, kind)
         return [replace(warning, message=f"{warning.message}?")]
     told = _told(read, of_focal_length)
     if told is None:
@@ -560,8 +560,11 @@ def check_mistakes(seen: SegmentedFrame, known: KnownFrames) -> list[ViewWarning
     return [ViewWarning("intrinsics", told[1].message, holds=False)]
 
 
-def _told(read: Reading, others: Sequence[Reading]) -> tuple[float, ViewWarning] | None:
-    """Return the probability that a frame is right, and what is said; None for nothing.
+def _told(
+    read: Reading, others: Sequence[Reading]
+) -> tuple[float, ViewWarning, str] | None:
+    """Return the probability that a frame is right, what is said, and the likeliest mistake's name;
+    None for nothing.
 
     Args:
         read: the frame as it was handed in.
@@ -591,7 +594,7 @@ def _told(read: Reading, others: Sequence[Reading]) -> tuple[float, ViewWarning]
             named.setdefault(one.sentence if one.focal == 1 else one.name, one.sentence)
     words = ", and ".join(facts[row].words for row in told)
     message = f"{words}: {'; or '.join(named.values())}"
-    return right, ViewWarning(facts[told[0]].warning, message)
+    return right, ViewWarning(facts[told[0]].warning, message), undone[best].name
 
 
 def _coincidence(difference: float, error: float) -> float:

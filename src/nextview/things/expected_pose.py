@@ -78,7 +78,7 @@ def sharper_poses(
         pose: its pose, (4, 4).
         covariance: covariance of rotation and translation after the views so far, (6, 6).
         sensor: the camera.
-        prior: prior of the camera poses.
+        model: errors that are expected of the camera pose.
         taken: number of views so far.
 
     Returns:

@@ -16,10 +16,14 @@ from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_stopping import own_stopping
 from nextview_lab.benchmark.board_page import markdown
-from nextview_lab.benchmark.class_tables import ClassResults, ClassTables, summarise
+from nextview_lab.benchmark.class_tables import (
+    ClassResults,
+    ClassTables,
+    after_views_table,
+    summarise,
+)
 from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.jobs import Settings
-from nextview_lab.benchmark.leaderboard import after_views_table
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview_lab.benchmark.results import RECORD, write_results
 from nextview_lab.data.predictions import Predictions

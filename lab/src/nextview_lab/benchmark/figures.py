@@ -18,11 +18,14 @@ from nextview.session.style import (
     new_figure,
     percent_axis,
 )
-from nextview_lab.benchmark.class_tables import ONE_STEP, ClassResults
+from nextview_lab.benchmark.class_tables import (
+    ONE_STEP,
+    ClassResults,
+    headline_threshold,
+)
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.evaluation import Evaluation
-from nextview_lab.benchmark.leaderboard import headline_threshold
 from nextview_lab.benchmark.page import words
 from nextview_lab.extras import extras
 

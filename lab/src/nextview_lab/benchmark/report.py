@@ -15,8 +15,8 @@ from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
 from nextview.policies.registry import DEFAULT_POLICY
 from nextview.recognition.map_names import LEM
+from nextview_lab.benchmark import class_tables as board
 from nextview_lab.benchmark import figures as draw
-from nextview_lab.benchmark import leaderboard as board
 from nextview_lab.benchmark.class_tables import ClassResults, class_set
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of

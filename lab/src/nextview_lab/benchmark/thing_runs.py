@@ -20,12 +20,13 @@ from nextview.policies.base import Policy
 from nextview.simulation.sensor import sensor_named
 from nextview.things.surface import Surface
 from nextview_lab.benchmark.jobs import Job, Settings
-from nextview_lab.benchmark.known_things import KnownThings, things_of
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
+    KnownThings,
     Occlusion,
     Setting,
     ThingEpisode,
+    things_of,
 )
 from nextview_lab.benchmark.thing_policies import (
     BEST_BLIND,

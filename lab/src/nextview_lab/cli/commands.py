@@ -89,7 +89,7 @@ COMMANDS = {
         example="export map runs/lem views.zarr models --bits 8",
     ),
     "predict": Command(
-        f"{CLI}.predict:predict",
+        f"{CLI}.stores:predict",
         "run the models once over every view of a store",
         example="predict views.zarr test.npz --split test --models models",
     ),
@@ -158,7 +158,7 @@ COMMANDS = {
         "nextview_lab.benchmark.bop:look_for_models",
         "locate the models of a BOP dataset in its images",
         "wrote {out}; next: evaluate it with bop_toolkit",
-        f"{CLI}.bop:print_bop",
+        f"{CLI}.benchmark_tables:print_bop",
         example="bop lmo nextview_lmo-test.csv --models lmo_memory",
     ),
     "submit": Command(
@@ -189,7 +189,7 @@ COMMANDS = {
         example="explore views.zarr",
     ),
     "check": Command(
-        f"{CLI}.check:check",
+        f"{CLI}.stores:check",
         "verify a view store",
         example="check views.zarr",
     ),

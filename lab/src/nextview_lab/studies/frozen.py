@@ -3,10 +3,10 @@
     python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0
     python -m nextview_lab.studies.frozen SCANS part --things 4 --draws 1 --grid 3 4
 
-Each thing lies in some of seven places (``places`` says what they are), by the
-physics of ``staged_things``, and a stereo camera takes all candidate views of it:
-a grid of azimuths and elevations over where a camera can stand. Nothing of nextview's own
-simulation is used. docs/submit.md describes the files and how methods are compared on them.
+Each thing lies in some of the seven places of ``staged_things``, by its physics, and a stereo
+camera takes all candidate views of it: a grid of azimuths and elevations over where a camera can
+stand. Nothing of nextview's own simulation is used. docs/submit.md describes the files and how
+methods are compared on them.
 
 All that a method is told of the cameras is drawn before the scene, and without knowing the thing
 (``draw_views``); the scene is then placed so that a detector would have aimed the cameras there.
@@ -56,6 +56,8 @@ from nextview_lab.studies.shared import scans_in
 from nextview_lab.studies.staged_things import (
     CAMERA_MATRIX,
     ENOUGH_PIXELS,
+    PLACES,
+    STEPS_PER_METRE,
     WHERE_CAMERAS_STAND,
     Float,
     Place,
@@ -68,16 +70,6 @@ from nextview_lab.studies.staged_things import (
     true_pose,
 )
 
-FROZEN_PLACES: tuple[Place, ...] = (
-    "alone",
-    "shelf",
-    "stack",
-    "bin",
-    "bowl",
-    "leaning",
-    "held",
-)
-STEPS_PER_METRE = 10_000  # of the depth images: 0.1 mm
 COMPRESSION = 6  # of PNG
 DISTANCES = (
     0.35,
@@ -141,7 +133,7 @@ class FrozenTerms:
         seed: of everything random.
     """
 
-    places: tuple[Place, ...] = FROZEN_PLACES
+    places: tuple[Place, ...] = PLACES
     things: int = 0
     draws: int = 2
     grid: tuple[int, int] = (5, 8)
@@ -246,19 +238,18 @@ def scene_before(
     scan = scan_of(str(scans), name)
     camera = views.poses[views.first]
     for _ in range(SCENES_TRIED):
-        found = staged(place, str(scans), name, rng)
-        if found is None:
+        scene = staged(place, str(scans), name, rng)
+        if scene is None:
             return None
 
-        scene, _ = found
         true = true_pose(scene[1])
         pose = moved(camera, true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3])
-        depth, mask = looked(*scene, pose, rng, STEPS_PER_METRE)
+        depth, mask = looked(*scene, pose, rng)
         if shown_pixels(depth, mask) < ENOUGH_PIXELS:
             continue
 
         aim = detected(depth, mask, pose) + rng.normal(0, AIM_ERROR, 3)
-        depth, mask = looked(*scene, moved(camera, aim), rng, STEPS_PER_METRE)
+        depth, mask = looked(*scene, moved(camera, aim), rng)
         if shown_pixels(depth, mask) >= ENOUGH_PIXELS:
             return ShownScene(*scene, aim, depth, mask)
     return None
@@ -273,7 +264,7 @@ def make_episode(
     folder: Path, scans: Path, name: str, place: Place, how: FrozenTerms
 ) -> EpisodeTruth | None:
     """Write an episode; its truth, or None if the thing cannot be shown there."""
-    rng = np.random.default_rng([how.seed, FROZEN_PLACES.index(place), *name.encode()])
+    rng = np.random.default_rng([how.seed, PLACES.index(place), *name.encode()])
     views = draw_views(place, how, rng)
     scene = scene_before(views, place, scans, name, rng)
     if scene is None:
@@ -286,7 +277,7 @@ def make_episode(
         depth, mask = scene.depth, scene.mask
         if number != views.first:
             there = moved(pose, scene.aim)
-            depth, mask = looked(scene.model, scene.data, there, rng, STEPS_PER_METRE)
+            depth, mask = looked(scene.model, scene.data, there, rng)
         depth[depth > how.farthest * STEPS_PER_METRE] = 0
         pixels.append(shown_pixels(depth, mask))
         place_of = folder / f"{number:03d}"

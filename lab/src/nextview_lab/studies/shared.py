@@ -1,11 +1,11 @@
-"""What studies share: scans, results line by line, shares, tables, progress."""
+"""What studies share: scans, results line by line, intervals of shares, progress."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,8 +14,7 @@ from rich.progress import track
 from scipy.stats import binomtest
 
 from nextview.cli.progress import console
-from nextview.data.pool import WorkerDied, each
-from nextview.errors import NextviewError, UsageError
+from nextview.errors import UsageError
 from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 
 SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
@@ -69,7 +68,6 @@ def results(
     asked: Sequence[Asked],
     run: Callable[[Asked], dict[str, Any]],
     what: str,
-    workers: int = 0,
 ) -> list[dict[str, Any]]:
     """Results of all that is asked for; what a file holds already is not run again.
 
@@ -79,13 +77,9 @@ def results(
         asked: tuples of these values.
         run: returns the rest of the line.
         what: is run, for the progress that is shown.
-        workers: processes; 0 for this one. With more, ``run`` has to be picklable.
 
     Returns:
         A line for each that is asked for, in their order.
-
-    Raises:
-        NextviewError: a process has died.
     """
 
     def key(values: Any) -> str:
@@ -95,33 +89,24 @@ def results(
         key([line.get(name) for name in fields]): line for line in read_lines(path)
     }
     missing = [item for item in asked if key(item) not in known]
-    done = each(run, missing, workers)
     with path.open("a") as file:
-        for item, found in progress(done, what, len(missing)) if missing else ():
-            if isinstance(found, WorkerDied):
-                raise NextviewError(f"{key(item)}: {found}")
-            line = json.dumps(
-                dict(zip(fields, item, strict=True)) | found, default=asdict
-            )
+        for item in progress(missing, what) if missing else ():
+            known_by = dict(zip(fields, item, strict=True))
+            line = json.dumps(known_by | run(item), default=asdict)
             file.write(f"{line}\n")
             file.flush()
             known[key(item)] = json.loads(line)
     return [known[key(item)] for item in asked]
 
 
-def progress(
-    items: Iterable[Item], what: str, total: int | None = None
-) -> Iterator[Item]:
+def progress(items: Sequence[Item], what: str) -> Iterator[Item]:
     """Some items one after the other, with progress on standard error.
 
     Args:
         items: that work is done with.
         what: is worked on.
-        total: number of items; None to take all of them first, and count.
     """
-    if total is None:
-        items = list(items)
-        total = len(items)
+    total = len(items)
     if console.is_terminal:
         yield from track(items, what, total, console=console)
         return
@@ -137,11 +122,3 @@ def wilson(count: int, total: int) -> tuple[float, float]:
     """The 95 % Wilson interval of a share."""
     low, high = binomtest(count, total).proportion_ci(method="wilson")
     return float(low), float(high)
-
-
-def share(count: int, total: int) -> str:
-    """A share with its 95 % Wilson interval, in words; "-" of nothing."""
-    if not total:
-        return "-"
-    low, high = wilson(count, total)
-    return f"{count} of {total}, {count / total:.2f} ({low:.2f} to {high:.2f})"

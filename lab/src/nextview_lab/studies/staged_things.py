@@ -1,9 +1,8 @@
 """Things that lie where things lie, and a stereo camera: nothing of nextview's own simulation.
 
 Things fall by the physics of MuJoCo and are seen along its rays. ``STAGES`` holds a function for
-each place, which returns a scene in which a thing may come to rest there; ``at_rest`` lets it fall,
-and ``shots_of`` takes three views around it. ``nextview_lab.studies.places`` judges nextview with
-them.
+each place, which returns a scene in which a thing may come to rest there; ``staged`` lets it fall,
+and ``looked`` takes a view of it.
 
 The same seed shows the same on every x86-64 processor. Matrix products, decompositions and
 exponentials differ in their last bits between processors, by the kernels that BLAS and NumPy choose
@@ -35,25 +34,21 @@ from nextview_lab.extras import extras
 
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Place = Literal["alone", "stood", "shelf", "stack", "bin", "bowl", "leaning", "held"]
+Place = Literal["alone", "shelf", "stack", "bin", "bowl", "leaning", "held"]
 PLACES: tuple[Place, ...] = get_args(Place)
 
 FOCAL = 610.0  # pixels
 IMAGE = 480, 640  # rows, columns
 STEREO_BASE = 0.055  # metres between the two cameras
 CAMERA_MATRIX = np.array([[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]])
-PER_METRE = 1000.0  # steps of a depth image, unless others are asked for
+STEPS_PER_METRE = 10_000  # of the depth images: 0.1 mm
 FARTHEST = 10.0  # metres that a ray goes
 DECIMALS = 7  # of what is rounded, metres and parts of directions
 COLLIDES = 3  # group of the geoms that are not seen
-VIEW_COUNT = 3
 STAGINGS_TRIED = 12  # of a thing in a place
 ENOUGH_PIXELS = 350  # of a thing, below which a view is not judged
-VIEWPOINTS_TRIED = 6  # of each view
 CONVEX_SHARE = 0.7  # of the hull that a scan fills, above which the hull is its shape
 FLOOR_DEPTH = 0.72  # metres from the table's top to the floor
-# cosine of the angle by which what was stood up may tilt
-FALLEN = np.cos(np.radians(10))
 CARRIED = 0.02  # least share of the weight that carries what leans
 # whose tops are flat when they lie on their largest side
 FLAT_TOPS = (
@@ -71,7 +66,6 @@ FLAT_TOPS = (
 # degrees: azimuths from the +x axis, elevations
 WHERE_CAMERAS_STAND: dict[Place, tuple[float, float, float, float]] = {
     "alone": (-180, 180, 25, 65),
-    "stood": (-180, 180, 25, 65),
     "shelf": (-40, 40, 5, 30),
     "stack": (-180, 180, 20, 60),
     "bin": (-180, 180, 50, 80),
@@ -340,20 +334,6 @@ def alone(actor: Actor, rng: np.random.Generator) -> Staging:
     return Staging(spec, {"thing": begin}, lambda m, d: near(d, 0.35, 0.3, 0.4))
 
 
-def stood(actor: Actor, rng: np.random.Generator) -> Staging:
-    """As it can be stood on a table, if it stays so."""
-    spec = room(rng)
-    actor.enters(spec)
-    turn = actor.in_some_stable_pose(rng)
-    begin = placed(actor.scan, turn, rng.uniform(-0.04, 0.04, 2), 0.002)
-
-    def still_stands(model: Any, data: Any) -> bool:
-        now = data.body("thing").xmat.reshape(3, 3)
-        return bool(now[2] @ turn[2] > FALLEN) and near(data, 0.35, 0.3, 0.4)
-
-    return Staging(spec, {"thing": begin}, still_stands)
-
-
 def shelf(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls in a compartment of 36 x 70 x 42 cm that is open towards +x."""
     spec = room(rng, table=False)
@@ -505,7 +485,6 @@ def held(actor: Actor, rng: np.random.Generator) -> Staging:
 
 STAGES: dict[Place, Callable[[Actor, np.random.Generator], Staging]] = {
     "alone": alone,
-    "stood": stood,
     "shelf": shelf,
     "stack": stack,
     "bin": in_a_bin,
@@ -540,10 +519,8 @@ def at_rest(staging: Staging) -> tuple[Any, Any] | None:
 
 def staged(
     place: Place, folder: str, name: str, rng: np.random.Generator
-) -> tuple[tuple[Any, Any], int] | None:
-    """A thing at rest where it should be: MuJoCo's model and data, and how many tries it took; None
-    if all were in vain.
-    """
+) -> tuple[Any, Any] | None:
+    """A thing at rest where it should be: MuJoCo's model and data; None after tries in vain."""
     mujoco = physics()
 
     for tries in range(STAGINGS_TRIED):
@@ -553,7 +530,7 @@ def staged(
             model, data = scene
             data.qpos[:] = rounded(data.qpos)
             mujoco.mj_kinematics(model, data)
-            return scene, tries + 1
+            return scene
     return None
 
 
@@ -598,14 +575,8 @@ def slope_along(values: Float, axis: int) -> Float:
     return np.where(np.abs(before) < np.abs(after), before, after)
 
 
-def as_measured(
-    depth: Float,
-    rng: np.random.Generator,
-    per_metre: float = PER_METRE,
-) -> NDArray[np.uint16]:
-    """What a stereo camera makes of depth: (H, W), metres, in; steps of which so many make a metre,
-    0 for holes, out.
-    """
+def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """What a stereo camera makes of depth: (H, W), metres, in; steps, 0 for holes, out."""
     true = FOCAL * STEREO_BASE / depth  # disparities, pixels
     slopes = [slope_along(true, axis) for axis in (0, 1)]
     rows, columns = np.indices(IMAGE)
@@ -633,7 +604,7 @@ def as_measured(
     shadow[:, :-1] = nearest[:, 1:] < in_second[:, :-1] - 0.5
     grazing = ~edges & (cosines < 0.2 + 0.04 * field(rng))
     holes = shadow | grazing | (in_second < 0) | (edges & (chance > 0.8)) | (seen < 4)
-    measured = np.rint(per_metre * FOCAL * STEREO_BASE / np.maximum(seen, 4))
+    measured = np.rint(STEPS_PER_METRE * FOCAL * STEREO_BASE / np.maximum(seen, 4))
     holes |= measured > np.iinfo(np.uint16).max
     return np.where(holes, 0, measured).astype(np.uint16)
 
@@ -654,15 +625,9 @@ def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> 
 
 
 def looked(
-    model: Any,
-    data: Any,
-    pose: Float,
-    rng: np.random.Generator,
-    per_metre: float = PER_METRE,
+    model: Any, data: Any, pose: Float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint16], Bools]:
-    """Measured depth, (H, W), steps of which so many make a metre, and the pixels of the thing,
-    (H, W).
-    """
+    """Measured depth, (H, W), steps, and the pixels of the thing, (H, W)."""
     mujoco = physics()
 
     rows, columns = np.indices(IMAGE)
@@ -692,56 +657,4 @@ def looked(
     )
     depth[hit < 0] = FARTHEST
     thing = hit.reshape(IMAGE) == model.geom("thing seen").id
-    return as_measured(depth.reshape(IMAGE), rng, per_metre), thing
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A frame, and the truth.
-
-    Attributes:
-        depth: (H, W), millimetres, 0 for holes.
-        mask: pixels of the thing, (H, W).
-        pose: true pose of the camera, (4, 4), OpenCV axes, metres.
-        told: what the arm says it is, (4, 4).
-    """
-
-    depth: NDArray[Any]
-    mask: Bools
-    pose: Float
-    told: Float
-
-    @property
-    def pixels(self) -> int:
-        """How many pixels of the thing have a depth."""
-        return int((self.mask & (self.depth > 0)).sum())
-
-
-def shots_of(
-    place: Place,
-    scene: tuple[Any, Any],
-    scan: trimesh.Trimesh,
-    arm_error: tuple[float, float],
-    rng: np.random.Generator,
-) -> tuple[list[Shot], float]:
-    """Three views around a thing, the best found of each, and the cameras' distance, metres."""
-    model, data = scene
-    true = true_pose(data)
-    middle = true[:3, :3] @ scan.bounds.mean(0) + true[:3, 3]
-    distance = float(np.clip(2 * np.linalg.norm(scan.extents), 0.3, 0.6))
-    left, right, low, high = WHERE_CAMERAS_STAND[place]
-    around = (right - left) / VIEW_COUNT
-    first = rng.uniform(0, 360) if right - left == 360 else 0.0
-    shots = []
-    for third in rng.permutation(VIEW_COUNT):
-        tried: list[Shot] = []
-        while len(tried) < VIEWPOINTS_TRIED:
-            azimuth = first + left + (third + rng.uniform(0.15, 0.85)) * around
-            aim = middle + rng.normal(0, 0.005, 3)
-            pose = camera_at(aim, azimuth, rng.uniform(low, high), distance)
-            told = as_told(pose, arm_error, rng)
-            tried.append(Shot(*looked(model, data, pose, rng), pose, told))
-            if tried[-1].pixels >= ENOUGH_PIXELS:
-                break
-        shots.append(max(tried, key=lambda shot: shot.pixels))
-    return shots, distance
+    return as_measured(depth.reshape(IMAGE), rng), thing

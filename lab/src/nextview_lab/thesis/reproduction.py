@@ -23,10 +23,9 @@ import tyro
 from nextview.cli.exit_status import orderly_end
 from nextview.files import sha256_of
 from nextview.recognition.belief import PLAIN_SUM
-from nextview_lab.benchmark.class_tables import ClassTables, summarise
+from nextview_lab.benchmark.class_tables import ClassTables, nothing_differs, summarise
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT
 from nextview_lab.benchmark.entries import default_entries
-from nextview_lab.benchmark.leaderboard import nothing_differs
 from nextview_lab.benchmark.published import published, published_threshold
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview_lab.data.predictions import Predictions
@@ -59,10 +58,9 @@ class Compared(NamedTuple):
     p: float
 
     def __str__(self) -> str:
-        return (
-            f"{100 * self.difference:+.1f} ({100 * self.low:+.1f} to {100 * self.high:+.1f}, p"
-            f" {_p(self.p)})"
-        )
+        p = "" if _p(self.p) == "1.000" else f", p {_p(self.p)}"
+        low, high = (f"{100 * end:+.1f}" for end in (self.low, self.high))
+        return f"{100 * self.difference:+.1f} ({low} to {high}{p})"
 
     @property
     def verdict(self) -> str:
@@ -116,7 +114,6 @@ def page(predictions: Path, samples: int = 2000) -> str:
         (p, None if t != t else t, m): (v, low, high) for p, t, m, v, low, high in rows
     }
     test = {name: tests_of(of, "accuracy") for name, of in tables.items()}
-    clean = {name: tests_of(of, "clean_accuracy") for name, of in tables.items()}
     lems = {name: what for name, what in LEMS.items() if name in ran}
 
     def number(
@@ -144,7 +141,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
             " bootstrap intervals over objects. p-values are by sign flips over objects, after one"
             " Holm correction over all that is compared with the same policy: every other one,"
             " published, learned or oracle, at every threshold, as in `nextview-lab benchmark"
-            " classes`."
+            " classes`; where none is given, p is 1.000."
             " Differences of accuracy are in percentage points."
         ),
         "",
@@ -257,13 +254,11 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         "| policy | what it knows | "
         + " | ".join(f"against {b}" for b in BASELINES)
-        + " | against random, no duplicates |",
-        "|---|---|---|---|---|---|",
+        + " |",
+        "|---|---|---|---|---|",
     ]
     for name, what in lems.items():
-        cells = [str(test[b][name, AT]) for b in BASELINES] + [
-            str(clean["random"][name, AT])
-        ]
+        cells = [str(test[b][name, AT]) for b in BASELINES]
         out.append(f"| {name} | {what} | " + " | ".join(cells) + " |")
     out += [
         "",
