@@ -62,11 +62,6 @@ class BopFiles:
         """File of the objects in all images."""
         return self.named("scene_gt", ".json")
 
-    @property
-    def visible_file(self) -> Path:
-        """File of what is visible of them."""
-        return self.named("scene_gt_info", ".json")
-
     def depth(self, name: str) -> Path:
         """Path of a depth image.
 

@@ -352,7 +352,7 @@ def load(
             "MODULE:NAME", see ``recognition.own_recogniser``. It is pickled with the system.
         camera_accuracy: standard deviations of the camera poses along and about each axis:
             (millimetres, degrees), for example from hand-eye calibration and the data sheet of the
-            arm. By default (3, 0.34). They add to the uncertainty of poses in the world frame, and
+            arm. By default (4, 0.34). They add to the uncertainty of poses in the world frame, and
             guide the alignment of views.
 
     Returns:

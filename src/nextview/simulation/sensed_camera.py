@@ -182,29 +182,6 @@ class SensedCamera:
             else None
         )
 
-    def visible_share(self, pose: Float) -> float:
-        """Return the share of the object's pixels that no box occludes, without sensor errors.
-
-        Args:
-            pose: as in ``observe``.
-
-        Returns:
-            A number from 0 to 1; 0 if the object is outside the image.
-        """
-        inside = self._truth.pose_in_object(
-            self._truth.pose_in_world(pose, self.sensor.distance)
-        )
-        depth = self._camera.observe(inside).depth
-        shown = depth > 0
-        count = np.count_nonzero(shown)
-        if count == 0:
-            return 0.0
-        if self._around is None:
-            return 1.0
-        boxes = self._around.observe(inside).depth
-        hidden = shown & (boxes > 0) & (boxes < depth)
-        return 1 - np.count_nonzero(hidden) / count
-
     def _scene(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
         """Return the true depth of object, boxes and table, metres, and the label of each pixel."""
         inside = self._truth.pose_in_object(pose)
