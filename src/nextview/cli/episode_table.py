@@ -64,7 +64,8 @@ def print_episode(
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
 
     console.print(_answer_in_words(result, has_threshold))
-    if result.novelty is not None and not result.unknown:
+    named = result.unknown or result.pose_candidates
+    if result.novelty is not None and not named:
         console.print(
             f"Known or unknown: {100 * result.novelty:.3g} % of known objects fit as badly as this"
             f" one or worse; {_limit_in_words(result.unknown_rate)}."

@@ -57,10 +57,6 @@ class LookOptions:
             along --up).
         frames: number of frames to use, evenly spread over the recording; for cameras that stand
             still, over the moments at which the scene has changed.
-        unknown: significance level of the test for unknown objects: an object with a smaller
-            p-value is called unknown. The default of 0.02 also rejects one known thing in 50. A
-            rate that no p-value of the models can be below is refused.
-            0 always names a thing.
     """
 
     models: str | tuple[str, ...] = "ycb"
@@ -72,7 +68,6 @@ class LookOptions:
     up: str | Three | None = None
     region: tuple[float, float, float, float, float, float] | None = None
     frames: int = 6
-    unknown: float | None = None
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,7 @@ def look(
     capture, left_out = check_capture(read, masked=False)
     console.print(f"{capture!r}")
     models = looking.models if isinstance(looking.models, str) else list(looking.models)
-    system = load(models, unknown=looking.unknown)
+    system = load(models)
     scene = Scene(system, *_where(capture, looking))
 
     with ExitStack() as recorded:

@@ -270,8 +270,6 @@ class BopOptions:
             try; by default all.
         camera_poses: use the poses of the cameras in scene_camera.json, in whose world z points
             up; by default the normal of the support plane does.
-        unknown: p-value below which an object is called unknown, and is not written; by default
-            0.02, so one known thing in 50 is. 0 always names a thing.
     """
 
     models: str = "ycb"
@@ -281,7 +279,6 @@ class BopOptions:
     camera: str | None = None
     frames: int | None = None
     camera_poses: bool = False
-    unknown: float | None = None
 
 
 class FoundPose(msgspec.Struct, frozen=True):
@@ -380,7 +377,7 @@ def look_for_models(
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
     numbers = _numbers_of_things(how.models, given, read)
-    system = load(how.models, unknown=how.unknown)
+    system = load(how.models)
 
     left_out: dict[str, str] = {}
     with only_one(out), unfinished(out, _key(read, how)) as parts:
@@ -489,7 +486,6 @@ def _key(dataset: BopDataset, how: BopOptions) -> str:
         card.sha256,
         sorted(how.ids),
         how.camera_poses,
-        how.unknown,
     ]
     return hashlib.sha256(msgspec.json.encode(depends)).hexdigest()
 
