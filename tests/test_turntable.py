@@ -118,7 +118,7 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, tmp_path):
     for name in ("chair", "table"):
         assert (
             system.recognise(
-                tmp_path / f"{name}.off", unit="m", start=17, sensor="wrist", seed=1
+                tmp_path / f"{name}.off", unit="m", start=30, sensor="wrist", seed=1
             ).answer
             == name
         )

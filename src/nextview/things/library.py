@@ -254,8 +254,12 @@ class Hypotheses:
             near = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
             others = own.alike(thing)
             turned = own.axes[thing].T @ HALF_TURNS @ own.axes[others][:, None]
-            things = np.append(np.full(len(near), thing), np.repeat(others, 4))
-            rotations = rotation @ np.concatenate([near, turned.reshape(-1, 3, 3)])
+            things = np.append(np.repeat(others, 4), np.full(len(near), thing))
+            rotations = rotation @ np.concatenate([turned.reshape(-1, 3, 3), near])
+            itself = 4 * np.searchsorted(others, thing)
+            things, rotations = (
+                np.delete(each, itself, 0) for each in (things, rotations)
+            )
             arms = np.einsum("nij,nj->ni", rotations, own.middles[things])
             centres = centre + rotation @ own.middles[thing] - arms
             found.append(Hypotheses.of(things, rotations, centres))
