@@ -559,6 +559,24 @@ def load_run(network: N, run: Path) -> N:
     return network.eval()
 
 
+def interpolate(network: nn.Module, start: dict[str, Tensor], share: float) -> None:
+    """Move the parameters of a trained network back towards their initial values.
+
+    Args:
+        network: the network, which is changed.
+        start: its initial parameters.
+        share: of the way from the initial (0) to the trained ones (1).
+    """
+    network.load_state_dict(
+        {
+            name: torch.lerp(start[name].to(values), values, share)
+            if values.is_floating_point()
+            else values
+            for name, values in network.state_dict().items()
+        }  # counters are not interpolated
+    )
+
+
 # patterns of parameter names in ports of EfficientNet to PyTorch, and names in a ``LiteNet``
 LITE_NAMES = {
     r"^_conv_": "",

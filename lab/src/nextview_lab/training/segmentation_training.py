@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -29,7 +30,7 @@ from nextview_lab.data.labelled_frames import (
 from nextview_lab.extras import extras
 from nextview_lab.training.architectures import SegmentationNet
 from nextview_lab.training.recipes import Hardware, SegmentationRecipe
-from nextview_lab.training.runs import OwnBatches, fit, new_run, train_once
+from nextview_lab.training.runs import OwnBatches, fit, interpolate, new_run, train_once
 
 with extras():
     import lightning as L
@@ -350,5 +351,7 @@ def fit_segmentation(
     if exported is not None:
         some = [batch[0] for batch in islice(training, BATCHES_NORMED)]
         start_from_export(module.net, exported, torch.cat(some))
+    start = deepcopy(module.net.state_dict())
     best = fit(module, training, validation, out, "validation_loss", "min", hardware)
+    interpolate(best.net, start, recipe.interpolation)
     return best.net.eval()
