@@ -48,7 +48,7 @@ FRAME_SHAPE = (160, 213)  # rows and columns
 FRAMES_OF_A_FILE = 400  # largest number of frames in a file
 VIEWS_OF_A_WORLD = 2
 FEW_PIXELS = 0.06  # share of object pixels; most frames with fewer are dropped
-FEW_KEPT = 0.35  # share of these that are kept
+FEW_KEPT = 0.25  # share of these that are kept
 # per frame: number of solids from which a file draws objects, and of meshes among them
 SHAPES_PER_FRAME = 0.35
 TOYS_PER_FRAME = 0.15

@@ -270,6 +270,8 @@ class SegmentationRecipe:
             validation frames relative to --frames.
         seed: seed of all random numbers, including those of the frames.
         patience: stop after so many epochs without a lower loss on validation; 0 never stops early.
+        interpolation: position of the final weights between the initial (0) and the trained ones
+            (1), as of the recogniser; for --start.
     """
 
     frames: int = 12_000
@@ -281,6 +283,7 @@ class SegmentationRecipe:
     validation_share: float = 0.05
     seed: int = 0
     patience: int = 0
+    interpolation: float = 1.0
 
     def __post_init__(self) -> None:
         _check(self, ("frames", "width", "epochs", "batch"), ("validation_share",))

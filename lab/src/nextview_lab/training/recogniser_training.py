@@ -22,6 +22,7 @@ from nextview_lab.training.recipes import Hardware, RecogniserRecipe
 from nextview_lab.training.runs import (
     OwnBatches,
     fit,
+    interpolate,
     new_run,
     optimiser,
     start_from,
@@ -323,13 +324,7 @@ def fit_recogniser(
     start = {name: values.clone() for name, values in module.net.state_dict().items()}
     validation = ValidationViews(sources[0].inputs, parts[1], labels)
     best = fit(module, views, validation, out, "class_accuracy", "max", hardware)
-    way = {
-        name: torch.lerp(start[name].to(values), values, recipe.interpolation)
-        if values.is_floating_point()
-        else values
-        for name, values in best.net.state_dict().items()  # counters are not interpolated
-    }
-    best.net.load_state_dict(way)
+    interpolate(best.net, start, recipe.interpolation)
 
     return best.net.eval()
 

@@ -27,6 +27,7 @@ from nextview.files import (
     sha256_of,
     write_record,
 )
+from nextview.segmentation.network import SegmentationCard
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import extras
@@ -396,7 +397,7 @@ def new_run(
     recipe: Any,
     weights: Path | None,
     held_out: Sequence[str],
-    made: Iterable[ViewStore | Predictions],
+    made: Iterable[ViewStore | Predictions | SegmentationCard],
 ) -> Run:
     """Describe a run of the current command.
 
@@ -404,7 +405,7 @@ def new_run(
         recipe: of the training.
         weights: file or run with the initial weights; None for random ones.
         held_out: names of the validation objects.
-        made: stores and predictions that the run uses.
+        made: stores, predictions and networks that the run uses.
 
     Returns:
         The description.
@@ -556,6 +557,24 @@ def load_run(network: N, run: Path) -> N:
             f"{path}: not the weights of the network that {run}/run.json describes"
         ) from None
     return network.eval()
+
+
+def interpolate(network: nn.Module, start: dict[str, Tensor], share: float) -> None:
+    """Move the parameters of a trained network back towards their initial values.
+
+    Args:
+        network: the network, which is changed.
+        start: its initial parameters.
+        share: of the way from the initial (0) to the trained ones (1).
+    """
+    network.load_state_dict(
+        {
+            name: torch.lerp(start[name].to(values), values, share)
+            if values.is_floating_point()
+            else values
+            for name, values in network.state_dict().items()
+        }  # counters are not interpolated
+    )
 
 
 # patterns of parameter names in ports of EfficientNet to PyTorch, and names in a ``LiteNet``

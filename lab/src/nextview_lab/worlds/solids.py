@@ -23,7 +23,7 @@ ROUND_SECTIONS = (24, 32)  # sides of a round outline
 TUBE_STEPS = 16  # segments of a bent tube
 
 
-def random_solid(rng: Generator, size: float) -> Solid:
+def random_solid(rng: Generator, size: float) -> tuple[str, Solid]:
     """Draw a solid of any kind.
 
     Args:
@@ -31,37 +31,15 @@ def random_solid(rng: Generator, size: float) -> Solid:
         size: its longest side, metres, within a third.
 
     Returns:
-        Vertices, (V, 3) float64, metres, and triangles, (F, 3) int32.
+        Its family, one of ``FAMILIES``; vertices, (V, 3) float64, metres, and triangles, (F, 3)
+        int32.
     """
-    kinds: Sequence[Callable[[Generator], Solid]] = (
-        box,
-        box,
-        cylinder,
-        container,
-        container,
-        handled_container,
-        compound,
-        compound,
-        bracket,
-        flange,
-        bolt,
-        pipe,
-        gear,
-        tool,
-        tool,
-        frame,
-        frame,
-        chain,
-        sheet,
-        lump,
-        bent_lump,
-        plate,
-    )
-
-    vertices, faces = kinds[int(rng.integers(len(kinds)))](rng)
+    kinds = [(name, kind) for name, family in FAMILIES.items() for kind in family]
+    name, kind = kinds[int(rng.integers(len(kinds)))]
+    vertices, faces = kind(rng)
     extent = float(np.ptp(vertices, axis=0).max())
     vertices = vertices * (size * rng.uniform(0.75, 1.33) / extent)
-    return vertices, np.asarray(faces, np.int32)
+    return name, (vertices, np.asarray(faces, np.int32))
 
 
 def joined(parts: Sequence[Solid]) -> Solid:
@@ -236,6 +214,19 @@ def container(rng: Generator) -> Solid:
     sections = int(rng.choice([8, *ROUND_SECTIONS, *ROUND_SECTIONS]))
     vessel = revolve(profile, sections=sections, process=False)
     return np.asarray(vessel.vertices), np.asarray(vessel.faces, np.int32)
+
+
+def bottle(rng: Generator) -> Solid:
+    """A body with shoulders, a neck and a cap."""
+    from trimesh.creation import revolve
+
+    body, neck, cap = rng.uniform([0.1, 0.03, 0.03], [0.25, 0.09, 0.1])
+    shoulder, throat, lip = np.sort(rng.uniform(0.4, 1, 3))
+    profile = [[0, 0], [body, 0], [body, shoulder], [neck, throat], [neck, lip]]
+    profile += [[cap, lip], [cap, 1], [0, 1]]
+    vessel = revolve(np.array(profile, float), sections=32, process=False)
+    flatter = [1, rng.choice([1.0, rng.uniform(0.5, 1)]), 1]
+    return np.asarray(vessel.vertices) * flatter, np.asarray(vessel.faces, np.int32)
 
 
 def handled_container(rng: Generator) -> Solid:
@@ -500,6 +491,59 @@ def sheet(rng: Generator) -> Solid:
     return flat * [rng.uniform(1, 4), 1, 1], faces
 
 
+def cutlery(rng: Generator) -> Solid:
+    """A flat bow with or without a wider end: a knife, a fork, a spoon, a pen, a ruler."""
+    at = np.linspace(0, 1, 2 * TUBE_STEPS)
+    start = rng.uniform(0.3, 0.8)
+    end = np.sin(np.pi * np.clip((at - start) / (1 - start), 0, 1))
+    half = rng.uniform(0.015, 0.05) + rng.choice([0, rng.uniform(0, 0.08)]) * end
+    outline = np.concatenate([np.c_[at, half], np.c_[at, -half][::-1]])
+    vertices, faces = extruded([outline], rng.uniform(0.012, 0.05))
+    vertices[:, 2] += rng.uniform(0, 0.06) * np.sin(np.pi * vertices[:, 0])
+    return vertices, faces
+
+
+def scissors(rng: Generator) -> Solid:
+    """Two blades that cross, each with an eye: scissors, pliers."""
+    thick = rng.uniform(0.01, 0.03)
+    eye = rng.uniform(0.08, 0.14)
+    pivot = rng.uniform(-0.2, 0.1)
+    opening = rng.uniform(3, 25)
+    halves = []
+    for side in (-1, 1):
+        corners = [[-0.5, -0.02], [pivot, -0.04], [0.5, -0.01], [0.5, 0.01]]
+        blade = extruded([np.array([*corners, [pivot, 0.04], [-0.5, 0.02]])], thick)
+        centre = -0.5 - 0.8 * eye, side * 0.6 * eye
+        rings = [ring_points(eye, 20, centre), ring_points(0.7 * eye, 20, centre)]
+        half = moved(joined([blade, extruded(rings, thick)]), by=(-pivot, 0, 0))
+        turn = Rotation.from_euler("z", -side * opening, degrees=True)
+        halves.append(moved(half, turn, (0, 0, side * thick / 2)))
+    return joined(halves)
+
+
+def dish(rng: Generator) -> Solid:
+    """A plate, a saucer or a tray, or upside down with a knob: a lid."""
+    from trimesh.creation import revolve
+
+    foot, rim, wall = rng.uniform([0.15, 0.02, 0.01], [0.45, 0.15, 0.03])
+    profile = [
+        [0, 0],
+        [foot, 0],
+        [0.5, rim],
+        [0.5, rim + wall],
+        [foot, wall],
+        [0, wall],
+    ]
+    sections = int(rng.choice([4, *ROUND_SECTIONS]))
+    round_one = revolve(np.array(profile), sections=sections, process=False)
+    solid = np.asarray(round_one.vertices), np.asarray(round_one.faces, np.int32)
+    if rng.random() < 0.5:
+        return solid
+    knob = extruded([ring_points(rng.uniform(0.04, 0.12), 20)], rng.uniform(0.05, 0.2))
+    lid = moved(solid, Rotation.from_euler("x", 180, degrees=True))
+    return joined([lid, knob])
+
+
 def lump(rng: Generator) -> Solid:
     """A round object with a soft relief: a ball, an egg, a fruit, a crumpled cloth."""
     from trimesh.creation import icosphere
@@ -525,3 +569,28 @@ def bent_lump(rng: Generator) -> Solid:
     path = np.c_[np.sin(bend * (at - 0.5)), np.cos(bend * (at - 0.5)), 0 * at] / bend
     taper = 1 - rng.uniform(0, 0.8) * np.abs(2 * at - 1) ** rng.integers(1, 6)
     return tube(path, (rng.uniform(0.04, 0.16) * taper).astype(float))
+
+
+FAMILIES: dict[str, Sequence[Callable[[Generator], Solid]]] = {
+    "groceries": (box, box, cylinder, cylinder, bottle, container),
+    "flat": (plate, plate, sheet, cutlery, cutlery, scissors, dish),
+    "others": (
+        container,
+        handled_container,
+        compound,
+        compound,
+        bracket,
+        flange,
+        bolt,
+        pipe,
+        gear,
+        tool,
+        tool,
+        frame,
+        frame,
+        chain,
+        lump,
+        bent_lump,
+    ),
+}
+"""Kinds of solids that are drawn equally often, by what may lie together."""

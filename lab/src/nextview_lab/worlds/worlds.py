@@ -44,6 +44,11 @@ DROPS_TRIED = 25
 # rays from each side that measure how far a solid can be pushed
 CONTACT_RAYS = 1500
 STACKED = 0.5  # share of piled objects that are placed on the last one
+# share of worlds with groceries or flat objects alone; of cameras aimed beside the objects; of bins
+# that are seen at a corner
+ONE_FAMILY = 0.5
+ASIDE = 0.25
+CORNERS = 0.25
 # share of levels whose objects are rotated by quarter turns, so that their sides are parallel
 ALIGNED = 0.4
 STEPS_OUTWARDS = 60
@@ -58,16 +63,18 @@ class Shape:
     """A solid with its resting poses.
 
     Attributes:
+        family: one of ``solids.FAMILIES``, or "meshes".
         solid: vertices, (V, 3), metres, and triangles, (F, 3).
         resting: rotations to its stable poses, (P, 3, 3), at least one; the smallest rectangles
             around their outlines are parallel to x and y.
     """
 
+    family: str
     solid: Solid
     resting: Float
 
     @classmethod
-    def of(cls, solid: Solid) -> Shape:
+    def of(cls, family: str, solid: Solid) -> Shape:
         """Find the stable poses of a solid on a plane."""
         from trimesh import Trimesh
         from trimesh.poses import compute_stable_poses
@@ -76,12 +83,14 @@ class Shape:
             hull = Trimesh(*solid).convex_hull
             poses, shares = compute_stable_poses(hull, n_samples=1)
         except (QhullError, ValueError):  # flat or degenerate: original orientation
-            return cls(solid, np.eye(3)[None])
+            return cls(family, solid, np.eye(3)[None])
         likely = poses[shares > LEAST_STABLE][:, :3, :3]
         if not len(likely):
-            return cls(solid, np.eye(3)[None])
+            return cls(family, solid, np.eye(3)[None])
         corners = np.asarray(hull.vertices)
-        return cls(solid, np.stack([_squared(turn, corners) for turn in likely]))
+        return cls(
+            family, solid, np.stack([_squared(turn, corners) for turn in likely])
+        )
 
 
 def _squared(turn: Float, corners: Float) -> Float:
@@ -346,18 +355,19 @@ def draw_shapes(
     Args:
         rng: source of all random numbers.
         count: number of solids.
-        others: solids of any size that provide a third of them, such as meshes of toys.
+        others: solids of any size that provide a quarter of them, such as meshes of toys.
     """
     shapes = []
     for _ in range(count):
-        if len(others) and rng.random() < 0.35:
+        if len(others) and rng.random() < 0.25:
             vertices, faces = others[int(rng.integers(len(others)))]
             stretch = rng.uniform(0.6, 1.4, 3) if rng.random() < 0.5 else np.ones(3)
             extent = np.ptp(vertices, axis=0).max()
+            family = "meshes"
             solid = vertices / extent * stretch, faces
         else:
-            solid = random_solid(rng, 1.0)
-        shapes.append(Shape.of(solid))
+            family, solid = random_solid(rng, 1.0)
+        shapes.append(Shape.of(family, solid))
     return shapes
 
 
@@ -390,6 +400,9 @@ def draw_world(
     kind = drawn if kind is None else kind
     if kind == "room" and len(furniture):
         return _room(shapes, furniture, rng)
+    if rng.random() < ONE_FAMILY:
+        family = rng.choice(["groceries", "flat"])
+        shapes = [one for one in shapes if one.family == family] or shapes
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.17))))
     if kind == "bin":
         return _bin(shapes, furniture, rng, scale)
@@ -428,8 +441,52 @@ def _level(
         gap,
         float(rng.choice([0, 0.2, 0.4, 0.7])),
     )
+    _beside(world, rng, min(7 * scale, reach))
     _hands(world, rng)
     return world
+
+
+def _beside(world: World, rng: Generator, reach: float) -> None:
+    """Add fixtures where they touch no object.
+
+    Args:
+        world: to which they are added.
+        rng: source of all random numbers.
+        reach: largest distance of one from the centre, metres.
+    """
+    size = max(0.15, 2.5 * world.scale)
+    objects = [
+        s for s, label in zip(world.solids, world.labels, strict=True) if label >= 0
+    ]
+    for _ in range(int(rng.choice([0, 0, 1, 3]))):
+        angle = rng.uniform(0, 2 * np.pi)
+        at = rng.uniform(0.3, 1) * reach * np.array([np.cos(angle), np.sin(angle)])
+        apart = [np.linalg.norm(s[0][:, :2] - at, axis=1).min() for s in objects]
+        if min(apart, default=size) > size / 2:
+            turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+            world.add(moved(_fixture(rng, size), turn, (*at, 0)), BACKGROUND)
+
+
+def _fixture(rng: Generator, size: float) -> Solid:
+    """Return a monitor, a robot, a lamp or a post on its foot, on z = 0.
+
+    Args:
+        rng: source of all random numbers.
+        size: of the foot, metres.
+    """
+    sides = int(rng.choice([4, 6, 32]))
+    thick = rng.uniform(0.004, 0.03)
+    foot = extruded([ring_points(size / 2, sides)], thick)
+    lean, tall = rng.normal(0, 0.1), rng.uniform(0.3, 2.5)
+    stem = size * np.linspace([0, 0, 0], [lean, 0, tall], 6)
+    parts = [foot, tube(stem, np.full(6, size * rng.uniform(0.04, 0.3)))]
+    if rng.random() < 0.4:  # a screen
+        wide, high = size * rng.uniform(1.5, 3), size * rng.uniform(1, 2)
+        parts.append(slab((0.03, wide, high), stem[-1], stem[-1, 2] + high / 2))
+    if rng.random() < 0.4:  # an arm
+        arm = stem[-1] + size * np.linspace([0, 0, 0], rng.normal(0, 1.5, 3), 6)
+        parts.append(tube(np.abs(arm), np.full(6, size * rng.uniform(0.1, 0.25))))
+    return joined(parts)
 
 
 def _table_top(
@@ -518,7 +575,7 @@ def _person(rng: Generator) -> Solid:
 
 def _hands(world: World, rng: Generator) -> None:
     """Sometimes add a hand or a gripper from above, with or without an object."""
-    if rng.random() > 0.08:
+    if rng.random() > 0.12:
         return
     size = max(world.scale, 0.04)
     beside = rng.normal(0, 1.5 * size, 2)
@@ -637,6 +694,9 @@ def _bin(
             at = Rotation.from_euler("z", yaw).apply(at)
             world.add(slab(size, at[:2], tall, yaw), BACKGROUND)
     _behind(world, furniture, rng, True, scale)
+    if rng.random() < CORNERS:
+        corner = Rotation.from_euler("z", yaw).apply([*half, 0.0])
+        world.focus = world.focus + 0.8 * corner
 
     inner = HeightMap(2 * float(half.max()) * 1.5, np.zeros(2), bottom)
     x, y = np.meshgrid(
@@ -767,7 +827,7 @@ def photograph(
             continue
 
         labels = label_of[owner]
-        clean *= _warp(rng, shape)
+        clean = _smeared(clean * _warp(rng, shape), rng)
         measured, source = sensor.measure(clean, rng)
         labels = np.where(source >= 0, labels[np.maximum(source, 0)], BACKGROUND)
         measured = _blind_spots(measured, labels, rng)
@@ -788,6 +848,8 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
     aside = world.scale * np.array([1.2, 1.2, 0.3]) * rng.normal(0, 1, 3)
     if world.scale > 0.5:
         aside /= 3
+    elif rng.random() < ASIDE:
+        aside *= 1.8
     pose[:3, 3] += world.focus + aside
 
     roll = rng.normal(0, 4) if rng.random() < 0.9 else rng.uniform(0, 360)
@@ -823,17 +885,28 @@ def _warp(rng: Generator, shape: tuple[int, int]) -> Float32:
     """Draw smooth scale errors of the depth, as in a badly calibrated camera."""
     if rng.random() < 0.5:
         return np.ones(shape, np.float32)
-    coarse = rng.normal(0, rng.uniform(0, 0.004), (4, 5))
+    coarse = rng.normal(rng.normal(0, 0.006), rng.uniform(0, 0.004), (4, 5))
     return (1 + ndimage.zoom(coarse, np.divide(shape, coarse.shape), order=3)).astype(
         np.float32
     )
+
+
+def _smeared(depth: Float32, rng: Generator) -> Float32:
+    """Smear depth across outlines, as stereo does, or bend corners alone, as time of flight."""
+    if rng.random() < 0.5:
+        return depth
+    width = rng.uniform(0.4, 1.6)
+    seen = ndimage.gaussian_filter((depth > 0).astype(np.float32), width)
+    smooth = ndimage.gaussian_filter(depth, width) / np.maximum(seen, 1e-6)
+    most = depth * float(rng.choice([0.01, 0.3]))
+    return np.where(depth > 0, depth + np.clip(smooth - depth, -most, most), 0)
 
 
 def _blind_spots(depth: Float32, labels: Index, rng: Generator) -> Float32:
     """Remove depth from dark or shiny objects, and from random patches."""
     depth = depth.copy()
     for thing in np.unique(labels[labels >= 0]):
-        if rng.random() < 0.04:
+        if rng.random() < 0.1:
             lost = ndimage.gaussian_filter(rng.normal(size=depth.shape), 3.0)
             depth[(labels == thing) & (lost > rng.normal(0, 0.06))] = 0
     if rng.random() < 0.15:
