@@ -1,7 +1,4 @@
-"""The wheels: what they ask for and hold.
-
-With NEXTVIEW_WHEELS=all, pip installs them and each extra from an index, as a user would.
-"""
+"""The wheels: what they ask for and hold."""
 
 import tomllib
 from pathlib import Path

@@ -384,7 +384,7 @@ def base_avoidance(view: MeshView) -> float:
     return float(1 - pixels[base].sum() / pixels.sum())
 
 
-@rated("depth", "suggested in the thesis, section 6")
+@rated("depth", "suggested in the thesis, chapter 8")
 def gradient_entropy(view: MeasuredView) -> float:
     """What the view tells of the directions in which the surface faces, bits.
 
