@@ -229,7 +229,7 @@ def test_the_next_view_shows_hidden_areas(ycb, ycb_meshes, seed, name):
     camera = camera_over(list(ycb_meshes.values()), seed=seed)
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
-    assert set(ycb_meshes) - set(by_name(scene)) == {name}
+    assert name not in by_name(scene)
     assert not scene.done
 
     scene.update(camera.frame(scene.target))

@@ -634,11 +634,11 @@ def _largest_plane(
     share = max(shares, default=0.0)
     plane = seen.levels[int(np.argmax(shares))].plane if shares else None
 
-    flatter = gain_as_range(frame, plane, flat, rng, up)
-    if up is not None and share < 1 / 3:
-        largest = find_plane(samples, rng)
-        if largest is not None and largest.holds(samples).mean() > 2 * share:
-            plane = largest
+    largest = find_plane(samples, rng)
+    flatter = gain_as_range(frame, largest, samples, rng)
+    if up is not None and share < 1 / 3 and largest is not None:
+        larger = largest.holds(samples).mean() > 2 * share
+        plane = largest if larger else plane
     if plane is None:
         return None, flatter
     pose = frame.camera_to_world

@@ -262,7 +262,6 @@ def gain_as_range(
     plane: Plane | None,
     samples: Samples,
     rng: Generator,
-    up: Float | None,
 ) -> float:
     """Return the share of samples that lie on a plane only with the depth read as range.
 
@@ -271,7 +270,6 @@ def gain_as_range(
         plane: found with the depth as it is; None if there is none.
         samples: of the frame.
         rng: source of all random numbers.
-        up: direction against gravity, (3,); None if it is not known.
     """
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
@@ -280,7 +278,7 @@ def gain_as_range(
         points=samples.camera
         + along * (depth / np.linalg.norm(along, axis=1))[:, None],
     )
-    other = find_plane(nearer, deepcopy(rng), up)
+    other = find_plane(nearer, deepcopy(rng))
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
     held = 0.0 if other is None else float(other.holds(nearer).mean())
     return max(0.0, held - usual)
