@@ -17,6 +17,7 @@ from exact_views import (
 from scipy.spatial.transform import Rotation
 
 from nextview.sensing.view import View
+from nextview.things.library import Hypotheses
 from nextview.things.point_pairs import (
     oriented,
 )
@@ -152,3 +153,23 @@ def test_a_thing_is_found_however_it_stands(library, thing, turn):
     degrees, millimetres = off_by(found.pose, true, mesh.centre)
     assert degrees < 3
     assert millimetres < 3
+
+
+def test_what_looks_alike_is_as_large_and_not_ruled_out():
+    """A box, one a tenth larger, one twice as large, and one that is ruled out."""
+    boxes = [
+        mesh_of((size * np.array([0.06, 0.09, 0.14]), (0, 0, 0)))
+        for size in (1, 1.1, 2, 1)
+    ]
+    library = library_of(*boxes)
+    one = Hypotheses.of(np.array([0]), np.eye(3)[None], np.zeros((1, 3)))
+    among = np.array([True, True, True, False])
+    (found,) = one.lookalikes(library, among)
+    assert np.unique(found.things).tolist() == [0, 1]
+    # four poses of the other one; all turn the box into itself
+    assert np.sum(found.things == 1) == 4
+    turned = np.abs(found.rotations)
+    np.testing.assert_allclose(turned, [np.eye(3)] * len(turned), atol=0.05)
+    # none is where the box was
+    own = found.rotations[found.things == 0]
+    assert not np.isclose(own, np.eye(3), atol=0.05).all((1, 2)).any()

@@ -59,7 +59,7 @@ def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
 
 def test_what_the_empty_place_shows_is_known(ycb):
     empty = sunk_bin(False)
-    scene = nextview.Scene(ycb, region=around(0.15), background=[empty])
+    scene = nextview.Scene(ycb, region=around(0.15), background=empty)
     look = scene.update(Frame(empty.depth + 1e-5, K, FROM_ABOVE))
     assert scene.objects == ()
     assert "unexplained" not in names(look)

@@ -156,8 +156,8 @@ class Scene:
         travel_cost: function that returns the cost of moving the camera from one pose to another,
             such as the seconds of a motion planner; infinity if there is no path. Metres of a
             straight line by default.
-        background: frames of the empty place, before anything was put there, such as a cell or a
-            bin: what they show, too, is no object.
+        background: frame or frames of the empty place, before anything was put there, such as a
+            cell or a bin: what they show, too, is no object.
         rule: rules out names of objects, given all objects, see ``scene.rule.SceneRule``.
 
     Raises:
@@ -176,7 +176,7 @@ class Scene:
         rng: np.random.Generator | None = None,
         travel_cost: ArrayLike | Callable[[Float, Float], float] | None = None,
         rule: SceneRule | None = None,
-        background: Sequence[Frame] = (),
+        background: Frame | Sequence[Frame] = (),
     ) -> None:
         self._policy = NamedPolicy.of(policy)
         self._rng = rng or np.random.default_rng(0)
@@ -195,6 +195,8 @@ class Scene:
         self.travel_cost = travel_cost
         self.segmentation = segmentation
         self.rule = rule
+        if isinstance(background, Frame):
+            background = (background,)
         self.background = tuple(background)
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region

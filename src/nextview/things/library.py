@@ -240,11 +240,15 @@ class Hypotheses:
         sizes = self.sizes[:, None] * factors
         return replace(self[rows], sizes=sizes.reshape(-1, 3))
 
-    def lookalikes(self, library: Library) -> list[Hypotheses]:
+    def lookalikes(self, library: Library, among: Mask) -> list[Hypotheses]:
         """Return for each of these what may look nearly the same in its place.
 
         That is the thing after turns of near symmetries, and all things that are about as large,
         with their principal axes along its own.
+
+        Args:
+            library: the things.
+            among: things that they may be, (T,) bool; all of these among them.
         """
         own = library.principal
         found = []
@@ -253,6 +257,7 @@ class Hypotheses:
         ):
             near = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
             others = own.alike(thing)
+            others = others[among[others]]
             turned = own.axes[thing].T @ HALF_TURNS @ own.axes[others][:, None]
             things = np.append(np.repeat(others, 4), np.full(len(near), thing))
             rotations = rotation @ np.concatenate([turned.reshape(-1, 3, 3), near])

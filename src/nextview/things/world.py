@@ -184,7 +184,7 @@ class World:
             world = world._with_proposals(left, among)
         shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
         world = world._with_proposals(view.leftovers(shown), among)
-        return world.with_lookalikes().with_other_sizes().pruned()
+        return world.with_lookalikes(among).with_other_sizes().pruned()
 
     def _with_proposals(self, segments: Iterable[Mask], among: Mask) -> World:
         """Return the world with what segments of the last view may show."""
@@ -213,9 +213,13 @@ class World:
         ]
         return np.array(rows, np.int64)
 
-    def with_lookalikes(self) -> World:
-        """Return the world with what may look nearly the same as new or doubtful things."""
-        groups = self.hypotheses[self._doubtful()].lookalikes(self.library)
+    def with_lookalikes(self, among: Mask) -> World:
+        """Return the world with what may look nearly the same as new or doubtful things.
+
+        Args:
+            among: things that may be there, (T,) bool.
+        """
+        groups = self.hypotheses[self._doubtful()].lookalikes(self.library, among)
         if not groups:
             return self
         new = Hypotheses.joined(groups)
