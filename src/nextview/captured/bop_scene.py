@@ -104,6 +104,7 @@ def bop_files(folder: Path, camera: str | None = None) -> list[BopFiles]:
     """
     if camera is None and (folder / SCENE_CAMERAS).exists():
         return [BopFiles(folder)]
+
     every = [path.stem for path in sorted(folder.glob("scene_camera_*.json"))]
     there = [name.removeprefix("scene_camera_") for name in every]
     if camera is not None:
@@ -113,6 +114,7 @@ def bop_files(folder: Path, camera: str | None = None) -> list[BopFiles]:
         return [BopFiles(folder, camera)]
     if not there:
         return [BopFiles(folder)]
+
     found = [BopFiles(folder, name) for name in there]
     with_depth = [files for files in found if files.named("depth").is_dir()]
     if not with_depth:

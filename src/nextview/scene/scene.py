@@ -653,11 +653,13 @@ class Scene:
             new = ruled_out_by(self.rule, state.objects)
             if not new:
                 return state
+
             known = state.world.library.names
             for name in {name for names in new.values() for name in names}:
                 if name not in known:
                     what = f"{one_line(name)} is none of the taught things"
                     raise UsageError(f"{what}{did_you_mean(name, known)}")
+
             ruled_out = {
                 number: {**state.ruled_out.get(number, {}), **new.get(number, {})}
                 for number in {*state.ruled_out, *new}

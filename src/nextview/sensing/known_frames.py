@@ -452,11 +452,13 @@ class Reading:
             normal = plane.normal * [mistake.focal, mistake.focal, 1]
             length = float(np.linalg.norm(normal))
             plane = Plane(normal / length, plane.offset / length)
+
         other = replace(self, plane=plane, mistake=mistake)
         if mistake.scale > 1:
             scale = 1 / mistake.scale
             other = replace(other, depths=scale * self.depths, scale=scale)
             return [other.agreeing(right.views, right.poses)]
+
         tried = [alone, right.poses] if mistake.scale < 1 else [alone]
         return [
             replace(other, poses=poses).agreeing(right.views, poses) for poses in tried
@@ -466,6 +468,10 @@ class Reading:
         """Return the reading with its agreement with the last frame.
 
         Where the last frame is confirmed by the frame as it is, no other reading agrees.
+
+        Args:
+            views: the last frame and this one; none without a last one.
+            poses: of both, camera-to-world, (2, 4, 4).
         """
         if not views:
             return self

@@ -268,6 +268,7 @@ def registered(
     information = np.diag(known)
     met = np.zeros(count, np.int64)
     costs = np.zeros(0)
+
     for reach, further in steps:
         poses = np.array([rigid(motion) for motion in motions])
         information = np.diag(known)

@@ -249,11 +249,13 @@ class View:
             low, high = np.unravel_index(close.argmax(), close.shape)
             if close[low, high] <= 0:
                 return
+
             touching[low] += touching[high]
             touching[:, low] += touching[:, high]
             touching[high] = touching[:, high] = touching[low, low] = 0
             sizes[low] += sizes[high]
             group[group == high] = low
+
             mask = np.isin(self.labels, np.flatnonzero(group == low))
             if np.count_nonzero(mask) >= self.fewest:
                 yield mask
@@ -295,7 +297,12 @@ def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:
 
 
 def shown_before(frame: Frame, empty: Frame) -> Mask:
-    """Return the pixels that show what a frame of the empty place shows, too, (H, W) bool."""
+    """Return the pixels that show what a frame of the empty place shows, too, (H, W) bool.
+
+    Args:
+        frame: the frame.
+        empty: of the same place without things, from anywhere.
+    """
     rows, columns = np.nonzero(frame.depth)
     pose = empty.camera_to_world
     points = (frame.positions(rows, columns) - pose[:3, 3]) @ pose[:3, :3]
@@ -307,10 +314,13 @@ def shown_before(frame: Frame, empty: Frame) -> Mask:
     seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
 
     # between the depths of neighbouring pixels: a surface may be steep
-    row, column = row[seen], column[seen]
+    row = row[seen]
+    column = column[seen]
     nearest = ndimage.minimum_filter(np.where(empty.depth > 0, empty.depth, np.inf), 3)
     farthest = ndimage.maximum_filter(empty.depth, 3)
-    rows, columns, z = rows[seen], columns[seen], points[seen, 2]
+    rows = rows[seen]
+    columns = columns[seen]
+    z = points[seen, 2]
     margin = ALIKE * np.hypot(noise_of(frame).at(z) * z**2, LEAST_ERROR * z)
     found = np.zeros(frame.shape, bool)
     found[rows, columns] = (z > nearest[row, column] - margin) & (
@@ -334,11 +344,13 @@ def _connected(
     most = np.maximum(np.maximum(NEIGHBOURS_APART, 4 * sigma), steepest)
     at = np.cumsum(pieces.ravel() > 0).reshape(pieces.shape) - 1
     count = int(at[-1, -1]) + 1
+
     pairs = []
     for one, two in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         joined = (pieces[one] == pieces[two]) & (pieces[one] > 0)
         joined &= np.abs(depth[one] - depth[two]) < most[one]
         pairs.append(np.stack([at[one][joined], at[two][joined]]))
+
     ends = np.concatenate(pairs, 1)
     graph = coo_array((np.ones(ends.shape[1], bool), ends), shape=(count, count))
     found = np.zeros(pieces.shape, np.int32)

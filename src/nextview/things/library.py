@@ -258,6 +258,8 @@ class Hypotheses:
             near = library.near.get(library.names[thing], np.zeros((0, 3, 3)))
             others = own.alike(thing)
             others = others[among[others]]
+
+            # the axes of the other on its own; not the thing itself as it lies
             turned = own.axes[thing].T @ HALF_TURNS @ own.axes[others][:, None]
             things = np.append(np.repeat(others, 4), np.full(len(near), thing))
             rotations = rotation @ np.concatenate([turned.reshape(-1, 3, 3), near])
@@ -265,6 +267,8 @@ class Hypotheses:
             things, rotations = (
                 np.delete(each, itself, 0) for each in (things, rotations)
             )
+
+            # the middles stay where they are
             arms = np.einsum("nij,nj->ni", rotations, own.middles[things])
             centres = centre + rotation @ own.middles[thing] - arms
             found.append(Hypotheses.of(things, rotations, centres))

@@ -100,7 +100,13 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
 
 
 def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
-    """Return the main reason why a name is not confident, in words."""
+    """Return the main reason why a name is not confident, in words.
+
+    Args:
+        world: the world.
+        thing: one of its things.
+        found: what is believed of it.
+    """
     things = world.hypotheses.things[found.rows]
     terms = {
         f"it explains its pixels by {100 * found.share:.0f} %, as well as it could be": (
@@ -120,7 +126,13 @@ def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
 def pose_candidates(
     world: World, found: Named, labels: Index | None = None
 ) -> tuple[PoseCandidate, ...]:
-    """Return the distinct poses of the hypotheses of a place, the likeliest first."""
+    """Return the distinct poses of the hypotheses of a place, the likeliest first.
+
+    Args:
+        world: the world.
+        found: what is believed of a thing.
+        labels: class of each thing of the library, (T,) int64; by default its number there.
+    """
     rows = found.rows
     some = world.hypotheses[rows]
     left = np.zeros((len(rows), 6, 6))

@@ -116,12 +116,11 @@ class PointPairs:
         points, normals = oriented(view, mask)
         if len(points) < FEWEST:
             return np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3))
+
         # what no motion changes of the pairs of each reference
         some = spread(points[None], REFERENCES)[0]
-        one, two = (
-            np.repeat(some, len(points)),
-            np.tile(np.arange(len(points)), len(some)),
-        )
+        one = np.repeat(some, len(points))
+        two = np.tile(np.arange(len(points)), len(some))
         keys = keys_of(points, normals, one, two).reshape(len(some), -1)
         turns = turns_of(points, normals, one, two).reshape(len(some), -1)
         apart = np.linalg.norm(points[one] - points[two], axis=1).reshape(keys.shape)
@@ -141,7 +140,9 @@ class PointPairs:
         order = order[among[things[order]]]
         of_one = max(of_one, most // len(self.points))
         order = order[rank_within(things[order]) < of_one][:most]
-        things, references, places = things[order], references[order], places[order]
+        things = things[order]
+        references = references[order]
+        places = places[order]
         own, turn = np.divmod(places, TURNS)
 
         # both normals are turned to one axis, and the thing about that axis
@@ -181,8 +182,14 @@ class PointPairs:
 
 
 def oriented(view: View, mask: Mask) -> tuple[Float, Float]:
-    """Return points of a segment and their normals towards the camera, (N, 3) each, world axes."""
-    grid, stride = view.grid(), view.stride
+    """Return points of a segment and their normals towards the camera, (N, 3) each, world axes.
+
+    Args:
+        view: the view.
+        mask: pixels of the segment, (H, W) bool.
+    """
+    grid = view.grid()
+    stride = view.stride
     own = mask[::stride, ::stride] & (grid.depth > 0)
     cells = np.flatnonzero(own)
     if len(cells) < FEWEST:
@@ -239,7 +246,14 @@ def spread(points: Floats, count: int) -> Index:
 
 
 def keys_of(points: Float, normals: Float, one: Index, two: Index) -> Index:
-    """Return the distance and the three angles of pairs of points, rounded, as one number each."""
+    """Return the distance and the three angles of pairs of points, rounded, as one number each.
+
+    Args:
+        points: (N, 3), metres.
+        normals: their unit normals, (N, 3).
+        one: first points of the pairs, (P,) int64.
+        two: their second points, (P,) int64.
+    """
     way = points[two] - points[one]
     length = np.linalg.norm(way, axis=1)
     way = way / np.maximum(length, 1e-9)[:, None]
@@ -265,7 +279,14 @@ def frames(normals: Floats) -> Float:
 
 
 def turns_of(points: Float, normals: Float, one: Index, two: Index) -> Float32:
-    """Return the turn of the second point of each pair about the normal of the first, steps."""
+    """Return the turn of the second point of each pair about the normal of the first, steps.
+
+    Args:
+        points: (N, 3), metres.
+        normals: their unit normals, (N, 3).
+        one: first points of the pairs, (P,) int64.
+        two: their second points, (P,) int64.
+    """
     way = np.einsum("nij,nj->ni", frames(normals)[one], points[two] - points[one])
     turn = np.arctan2(way[:, 2], way[:, 1]) * (TURNS / (2 * np.pi))
     return turn.astype(np.float32)

@@ -130,6 +130,8 @@ def best(
         if len(kept) == most:
             break
         counts[thing] += 1
+
+        # nor another one in nearly the same pose
         angle = np.sqrt(np.maximum(3 - turns @ turns[row], 0))
         apart = np.linalg.norm(some.centres - some.centres[row], axis=1)
         same = angle + apart / library.radii[thing] < SAME_POSE

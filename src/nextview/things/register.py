@@ -224,6 +224,8 @@ def _step(
         of_view = normal_equations(library, view, some, reach, count, outline)
         left += of_view[0]
         right += of_view[1]
+
+    # a step is short, and damped
     radius = library.radii[some.things][:, None]
     stays = np.concatenate([np.tile(radius**2, 3), np.ones((len(some), 3))], 1)
     left[:, range(6), range(6)] += stays * DAMPING * count * len(views)

@@ -174,6 +174,7 @@ class World:
             last = row[-1]
             if last is not None and any(row[:-1]):
                 strange.ravel()[last.cells] = True
+
         for segments, share, most, known in (
             (view.instances, SURE_SHARE, EXPLAINED, before),
             (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
@@ -182,6 +183,7 @@ class World:
             shown = world.explained(share) | view.enlarged(known)
             left = [mask for mask in segments() if shown[mask].mean() < most]
             world = world._with_proposals(left, among)
+
         shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
         world = world._with_proposals(view.leftovers(shown), among)
         return world.with_lookalikes(among).with_other_sizes().pruned()
@@ -420,7 +422,8 @@ class World:
     def pruned(self) -> World:
         """Return the world with the chosen hypotheses and the likeliest others of each place."""
         some = self.hypotheses
-        totals, taught = self.totals, some.taught
+        totals = self.totals
+        taught = some.taught
         kept = {one.row for one in self.things if one.row >= 0}
         places: list[int] = []
         for row in np.argsort(-totals).tolist():
@@ -432,6 +435,7 @@ class World:
             near = apart < 0.5 * radius
             same = near & (some.things[places] == some.things[row])
             same &= taught[places] == taught[row]
+
             few = near.sum() < RIVALS and same.sum() < RIVALS_OF_ONE
             if row in kept or (few and totals[row] > 0):
                 kept.add(row)
@@ -470,6 +474,8 @@ def corrected(world: World, view: View) -> View:
     ]
     if not known:
         return view
+
+    # one error for all things together, and that which each of them tells
     rows = np.array(known)
     some = world.hypotheses[rows]
     groups = [rows, *([row] for row in rows)] if len(rows) > 1 else [rows]
@@ -478,6 +484,7 @@ def corrected(world: World, view: View) -> View:
         tried.append(
             camera_error(world.library, view, world.hypotheses[np.array(group)])
         )
+
     usual = [_usual(world.scores[row]) for row in rows]
     values = []
     for one in tried:
@@ -498,13 +505,16 @@ def _balanced(world: World) -> World:
     some = world.hypotheses
     if len(world.views) < 2 or not len(some):
         return world
+
     middle = some.centres.mean(0)
-    turns, shifts = [], []
+    turns = []
+    shifts = []
     for view in world.views:
         given = view.frame.camera_to_world
         turn = view.camera[:3, :3] @ given[:3, :3].T
         turns.append(Rotation.from_matrix(turn).as_rotvec())
         shifts.append(turn @ (middle - given[:3, 3]) + view.camera[:3, 3] - middle)
+
     back = np.eye(4)
     back[:3, :3] = Rotation.from_rotvec(-np.mean(turns, axis=0)).as_matrix()
     back[:3, 3] = middle - back[:3, :3] @ (middle + np.mean(shifts, axis=0))
@@ -596,6 +606,7 @@ def _greedy(
         if gain < max((bounds[one] for one in bounds if one != row), default=0.0):
             bounds[row] = gain
             continue
+
         del bounds[row]
         kept.append(row)
         for number, one in enumerate(rows[row]):
@@ -621,6 +632,7 @@ def _alone(
                     second[cells], np.minimum(one.gain, best[cells])
                 )
                 best[cells] = np.maximum(best[cells], one.gain)
+
         for row in kept:
             one = rows[row][number]
             if one is not None:
