@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.scene.followed import SURPRISE
+from nextview.sensing.frame import Frame
 from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
@@ -56,7 +57,6 @@ class Changes:
         moved: numbers of things that stand elsewhere.
         gone: things that are no longer where they were.
         stand: numbers of things that the view shows where they were.
-        nothing: whether the view is taken from where the last one was, and shows nothing new.
         wrong_pose: whether most of several things are not where they were, though the camera may
             have moved: its pose is likely to be wrong.
     """
@@ -67,7 +67,6 @@ class Changes:
     moved: tuple[int, ...] = ()
     gone: tuple[Thing, ...] = ()
     stand: tuple[int, ...] = ()
-    nothing: bool = False
     wrong_pose: bool = False
 
 
@@ -122,27 +121,58 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
     )
 
 
+def nothing_new(world: World, frame: Frame) -> bool:
+    """Return True if a frame is taken from where the last view was, and looks as it did.
+
+    Args:
+        world: before the frame.
+        frame: of a depth camera.
+    """
+    if not world.views:
+        return False
+    last = world.views[-1]
+    alike = last.alike(frame)
+    depth = frame.depth[:: last.stride, :: last.stride]
+    if _standing(world, world.owners[-1], alike) is None:
+        return False
+    new = (depth > 0) & ~alike
+    new = ndimage.binary_opening(new, np.ones((3, 3), bool))
+    return np.count_nonzero(new) < FEWEST_PIXELS
+
+
 def _still(world: World, view: View) -> Changes | None:
     """Return that all stands where it was: the same place was seen before, and looks as it did."""
     for before, owner in zip(world.views[::-1], world.owners[::-1], strict=True):
-        alike = view.again(before).ravel()
+        alike = before.alike(view.frame)
         if not alike.any():
             continue
-        counts = np.bincount(owner, minlength=world.next_number)
-        same = np.bincount(owner, alike, minlength=world.next_number)
-        numbers = [one.number for one in world.things if counts[one.number]]
-        if any(same[number] < STILL * counts[number] for number in numbers):
+        stand = _standing(world, owner, alike)
+        if stand is None:
             return None
-
         held = np.zeros(len(owner), np.int32)
-        depth = view.grid().depth
-        new = (depth > 0) & ~alike.reshape(depth.shape)
-        new = ndimage.binary_opening(new, np.ones((3, 3), bool))
-        few = int(np.count_nonzero(new)) < FEWEST_PIXELS
-        nothing = before is world.views[-1] and few
-        view = view.seen_from(before.camera)
-        return Changes(world, view, held, stand=tuple(numbers), nothing=nothing)
+        return Changes(world, view.seen_from(before.camera), held, stand=stand)
     return None
+
+
+def _standing(
+    world: World, owner: NDArray[np.int32], alike: Mask
+) -> tuple[int, ...] | None:
+    """Return the numbers of the things that a view showed and that look as they did.
+
+    Args:
+        world: with the view.
+        owner: number of the thing that each pixel of its grid shows, 0 for none, (P,).
+        alike: pixels of its grid that look as they did, (h, w) bool.
+
+    Returns:
+        The numbers; None if one of the things looks different.
+    """
+    counts = np.bincount(owner, minlength=world.next_number)
+    same = np.bincount(owner, alike.ravel(), minlength=world.next_number)
+    numbers = [one.number for one in world.things if counts[one.number]]
+    if any(same[number] < STILL * counts[number] for number in numbers):
+        return None
+    return tuple(numbers)
 
 
 def _clear(one: Thing) -> bool:

@@ -15,7 +15,7 @@ from nextview.checks import did_you_mean, one_line
 from nextview.cores import one_blas_thread
 from nextview.errors import ModelError, ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
-from nextview.scene.changes import changes
+from nextview.scene.changes import changes, nothing_new
 from nextview.scene.grasps import (
     GRASP_CLEARANCE,
     MOST_UNSEEN,
@@ -459,6 +459,9 @@ class Scene:
             return Look(False, warnings=(REPEATED,))
 
         before = self._state
+        if frame.mask is None and nothing_new(before.world, frame):
+            again = (*before.tops[-1].warnings, *before.remarks)
+            return Look(True, warnings=again)
         top, view = self._seen(frame, before.tops)
         shown = top.plane if top.shows_ground else None
         top = replace(top, warnings=(*top.warnings, *known.check(frame, shown)))
@@ -624,8 +627,6 @@ class Scene:
             raise ObservationError(NOTHING_AGAIN)
         if told.wrong_pose:
             return before, Look(False, warnings=(self._why_wrong(top),))
-        if told.nothing:
-            return before, Look(True, warnings=(*top.warnings, *before.remarks))
 
         world = told.world.with_view(told.view, told.held)
         world = world.searched(np.ones(len(world.library), bool)).numbered()

@@ -145,15 +145,13 @@ class View:
         object.__setattr__(left, "_grids", {})
         return left
 
-    def again(self, earlier: View) -> Mask:
-        """Return the pixels of the grid that an earlier view from this place shows, too, (h, w)."""
-        now = self.grid()
-        if self.frame.shape != earlier.frame.shape or not one_stand(
-            earlier.frame, self.frame
-        ):
-            return np.zeros(now.depth.shape, bool)
-        then = earlier.grid().depth
-        return (then > 0) & (np.abs(then - now.depth) < ALIKE * now.sigma)
+    def alike(self, frame: Frame) -> Mask:
+        """Return the pixels of the grid that a frame from this place shows, too, (h, w) bool."""
+        grid = self.grid()
+        if frame.shape != self.frame.shape or not one_stand(self.frame, frame):
+            return np.zeros(grid.depth.shape, bool)
+        now = frame.depth[:: self.stride, :: self.stride]
+        return (grid.depth > 0) & (np.abs(grid.depth - now) < ALIKE * grid.sigma)
 
     @property
     def depth(self) -> Float32:

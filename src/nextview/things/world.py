@@ -168,7 +168,7 @@ class World:
         view = self.views[-1]
         before = np.zeros(view.grid().depth.shape, bool)
         for one in self.views[:-1]:
-            before |= view.again(one)
+            before |= one.alike(view.frame)
         strange = before.copy()
         for row in self.strangers:
             last = row[-1]
