@@ -80,7 +80,7 @@ def levels_of(
     noise: Noise,
     up: Float | None,
     earlier: Sequence[SurfaceLevel] = (),
-) -> list[SurfaceLevel]:
+) -> tuple[list[SurfaceLevel], list[SurfaceLevel | None]]:
     """Find the levels of a frame, by decreasing number of instance pixels that they carry.
 
     Args:
@@ -91,12 +91,16 @@ def levels_of(
         up: direction against gravity, (3,), world; None for the normal of the plane that carries
             most instance pixels.
         earlier: levels of earlier frames; used if they are not visible in this one.
+
+    Returns:
+        The levels, and what carries each instance: a level, or the top of another instance.
     """
+    sizes = [np.count_nonzero(mask) for mask in masks]
 
     def load(level: SurfaceLevel, carriers: Sequence[SurfaceLevel | None]) -> int:
         """Return the number of instance pixels that a level carries."""
-        pairs = zip(masks, carriers, strict=True)
-        return sum(int(mask.sum()) for mask, carrier in pairs if carrier is level)
+        pairs = zip(sizes, carriers, strict=True)
+        return sum(size for size, carrier in pairs if carrier is level)
 
     levels = _found(frame, surface & (frame.depth > 0), noise, up)
     if up is None and levels:
@@ -116,30 +120,11 @@ def levels_of(
     ]
     every = [*levels, *hidden]
     carriers = [carrier_of(mask, frame, every) for mask in masks]
-    return sorted(every, key=lambda one: -load(one, carriers))
-
-
-def carriers_of(
-    masks: Sequence[Mask],
-    frame: Frame,
-    levels: Sequence[SurfaceLevel],
-    noise: Noise,
-    up: Float | None,
-) -> list[SurfaceLevel | None]:
-    """Return the level that carries each instance: a surface, or the top of another instance.
-
-    Args:
-        masks: of each instance, (H, W) bool.
-        frame: of the masks.
-        levels: of the frame, see ``levels_of``.
-        noise: of the frame.
-        up: direction against gravity, (3,), world; None for the normal of the first level.
-    """
-    carriers = [carrier_of(mask, frame, levels) for mask in masks]
-    if not levels or None not in carriers:
-        return carriers
-    upright = levels[0].plane.normal if up is None else up
-    return _on_others(carriers, masks, frame, noise, upright)
+    every.sort(key=lambda one: -load(one, carriers))
+    if every and None in carriers:
+        upright = every[0].plane.normal if up is None else up
+        carriers = _on_others(carriers, masks, frame, noise, upright)
+    return every, carriers
 
 
 def carrier_of(

@@ -14,7 +14,6 @@ from nextview.sensing.levels import (
     SurfaceLevel,
     apart_from,
     carrier_of,
-    carriers_of,
     levels_of,
     points_of,
 )
@@ -156,8 +155,7 @@ def segmented_frame(
     """
     noise = noise_of(frame)
     masks = instances.masks
-    levels = levels_of(frame, masks, instances.surface, noise, up, earlier)
-    carriers = carriers_of(masks, frame, levels, noise, up)
+    levels, carriers = levels_of(frame, masks, instances.surface, noise, up, earlier)
     return SegmentedFrame(
         frame,
         noise,

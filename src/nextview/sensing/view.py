@@ -361,8 +361,9 @@ def _not_large(
 ) -> NDArray[np.int32]:
     """Return labels of measured pixels, (H, W) int32, without what is larger, metres."""
     large = np.zeros(int(labels.max(initial=0)) + 1, bool)
+    enough = np.bincount(labels.ravel()) >= FEWEST_PIXELS
     for number, box in enumerate(ndimage.find_objects(labels), 1):
-        if box is not None:
+        if box is not None and enough[number]:
             rows, columns = np.nonzero(labels[box] == number)
             place = rows + box[0].start, columns + box[1].start
             large[number] = _extent(frame, *place) > most
@@ -371,8 +372,6 @@ def _not_large(
 
 def _extent(frame: Frame, rows: Index, columns: Index) -> float:
     """Return how far apart the measured points of some pixels lie, without outliers, metres."""
-    if len(rows) < FEWEST_PIXELS:
-        return 0.0
     few = slice(None, None, max(1, len(rows) // 500))
     points = frame.positions_in_camera(rows[few], columns[few])
     low, high = np.quantile(points, OUTLIERS, axis=0)

@@ -32,8 +32,10 @@ EXPLAINED_OF_UNION = (
     0.3  # the same of several segments together: one of them is explained
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
-RIVALS = 12  # hypotheses of one place that are kept
-RIVALS_OF_ONE = 2
+AS_LIKELY = (
+    0.5  # of what the best hypothesis of a place explains: of others that are kept
+)
+RIVALS_OF_ONE = 2  # hypotheses of one thing at one place that are kept
 LOOKALIKES, LOOKALIKES_OF_ONE = 4, 2  # of a new or doubtful thing that are kept
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
@@ -424,20 +426,18 @@ class World:
         some = self.hypotheses
         totals = self.totals
         taught = some.taught
+        radii = self.library.radii[some.things]
         kept = {one.row for one in self.things if one.row >= 0}
         places: list[int] = []
         for row in np.argsort(-totals).tolist():
-            radius = np.maximum(
-                self.library.radii[some.things[row]],
-                self.library.radii[some.things[places]],
-            )
             apart = np.linalg.norm(some.centres[places] - some.centres[row], axis=1)
-            near = apart < 0.5 * radius
+            near = apart < 0.5 * np.minimum(radii[places], radii[row])
             same = near & (some.things[places] == some.things[row])
             same &= taught[places] == taught[row]
 
-            few = near.sum() < RIVALS and same.sum() < RIVALS_OF_ONE
-            if row in kept or (few and totals[row] > 0):
+            best = totals[places][near].max(initial=0.0)
+            likely = totals[row] > AS_LIKELY * best and same.sum() < RIVALS_OF_ONE
+            if row in kept or likely:
                 kept.add(row)
                 places.append(row)
         return self.with_rows(np.array(sorted(kept), np.int64))
