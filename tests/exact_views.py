@@ -11,12 +11,12 @@ from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.session.target import view_of
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.library import Library, near_turns
 from nextview.things.naming import named
 from nextview.things.surface import Surface
 from nextview.things.symmetry import find_near_symmetries
-from nextview.things.target import view_of
 from nextview.things.world import World, corrected
 
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees

@@ -19,17 +19,17 @@ from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
 from nextview.session.ranked import rank_views
+from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.target import view_of
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.expected_images import ExpectedSensor, SeenSurroundings
-from nextview.things.expected_model import Leading
-from nextview.things.expected_views import ExpectedViews, Outlook, expected_views
 from nextview.things.library import Hypotheses, Library
-from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.score import score
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.target import view_of
+from nextview.views.expected_images import ExpectedSensor, SeenSurroundings
+from nextview.views.expected_model import Leading
+from nextview.views.expected_views import ExpectedViews, Outlook, expected_views
 
 SPHERE = ViewSphere.named("40")
 AWAY = 0.45  # metres from the centre

@@ -14,8 +14,8 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import read_card
+from nextview.session.recogniser import open_recogniser
 from nextview.things.memory import open_memory
-from nextview.things.recogniser import open_recogniser
 
 FLOATS = (
     "views",

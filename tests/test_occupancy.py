@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.sensing.expected_visibility import (
+from nextview.views.expected_visibility import (
     FREE,
     UNSEEN,
     Occupancy,

@@ -20,9 +20,9 @@ from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import share_of_likeliest
 from nextview.sensing import Frame
+from nextview.session.recogniser import VerifiedRecogniser
 from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.recogniser import VerifiedRecogniser
 
 ORIGIN = np.array([0.3, -0.1, 0.2])  # of the scans, far from the things
 SPOT = np.array([0.4, -0.25, 0.0])  # on the table

@@ -13,9 +13,9 @@ from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError
 from nextview.geometry.mesh import make_mesh
 from nextview.recognition.inference import Models, NetworkRecogniser
+from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.several import SeveralRecognisers
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.recogniser import VerifiedRecogniser
-from nextview.things.several import SeveralRecognisers
 
 
 def memory_of(folder) -> VerifiedRecogniser:

@@ -17,10 +17,10 @@ from matplotlib.patches import Rectangle
 
 import nextview
 from nextview.data.samples import sample_mesh
+from nextview.figures.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, PlainFigure
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.maps import local_peaks
 from nextview.recognition.model_card import find_card
-from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, PlainFigure
 from nextview.session.view import View
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview_lab.data.measures import depth_entropy

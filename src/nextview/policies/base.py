@@ -10,8 +10,8 @@ from nextview.errors import PolicyError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
-from nextview.things.expected_views import Outlook
 from nextview.types import Float, Floats, Index, Mask
+from nextview.views.expected_views import Outlook
 
 # relative to the best value; among views within this range, travel decides
 NEAR_TIE = 0.05

@@ -13,8 +13,8 @@ from nextview.policies.base import (
     nearer_first,
     travel_from,
 )
-from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Index, Mask
+from nextview.views.expected_views import Goal, Outlook
 
 LEAST_INFORMATION = 1e-3  # nats; views with less are considered uninformative
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from nextview.scene.followed import SURPRISE
 from nextview.sensing.frame import Frame
-from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View
+from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View, stride_of
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
@@ -130,14 +130,14 @@ def nothing_new(world: World, frame: Frame) -> bool:
     """
     if not world.views:
         return False
-    last = world.views[-1]
-    alike = last.alike(frame)
-    depth = frame.depth[:: last.stride, :: last.stride]
-    if _standing(world, world.owners[-1], alike) is None:
+    alike = world.views[-1].alike(frame)
+    if not alike.any() or _standing(world, world.owners[-1], alike) is None:
         return False
+    stride = stride_of(frame)
+    depth = frame.depth[::stride, ::stride]
     new = (depth > 0) & ~alike
     new = ndimage.binary_opening(new, np.ones((3, 3), bool))
-    return np.count_nonzero(new) < FEWEST_PIXELS
+    return int(np.count_nonzero(new)) < FEWEST_PIXELS
 
 
 def _still(world: World, view: View) -> Changes | None:

@@ -13,13 +13,7 @@ from matplotlib.patheffects import withStroke
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from nextview.geometry.axes import upright_axes
-from nextview.geometry.ray_caster import RayCaster
-from nextview.scene.name_places import Labelled, name_places
-from nextview.scene.objects import UNKNOWN_NAME, SceneObject
-from nextview.sensing.frame import Frame, within
-from nextview.sensing.tabletop import TableTop
-from nextview.session.style import (
+from nextview.figures.style import (
     ACCENT,
     BLUE,
     FAINT,
@@ -29,6 +23,12 @@ from nextview.session.style import (
     PAPER,
     PlainFigure,
 )
+from nextview.geometry.axes import upright_axes
+from nextview.geometry.ray_caster import RayCaster
+from nextview.scene.name_places import Labelled, name_places
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.sensing.frame import Frame, within
+from nextview.sensing.tabletop import TableTop
 from nextview.types import Float, Floats, Mask
 
 FIGURE_HEIGHT = 4.0  # inches, of both panels: names are legible on a page

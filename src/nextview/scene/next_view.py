@@ -25,9 +25,9 @@ from nextview.session.limits import Limits
 from nextview.session.reach import Reach
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System
-from nextview.things.expected_views import Outlook
 from nextview.things.world import World
 from nextview.types import Float, Index, Mask
+from nextview.views.expected_views import Outlook
 
 TABLE_CELL = 0.02  # metres, side of a cell of the table
 OBJECT_MARGIN = 0.08  # metres of table around the objects that count

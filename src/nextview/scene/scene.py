@@ -60,11 +60,11 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
+from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.several import SeveralRecognisers
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
 from nextview.things.library import Library
-from nextview.things.recogniser import VerifiedRecogniser
-from nextview.things.several import SeveralRecognisers
 from nextview.things.world import Thing, World
 from nextview.types import Float
 

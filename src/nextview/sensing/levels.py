@@ -95,7 +95,7 @@ def levels_of(
     Returns:
         The levels, and what carries each instance: a level, or the top of another instance.
     """
-    sizes = [np.count_nonzero(mask) for mask in masks]
+    sizes = [int(mask.sum()) for mask in masks]
 
     def load(level: SurfaceLevel, carriers: Sequence[SurfaceLevel | None]) -> int:
         """Return the number of instance pixels that a level carries."""

@@ -146,11 +146,15 @@ class View:
         return left
 
     def alike(self, frame: Frame) -> Mask:
-        """Return the pixels of the grid that a frame from this place shows, too, (h, w) bool."""
-        grid = self.grid()
+        """Return the pixels of the grid of a frame that this view shows alike, (h, w) bool.
+
+        There are none if the frame was not taken from where this view was.
+        """
+        stride = stride_of(frame)
+        now = frame.depth[::stride, ::stride]
         if frame.shape != self.frame.shape or not one_stand(self.frame, frame):
-            return np.zeros(grid.depth.shape, bool)
-        now = frame.depth[:: self.stride, :: self.stride]
+            return np.zeros(now.shape, bool)
+        grid = self.grid()
         return (grid.depth > 0) & (np.abs(grid.depth - now) < ALIKE * grid.sigma)
 
     @property
@@ -161,7 +165,7 @@ class View:
     @property
     def stride(self) -> int:
         """Pixels of the frame from one pixel of the grid to the next."""
-        return max(1, round(self.frame.shape[1] / GRID_COLUMNS))
+        return stride_of(self.frame)
 
     def grid(self, coarser: int = 1) -> Grid:
         """Return the grid of pixels on which hypotheses are scored.
@@ -274,6 +278,11 @@ class View:
                 key = first[beside] * count + second[beside]
                 found += np.bincount(key, minlength=count**2).reshape(count, count)
         return found + found.T
+
+
+def stride_of(frame: Frame) -> int:
+    """Return the pixels of a frame from one pixel of its grid to the next."""
+    return max(1, round(frame.shape[1] / GRID_COLUMNS))
 
 
 def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:

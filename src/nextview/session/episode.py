@@ -28,8 +28,8 @@ from nextview.recognition.belief import (
     log_evidence_of,
 )
 from nextview.recognition.protocol import JointBelief
-from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.types import Float, Floats, Index, Mask
+from nextview.views.expected_visibility import SeenScene, expected_visibility
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,17 @@ from matplotlib.patheffects import withStroke
 from scipy.ndimage import label
 
 from nextview.errors import UsageError
+from nextview.figures.soft_light import SoftLight
+from nextview.figures.style import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    FIGURE_STYLE,
+    GREY,
+    INK,
+    PAPER,
+    PlainFigure,
+)
 from nextview.files import new_file
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
@@ -26,17 +37,6 @@ from nextview.geometry.viewsphere import (
     look_at_origin,
 )
 from nextview.recognition.belief import Stopping
-from nextview.session.soft_light import SoftLight
-from nextview.session.style import (
-    ACCENT,
-    BLUE,
-    FAINT,
-    FIGURE_STYLE,
-    GREY,
-    INK,
-    PAPER,
-    PlainFigure,
-)
 from nextview.session.view import View
 from nextview.types import Float, Floats, Index, Mask
 

@@ -11,8 +11,8 @@ from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import checked_pose
 from nextview.geometry.viewsphere import angle_between, direction_of
 from nextview.policies.base import nearer_first
-from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Index
+from nextview.views.expected_views import Goal, Outlook
 
 
 @dataclass(frozen=True, eq=False)

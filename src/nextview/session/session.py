@@ -60,8 +60,8 @@ from nextview.session.reach import (
 from nextview.session.result import Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
-from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
+from nextview.views.expected_views import Goal, Outlook
 
 FARTHEST_TARGET = 60.0
 """Object radii: such as 0.6 m from a thing with a radius of 0.01 m. A distance in millimetres

@@ -46,11 +46,11 @@ from nextview.recognition.protocol import (
 from nextview.segmentation.instances import Segmenter
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.limits import Limits
+from nextview.session.recogniser import VerifiedRecogniser, open_recogniser
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
-from nextview.things.expected_views import Goal
-from nextview.things.recogniser import VerifiedRecogniser, open_recogniser
-from nextview.things.several import SeveralRecognisers
+from nextview.session.several import SeveralRecognisers
+from nextview.views.expected_views import Goal
 
 if TYPE_CHECKING:
     from nextview.captured.camera import CapturedCamera

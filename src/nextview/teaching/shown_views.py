@@ -16,9 +16,9 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.belief import Stopping
+from nextview.session.recogniser import VerifiedRecogniser
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import RINGS
-from nextview.things.recogniser import VerifiedRecogniser
 
 VIEWS_SHOWN = (1, 2, 3)  # numbers of views after which things are named
 # most rendered views per test, including those that miss the thing

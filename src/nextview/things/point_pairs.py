@@ -177,7 +177,7 @@ class PointPairs:
         steps = np.rint(np.repeat(turns, lengths) - self.turns[pairs]).astype(np.int32)
         places = self.first[pairs] * TURNS + steps % TURNS
         tells = np.where(self.common[keys], COMMON_WEIGHT, 1.0)
-        votes: Float = np.bincount(places, np.repeat(tells, lengths))
+        votes = np.asarray(np.bincount(places, np.repeat(tells, lengths)), np.float64)
         leading = np.flatnonzero(votes >= FEWEST_VOTES)
         return leading, votes[leading]
 

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from nextview.figures.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere, direction_of
 from nextview.recognition.poses import place_in_words
-from nextview.session.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.session.view import View
-from nextview.things.expected_views import RivalPictures
 from nextview.types import Float, Mask
 from nextview.viewers.exploration import Walk
+from nextview.views.expected_views import RivalPictures
 
 MAP_CELL = 11  # side of a cell of a map, pixels
 SHOWN_CLASSES = 5  # number of listed classes

@@ -27,9 +27,9 @@ from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.expected_views import RivalPictures
 from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
 from nextview.types import Float, Float32
+from nextview.views.expected_views import RivalPictures
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ import numpy as np
 
 from nextview.checks import extras, whole
 from nextview.errors import NextviewError, UsageError
+from nextview.figures.style import GROUND, PAPER, rgb
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import map_policy_names, policy_names
 from nextview.recognition.model_card import find_models
-from nextview.session.style import GROUND, PAPER, rgb
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float
 from nextview.viewers.card import class_card, preview_card, walk_card

@@ -7,8 +7,8 @@ import numpy as np
 
 from nextview.checks import extras
 from nextview.errors import UsageError
+from nextview.figures.style import ACCENT, INK, heat, rgb
 from nextview.session.session import Session
-from nextview.session.style import ACCENT, INK, heat, rgb
 from nextview.session.view import View
 
 with extras():

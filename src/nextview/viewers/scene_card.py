@@ -10,11 +10,11 @@ from html import escape
 from pathlib import Path
 
 from nextview.errors import SessionError
+from nextview.figures.style import FAINT, INK, PAPER
 from nextview.files import new_file
 from nextview.recognition.poses import place_in_words
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.session.style import FAINT, INK, PAPER
 from nextview.viewers.scene_shapes import colour_of
 
 PAGE_CANDIDATES = 4  # listed candidates per object

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from nextview.checks import extras
 from nextview.errors import SessionError, UsageError
+from nextview.figures.style import ACCENT, GROUND, INK, PAPER, rgb
 from nextview.files import new_file
 from nextview.scene.figure import grey_picture
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.session.style import ACCENT, GROUND, INK, PAPER, rgb
 from nextview.types import Float
 from nextview.viewers.scene_card import scene_card
 from nextview.viewers.scene_shapes import colour_of, named, placed_shape, points_of

@@ -9,9 +9,9 @@ import numpy as np
 
 from nextview.checks import extras
 from nextview.errors import UsageError
+from nextview.figures.style import ACCENT, GREY, INK, rgb
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.session.style import ACCENT, GREY, INK, rgb
 from nextview.viewers.scene_shapes import colour_of, named, placed_shape, seen_points
 
 with extras():

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from nextview.figures.style import GREY
 from nextview.geometry.ray_caster import Triangles
 from nextview.scene.figure import OBJECT_COLOURS
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.session.style import GREY
 
 MOST_POINTS = 12_000  # largest number of drawn points of a frame or an object
 

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nextview.checks import extras
+from nextview.figures.style import ACCENT, FAINT, INK, WOOD, heat, rgb
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import great_circle
-from nextview.session.style import ACCENT, FAINT, INK, WOOD, heat, rgb
 from nextview.types import Float, Float32
 from nextview.viewers.card import warm
 from nextview.viewers.exploration import Walk

@@ -35,8 +35,8 @@ from nextview.recognition.belief import Calibration, FixedLength, Stopping
 from nextview.recognition.map_names import in_order
 from nextview.session.episode import Episodes
 from nextview.teaching.thing_sources import find_things
-from nextview.things.expected_model import MOST_LEADING
 from nextview.types import Float, Index
+from nextview.views.expected_model import MOST_LEADING
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     Occlusion,

@@ -7,8 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.recognition.map_names import LCM, LEM
-from nextview.session.style import (
+from nextview.figures.style import (
     ACCENT,
     BLUE,
     GREY,
@@ -18,6 +17,7 @@ from nextview.session.style import (
     new_figure,
     percent_axis,
 )
+from nextview.recognition.map_names import LCM, LEM
 from nextview_lab.benchmark.class_tables import (
     ONE_STEP,
     ClassResults,

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from nextview.figures.style import to_svg
 from nextview.files import new_folder
 from nextview.recognition.map_names import measure_of
-from nextview.session.style import to_svg
 from nextview_lab.benchmark.board_page import NONE, points
 from nextview_lab.benchmark.entries import knows_truth
 from nextview_lab.data.predictions import Predictions

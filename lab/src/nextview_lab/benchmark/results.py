@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from nextview.figures.style import to_png
 from nextview.files import new_folder
-from nextview.session.style import to_png
 from nextview_lab.benchmark.board_page import Board, markdown, written
 from nextview_lab.benchmark.comparison import Tables, too_few
 from nextview_lab.benchmark.figures import differences, views_curve

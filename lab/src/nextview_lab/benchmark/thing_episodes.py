@@ -29,14 +29,14 @@ from nextview.recognition.protocol import (
     Recogniser,
     log_evidence_of_views,
 )
+from nextview.session.recogniser import VerifiedRecogniser, open_recogniser
 from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.expected_views import Outlook
-from nextview.things.recogniser import VerifiedRecogniser, open_recogniser
 from nextview.things.surface import Surface
 from nextview.types import Float, Index
+from nextview.views.expected_views import Outlook
 from nextview_lab.data.metrics import add_s
 
 

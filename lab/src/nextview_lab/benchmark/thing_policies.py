@@ -12,10 +12,10 @@ from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy
-from nextview.things.expected_images import HypothesisImages, rendered_images
-from nextview.things.expected_likelihood import depth_variance
-from nextview.things.expected_views import RENDERED_SIDE, Outlook
 from nextview.types import Float, Float32, Index, Mask
+from nextview.views.expected_images import HypothesisImages, rendered_images
+from nextview.views.expected_likelihood import depth_variance
+from nextview.views.expected_views import RENDERED_SIDE, Outlook
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     KnownThings,

@@ -16,7 +16,7 @@ from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED_MODELS, ModelCard
 from nextview.recognition.network_input import from_store
-from nextview.things.recogniser import open_recogniser
+from nextview.session.recogniser import open_recogniser
 from nextview.types import Float32, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects

@@ -14,7 +14,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from nextview.session.fonts import fit_fonts
+from nextview.figures.fonts import fit_fonts
 from nextview.types import Floats
 
 INK = "#1f2933"

@@ -14,13 +14,13 @@ from nextview.geometry.observation import Observation
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
-from nextview.things.expected_views import Outlook
+from nextview.session.target import view_of
 from nextview.things.library import Library, near_turns
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
-from nextview.things.target import view_of
 from nextview.things.world import World, corrected
 from nextview.types import Floats, Index, Mask
+from nextview.views.expected_views import Outlook
 
 NO_SCALE = "the scale of the views is not known in metres"
 NO_NAME = "every name is ruled out"

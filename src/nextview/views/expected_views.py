@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
 from nextview.recognition.poses import PoseCandidate
-from nextview.things.expected_images import (
+from nextview.things.surface import SurfaceCaster
+from nextview.things.world import Thing, World
+from nextview.types import Float, Index, Mask
+from nextview.views.expected_images import (
     ExpectedSensor,
     SeenSurroundings,
     rendered_images,
 )
-from nextview.things.expected_likelihood import (
+from nextview.views.expected_likelihood import (
     different_pixels,
     divergences,
     gaps_after_alignment,
 )
-from nextview.things.expected_model import MOST_LEADING, ExpectedModel, Leading
-from nextview.things.expected_pose import sharper_poses
-from nextview.things.surface import SurfaceCaster
-from nextview.things.world import Thing, World
-from nextview.types import Float, Index, Mask
+from nextview.views.expected_model import MOST_LEADING, ExpectedModel, Leading
+from nextview.views.expected_pose import sharper_poses
 
 Goal = Literal["thing", "pose"]
 

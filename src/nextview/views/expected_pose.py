@@ -8,15 +8,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from nextview.things.expected_images import ExpectedSensor, HypothesisImages
-from nextview.things.expected_model import (
+from nextview.things.surface import Surface
+from nextview.types import Float, Float32, Mask
+from nextview.views.expected_images import ExpectedSensor, HypothesisImages
+from nextview.views.expected_model import (
     OUTLINE_PIXELS,
     SCAN_ERROR,
     ExpectedModel,
     inverses,
 )
-from nextview.things.surface import Surface
-from nextview.types import Float, Float32, Mask
 
 # smallest surface error, metres: below the accuracy of all cameras
 LEAST_SURFACE_ERROR = 1e-6

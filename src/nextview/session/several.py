@@ -18,9 +18,9 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_of
 from nextview.recognition.protocol import JointBelief, least_p_value
+from nextview.session.recogniser import VerifiedRecogniser
 from nextview.things.library import Library
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats
 

@@ -13,10 +13,10 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from nextview.sensing.view import View
-from nextview.things.expected_model import Leading
 from nextview.things.surface import SurfaceCaster
-from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.types import Float, Float32, Mask
+from nextview.views.expected_model import Leading
+from nextview.views.unseen_space import MeasuredDepth, chance_of_sight
 
 LOWEST_COSINE = 0.15  # smallest cosine of incidence in the likelihood of a pixel
 # distance from the support surface within which a point belongs to it, metres

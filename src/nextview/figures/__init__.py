@@ -1,0 +1,1 @@
+"""What all figures share: their style, fonts for any script, and the light on surfaces."""
