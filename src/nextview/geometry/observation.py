@@ -47,7 +47,6 @@ class SceneView:
         intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
         background_free: whether nothing is there where nothing was measured, as in renders; a
             sensor may miss what is black or shiny.
-        step: every so many rows and columns of the frame were taken.
         camera: name of the camera; "" for the one camera.
         support: plane under the object, if it is known, (4,): upward normal, object frame, and
             height of the origin above the plane, object radii.
@@ -58,7 +57,6 @@ class SceneView:
     pose: Float
     intrinsics: Float
     background_free: bool = False
-    step: int = 1
     camera: str = ""
     support: Float | None = None
 

@@ -16,8 +16,6 @@ from nextview.types import Float, Float32, Index
 WIDEST_FACET = 1 / 16
 # depth range of facets of one surface, object radii; of these the one nearest to a pixel is shown
 SURFACE_LAYER = 0.03
-# size of a pixel of the scene, object radii: half a voxel of ``expected_visibility``
-FINEST_PITCH = 1 / 32
 
 
 def observation_of(
@@ -166,25 +164,11 @@ def _scene(sighting: Sighting, pose: Float, object_frame: ObjectFrame) -> SceneV
     if plane is not None:
         height = float(plane.height(object_frame.centre)) / radius
         support = np.append(object_frame.axes @ plane.normal, height)
-    k = sighting.frame.intrinsics.copy()
-    step = max(
-        1,
-        int(
-            FINEST_PITCH
-            * min(k[0, 0], k[1, 1])
-            / max(float(np.linalg.norm(pose[:3, 3])), 1.0)
-        ),
-    )
-
-    k[:2] /= step
-    k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
-    few = (slice(step // 2, None, step),) * 2
     return SceneView(
-        sighting.frame.depth[few] / np.float32(radius),
-        sighting.mask[few],
+        sighting.frame.depth / np.float32(radius),
+        sighting.mask,
         pose,
-        k,
-        step=step,
+        sighting.frame.intrinsics,
         camera=sighting.frame.camera,
         support=support,
     )

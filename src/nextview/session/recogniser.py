@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -185,7 +186,8 @@ class VerifiedRecogniser(TaughtRecogniser):
             known, world = len(self._last[0]), self._last[1]
         for observation in seen[known:]:
             view = corrected(world, view_of(observation))
-            world = world.with_view(view).searched(among).numbered()
+            # what is looked at is an object, and no piece of a wall
+            world = replace(world.with_view(view), flat=()).searched(among).numbered()
         self._last = (seen, world)
         return world
 

@@ -16,7 +16,8 @@ def view_of(observation: Observation) -> View:
     """Return the view of an object that an observation shows, in metres.
 
     Args:
-        observation: a view of the object, with a scale; its pixels are the only segment.
+        observation: a view of the object, with a scale; its pixels are the only segment, and all
+            others show what is known otherwise.
     """
     radius = float(observation.radius or 1.0)
     scene = observation.scene
@@ -36,5 +37,6 @@ def view_of(observation: Observation) -> View:
     if support is not None:
         height = frame.along(support[:3], float(support[3]) * radius)
     none = np.zeros(depth.shape, bool)
-    instances = Instances((target & (frame.depth > 0),), none, none)
-    return View.of(frame, instances, frame.depth > 0, height, np.inf)
+    measured = frame.depth > 0
+    instances = Instances((target & measured,), none, none)
+    return View.of(frame, instances, measured, height, np.inf, measured & ~target)

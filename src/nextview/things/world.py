@@ -196,16 +196,22 @@ class World:
         return self if new is None else self.with_hypotheses(new).chosen()
 
     def with_other_sizes(self) -> World:
-        """Return the world with new or doubtful things in another size, that which fits best."""
-        some = self.hypotheses[self._doubtful()]
+        """Return the world with new or doubtful things in another size, that which fits best.
+
+        As often as in other sizes they are registered in their own.
+        """
+        own = some = self.hypotheses[self._doubtful()]
         if not len(some):
             return self
+        closer = (0.06, 0.04, 0.03)
         for _ in range(RESIZED):
+            own = register(self.library, self.views, own, closer, 96)
             new = some.in_other_sizes()
-            new = register(self.library, self.views, new, (0.06, 0.04, 0.03), 96)
+            new = register(self.library, self.views, new, closer, 96)
             totals = self._coarse_totals(new).reshape(len(some), -1)
             some = new[totals.argmax(1) + totals.shape[1] * np.arange(len(some))]
-        return self.with_hypotheses(some[np.flatnonzero(~some.taught)]).chosen()
+        other = some[np.flatnonzero(~some.taught)]
+        return self.with_hypotheses(Hypotheses.joined([own, other])).chosen()
 
     def _doubtful(self) -> Index:
         """Return the rows of things that are new, or that explain less than is sure."""

@@ -238,19 +238,23 @@ class SeenScene:
 
     def seen(self, view: SceneView) -> Self:
         """Return the scene after one more frame."""
+        # pixels of half a voxel are fine enough
+        away = max(float(np.linalg.norm(view.pose[:3, 3])), 1.0)
+        focal = min(view.intrinsics[0, 0], view.intrinsics[1, 1])
+        step = max(1, int(self.occupancy.grid.pitch / 2 * focal / away))
+        few = (slice(step // 2, None, step),) * 2
+        depth = view.depth[few]
+        k = view.intrinsics.copy()
+        k[:2] /= step
+        k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
         occupancy = self.occupancy.seen(
-            view.depth,
-            view.pose,
-            view.intrinsics,
-            view.target,
-            view.background_free,
+            depth, view.pose, k, view.target[few], view.background_free
         )
 
-        rows, columns = np.nonzero(view.depth[::2, ::2])
-        depth = view.depth[::2, ::2][rows, columns]
+        rows, columns = np.nonzero(depth[::2, ::2])
         ahead = np.stack([2 * columns + 0.5, 2 * rows + 0.5, np.ones(len(rows))])
         heights = (
-            view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead * depth
+            view.pose[2, :3] @ np.linalg.inv(k) @ ahead * depth[::2, ::2][rows, columns]
             + view.pose[2, 3]
         )
         near = heights[np.abs(heights) <= 1.2]
