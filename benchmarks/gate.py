@@ -63,7 +63,13 @@ from benchmarks.gate_frames import (
 )
 from nextview.sensing import Frame
 from nextview_lab.benchmark.real import pixels_met
-from nextview_lab.data.real_frames import RealFrame, real_frames
+from nextview_lab.data.real_frames import (
+    RealFrame,
+    Shot,
+    Told,
+    real_frames,
+    write_frames,
+)
 
 Part = Literal["tables", "single", "parts", "moves", "places", "real", "counts"]
 Row = dict[str, Any]
@@ -331,6 +337,21 @@ def real_cases(bench: Bench) -> Iterator[tuple[str, RealFrame]]:
             yield group, seen
 
 
+def write_tables(bench: Bench, folder: Path) -> None:
+    """Write the frames of all tables as ``nextview-lab real`` reads them."""
+    shots: dict[str, Shot] = {}
+    for name, seen in bench.cases("tables"):
+        told = [
+            Told(name="" if thing.startswith(STRANGER) else thing, label=number)
+            for number, thing in enumerate(seen.names.tolist(), 1)
+        ]
+        for frame, (depth, labels) in enumerate(
+            zip(seen.depth, seen.labels, strict=True)
+        ):
+            shots[f"{name}, {frame}"] = depth, labels, told
+    write_frames(folder, INTRINSICS, shots)
+
+
 def counts(bench: Bench) -> Iterator[Row]:
     """What the package consists of, by its folders."""
     package = Path(nextview.__file__).parent
@@ -450,6 +471,7 @@ def main(
     only: tuple[Part, ...] = (),
     quick: bool = False,
     frames: Path = Path("~/.cache/nextview/gate"),
+    write_to: Path | None = None,
 ) -> None:
     """Measure all parts, and print a table for each.
 
@@ -460,8 +482,12 @@ def main(
         only: parts to measure.
         quick: measure a third of the cases.
         frames: folder of the drawn frames.
+        write_to: write the frames of the tables to this folder, and measure nothing.
     """
     bench = Bench(data, frames.expanduser(), 3 if quick else 1)
+    if write_to is not None:
+        write_tables(bench, write_to)
+        return
     kept, other = (
         run_in(out if out and out.exists() else None, quick),
         run_in(against, quick),

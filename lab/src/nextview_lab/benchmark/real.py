@@ -44,6 +44,7 @@ class RealThing:
         number: of the thing in the frame, from 1; 0 for what is elsewhere.
         thing: its true name, "" without one.
         taught: whether this name is taught.
+        pixels: that are known of it; None if none is.
         name: that the object has, or would most likely have; "" if nothing was found there.
         belief: in this name.
         named: whether it is called so; if not, it is called unknown.
@@ -58,6 +59,7 @@ class RealThing:
     number: int = 0
     thing: str = ""
     taught: bool = False
+    pixels: int | None = None
     name: str = ""
     belief: float = 0.0
     named: bool = False
@@ -184,8 +186,12 @@ def compared(
     blank = RealThing(str(frame.folder), frame.name, cpu=answer.cpu)
 
     def row_of(number: int, **more: Any) -> RealThing:
-        name = things[number].name if number else ""
-        return replace(blank, number=number, thing=name, taught=name in clouds, **more)
+        if not number:
+            return replace(blank, **more)
+        thing = things[number]
+        pixels = None if thing.pixels is None else int(thing.pixels.sum())
+        known = {"thing": thing.name, "taught": thing.name in clouds, "pixels": pixels}
+        return replace(blank, number=number, **known, **more)
 
     rows = []
     for one in sorted(answer.objects, key=lambda one: not one.named):

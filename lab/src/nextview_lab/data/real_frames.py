@@ -20,7 +20,7 @@ each pixel, 0 for none |
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
+from PIL import Image
 
 from nextview.captured.bop_scene import (
     EVERY_SCENE_CAMERAS,
@@ -49,7 +50,7 @@ from nextview.captured.frames import (
 )
 from nextview.captured.mat_scenes import read_mat
 from nextview.errors import DatasetError, ObservationError
-from nextview.files import read_record, regular_file
+from nextview.files import read_record, regular_file, write_record
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Mask
 
@@ -78,6 +79,9 @@ class Told(Struct, forbid_unknown_fields=True):
     row: float | None = None
     label: int | None = None
     pose: Matrix | None = None
+
+
+Shot = tuple[NDArray[np.uint16], NDArray[np.uint8], Sequence[Told]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +185,26 @@ def _captured(
         (frame,) = read_capture(path, given, depth_scale=step).frames
         found.append(replace(frame, name=name))
     return found
+
+
+def write_frames(folder: Path, intrinsics: Float, shots: Mapping[str, Shot]) -> None:
+    """Write frames, and what is known of the things in them.
+
+    Args:
+        folder: to write into; none of the frames may be there.
+        intrinsics: pinhole matrix, (3, 3), pixels, the middle of the first pixel at 0.
+        shots: depth, (H, W) uint16, millimetres, the number of the thing in each pixel, (H, W)
+            uint8, and the things, by the names of the frames.
+    """
+    (folder / "labels").mkdir(parents=True, exist_ok=True)
+    for name, (depth, labels, _) in shots.items():
+        (folder / name).mkdir()
+        Image.fromarray(depth).save(folder / name / "depth.png")
+        Image.fromarray(labels).save(folder / LABELS[0].format(name))
+        write_record(
+            folder / name / CAMERA, intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        )
+    write_record(folder / TRUTH, {name: told for name, (_, _, told) in shots.items()})
 
 
 def bop_frame(
