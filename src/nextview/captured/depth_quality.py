@@ -87,9 +87,9 @@ class DepthQuality:
     def sentences(self) -> list[str]:
         """What is to be said of the depth, in words."""
         said = [
-            f"at {depth:.2f} m: noise {noise:.1f} mm, a pixel covers {pixel:.1f} mm; most things get"
-            f" a name from {side:.1f} cm on, and two that differ by less than {detail:.0f} mm look"
-            " alike"
+            f"at {depth:.2f} m: noise {noise:.1f} mm, a pixel covers {pixel:.1f} mm; most things"
+            f" get a name from {side:.1f} cm on, and two that differ by less than {detail:.0f} mm"
+            " look alike"
             for depth, noise, pixel, side, detail in zip(
                 self.depths,
                 1000 * self.noise,

@@ -107,11 +107,10 @@ def _draw(quality: DepthQuality, path: Path) -> None:
         axes.axhline(size, color=GREY, linewidth=0.8, linestyle=":")
         axes.annotate(
             name,
-            (1, size),
-            (-2, 2),
+            (0, size),
+            (3, 2),
             xycoords=("axes fraction", "data"),
             textcoords="offset points",
-            ha="right",
             color=GREY,
             fontsize=8.5,
         )

@@ -20,6 +20,7 @@ from nextview.files import new_file
 from nextview.session.style import (
     ACCENT,
     BLUE,
+    FAINT,
     legend,
     new_figure,
     percent_axis,
@@ -30,6 +31,7 @@ from nextview_lab.benchmark.statistics import wilson
 BELIEFS = (0.5, 0.8, 0.95, 0.97, 1.01)  # a confident name has at least the last but one
 MARKERS = "os^D"
 ASIDE = 0.11  # between two series
+RIGHT, NAMED = "names that are right", "strangers with such a name"
 
 
 def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
@@ -40,7 +42,7 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    found: dict[str, list[tuple[int, int]]] = {"right": [], "strangers named": []}
+    found: dict[str, list[tuple[int, int]]] = {RIGHT: [], NAMED: []}
     on = {
         (row["folder"], row["frame"], row["number"]): []
         for row in rows
@@ -55,8 +57,8 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
                     named.add(thing)
                 else:
                     right.append(row["right"] == "True")
-        found["right"].append((sum(right), len(right)))
-        found["strangers named"].append((len(named), len(on)))
+        found[RIGHT].append((sum(right), len(right)))
+        found[NAMED].append((len(named), len(on)))
     return found
 
 
@@ -82,10 +84,13 @@ def main(tables: tyro.conf.Positional[tuple[Path, ...]], figure: Path) -> None:
                 [max(0.0, high - p) for p, (_, high) in zip(share, ends, strict=True)],
             ],
             fmt=MARKERS[number // 2 % len(MARKERS)],
-            color=BLUE if what == "right" else ACCENT,
+            color=BLUE if what == RIGHT else ACCENT,
             label=f"{path.stem}: {what}",
             elinewidth=1.2,
         )
+    for k, (low, high) in enumerate(pairwise(BELIEFS)):
+        around = [k - 4 * ASIDE, k + 4 * ASIDE]
+        axes.fill_between(around, low, min(high, 1), color=FAINT, linewidth=0, zorder=0)
     ranges = [f"{low:g} to {high:g}" for low, high in pairwise(BELIEFS[:-1])]
     axes.set_xticks(range(len(BELIEFS) - 1), [*ranges, f"{BELIEFS[-2]:g} to 1"])
     axes.set_xlabel("belief in a name")
