@@ -316,7 +316,11 @@ def real(bench: Bench) -> Iterator[Row]:
         scene = nextview.Scene(system, up=None)
         cost = updated(scene, seen.read())[1]
         judged = []
-        left = {one.name: one.pixels for one in seen.things() if one.name}
+        left = {
+            one.name: one.pixels
+            for one in seen.things()
+            if one.name and one.pixels is not None
+        }
         known = set(left)
         for one in named_in(scene):
             points = moved(shapes[one.name][0], one.pose)

@@ -103,11 +103,11 @@ def _draw(quality: DepthQuality, path: Path) -> None:
     axes.set_ylim(0.05, 50)
     axes.set_yticks([0.1, 1, 10], ["1 mm", "1 cm", "10 cm"])
     axes.minorticks_off()
-    for name, size in GUIDES.items():
-        axes.axhline(size, color=GREY, linewidth=0.8, linestyle=":")
+    for name, guide in GUIDES.items():
+        axes.axhline(guide, color=GREY, linewidth=0.8, linestyle=":")
         axes.annotate(
             name,
-            (0, size),
+            (0, guide),
             (3, 2),
             xycoords=("axes fraction", "data"),
             textcoords="offset points",

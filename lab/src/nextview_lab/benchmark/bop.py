@@ -23,7 +23,7 @@ from nextview.captured.bop_scene import (
 from nextview.captured.frames import MILLIMETRES, CapturedFrame
 from nextview.checks import one_line
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, new_file, only_one, read_record, unfinished
 from nextview.sensing.frame import Frame
 from nextview.session.system import load
@@ -286,7 +286,7 @@ class BopRun:
 
     out: Path
     images: int
-    left_out: dict[str, str]
+    left_out: dict[str, NextviewError]
     poses: int
     seconds: float
     others: dict[str, int]
@@ -344,9 +344,7 @@ def look_for_models(
             if (answer := answers[image.name]) is not None
         }
         if not found:
-            raise DatasetError(
-                f"{dataset}: no image can be looked at: {next(iter(answers.left_out.values()))}"
-            )
+            raise DatasetError(f"{dataset}: no image can be looked at{answers.why()}")
         lines = {
             image: [one for one in answer.objects if one.named and one.name in numbers]
             for image, answer in found.items()

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from msgspec import Struct
 
-from nextview.errors import DatasetError, ObservationError, UsageError
+from nextview.errors import DatasetError, NextviewError, ObservationError, UsageError
 from nextview.files import read_record, write_record
 from nextview.scene.scene import Scene
 from nextview.sensing.frame import Frame
@@ -96,7 +96,7 @@ class FrameAnswers:
             up: direction against gravity in the world, (3,); None for the normal of the support
                 plane.
         """
-        self.left_out: dict[str, str] = {}
+        self.left_out: dict[str, NextviewError] = {}
         self._folder = folder
         self._system = system
         self._up = up
@@ -112,8 +112,16 @@ class FrameAnswers:
                 try:
                     write_record(self._file(name), self._looked(read))
                 except (DatasetError, ObservationError) as error:
-                    self.left_out[name] = str(error)
+                    self.left_out[name] = error
             yield done
+
+    def refused(self, name: str) -> bool:
+        """Whether a frame was read, and showed no plane, or nothing."""
+        return isinstance(self.left_out.get(name), ObservationError)
+
+    def why(self) -> str:
+        """Why the first frame that is left out is, as the end of a sentence."""
+        return next((f": {error}" for error in self.left_out.values()), "")
 
     def __getitem__(self, name: str) -> FrameAnswer | None:
         """What was found in a frame; None if it could not be looked at."""

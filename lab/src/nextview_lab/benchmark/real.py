@@ -5,12 +5,11 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, UsageError
+from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, new_file, only_one, unfinished
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
@@ -81,7 +80,7 @@ class RealRun:
 
     out: Path
     rows: tuple[RealThing, ...]
-    left_out: dict[str, str]
+    left_out: dict[str, NextviewError]
 
 
 def recognise_real(
@@ -144,12 +143,13 @@ def recognise_real(
         rows = [
             row
             for name, frame in there.items()
-            if (answer := answers[name]) is not None
+            if (answer := answers[name]) is not None or answers.refused(name)
             for row in compared(frame, answer, clouds)
         ]
         if not rows:
-            why = next(iter(answers.left_out.values()), "there is none")
-            raise DatasetError(f"{folders[0]}: no frame can be looked at: {why}")
+            raise DatasetError(
+                f"{folders[0]}: no frame can be looked at{answers.why()}"
+            )
         with new_file(out, overwrite) as new:
             _write(new, rows)
     return RealRun(out, tuple(rows), answers.left_out)
@@ -168,55 +168,60 @@ def surface_points(system: System) -> dict[str, Float]:
 
 def compared(
     frame: RealFrame,
-    answer: FrameAnswer,
+    answer: FrameAnswer | None,
     clouds: Mapping[str, Float],
 ) -> list[RealThing]:
     """Compare what was found in a frame with what is known.
 
     Args:
         frame: the frame.
-        answer: what was found in it.
+        answer: what was found in it; None if it was refused.
         clouds: points on the scans of what is taught, by name.
 
     Returns:
-        A row for each object, and for each thing that no name was given to; at least one.
+        A row for each object, and for each thing at which none was found; at least one.
     """
     things = dict(enumerate(frame.things(), 1))
-    left = dict(things)
-    blank = RealThing(str(frame.folder), frame.name, cpu=answer.cpu)
-
-    def row_of(number: int, **more: Any) -> RealThing:
-        if not number:
-            return replace(blank, **more)
-        thing = things[number]
-        pixels = None if thing.pixels is None else int(thing.pixels.sum())
-        known = {"thing": thing.name, "taught": thing.name in clouds, "pixels": pixels}
-        return replace(blank, number=number, **known, **more)
+    blank = RealThing(str(frame.folder), frame.name)
+    if answer is not None:
+        blank = replace(blank, cpu=answer.cpu)
+    bare = {0: blank}
+    for number, thing in things.items():
+        bare[number] = replace(
+            blank,
+            number=number,
+            thing=thing.name,
+            taught=thing.name in clouds,
+            pixels=None if thing.pixels is None else int(thing.pixels.sum()),
+        )
 
     rows = []
-    for one in sorted(answer.objects, key=lambda one: not one.named):
+    left = dict(things)
+    found = () if answer is None else answer.objects
+    for one in sorted(found, key=lambda one: not one.named):
         points = moved(clouds[one.name], one.matrix)
-        own = left if one.named else things
         met = {n: meeting(thing, points, frame, clouds) for n, thing in things.items()}
+        own = left if one.named else things
         right = [n for n, thing in own.items() if thing.name == one.name and met[n]]
-        number = right[0] if right else max(met, key=lambda n: met[n], default=0)
-        pose = things[number].pose if right else None
-        off = None if pose is None else 1000 * add_s(clouds[one.name], one.matrix, pose)
+        at = right[0] if right else max(met, key=lambda n: met[n], default=0)
+        pose = things[at].pose if right else None
         if right and one.named:
-            del left[number]
+            del left[at]
         rows.append(
-            row_of(
-                number if number and met[number] else 0,
+            replace(
+                bare[at if met.get(at) else 0],
                 name=one.name,
                 belief=one.belief,
                 named=one.named,
                 confident=one.confident,
                 right=bool(right),
-                add_s=off,
+                add_s=None
+                if pose is None
+                else 1000 * add_s(clouds[one.name], one.matrix, pose),
             )
         )
     told = {row.number for row in rows}
-    return [*rows, *(row_of(n) for n in things if n not in told)] or [blank]
+    return [*rows, *(bare[n] for n in things if n not in told)] or [blank]
 
 
 def moved(points: Float, pose: Float) -> Float:
@@ -299,8 +304,9 @@ def _figures(rows: Sequence[RealThing]) -> dict[str, str]:
     """The figures of some frames, by what they are."""
     named = [row for row in rows if row.named]
     right = [row for row in named if row.right]
-    wrong = [row for row in named if not row.right]
-    seconds = [*{(row.folder, row.frame): row.cpu for row in rows}.values()]
+    sure = [row for row in named if row.confident]
+    frames = {(row.folder, row.frame): row.cpu for row in rows}
+    seconds = [cpu for cpu in frames.values() if cpu is not None]
 
     def things(some: Sequence[RealThing], taught: bool) -> int:
         each = [row for row in some if row.number and row.taught == taught]
@@ -311,15 +317,15 @@ def _figures(rows: Sequence[RealThing]) -> dict[str, str]:
     share = f", {len(right) / known:.2f} ({low:.2f} to {high:.2f})" if known else ""
     errors = [row.add_s for row in right if row.add_s is not None]
     return {
-        "frames": f"{len(seconds)}",
+        "frames, refused": f"{len(frames)}, {len(frames) - len(seconds)}",
         "taught things in view": f"{known}",
         "right": f"{len(right)}{share}",
-        "right and confident": f"{sum(row.confident for row in right)}",
-        "wrong names": f"{len(wrong)}",
-        "wrong and confident": f"{sum(row.confident for row in wrong)}",
+        "right and confident": f"{sum(row.right for row in sure)}",
+        "wrong names": f"{len(named) - len(right)}",
+        "wrong and confident": f"{sum(not row.right for row in sure)}",
         "strangers with pixels": f"{things(rows, False)}",
         "with a name": f"{things(named, False)}",
-        "with a confident name": f"{things([row for row in named if row.confident], False)}",
+        "with a confident name": f"{things(sure, False)}",
         "ADD-S, mm (worst)": _median(errors),
         "CPU, s a frame (worst)": _median(seconds),
     }

@@ -292,7 +292,7 @@ def print_real(run: RealRun) -> None:
     print_tables([real_table(run.rows)])
 
 
-def _print_left_out(left_out: Mapping[str, str]) -> None:
+def _print_left_out(left_out: Mapping[str, Exception]) -> None:
     """Print why frames were left out, by their names."""
     for name, reason in left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)

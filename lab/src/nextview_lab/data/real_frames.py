@@ -176,9 +176,9 @@ def _captured(
         camera, steps = path.with_name(CAMERA), path.with_name(SCALE)
         given = intrinsics
         if camera.exists():
-            given = tuple(
-                read_record(camera, FourNumbers, "fx, fy, cx, cy", DatasetError)
-            )
+            what = "fx, fy, cx, cy"
+            fx, fy, cx, cy = read_record(camera, FourNumbers, what, DatasetError)
+            given = fx, fy, cx, cy
         step = MILLIMETRES if scale is None else scale
         if steps.exists():
             step = read_record(steps, float, "metres a step", DatasetError)
@@ -253,7 +253,7 @@ def _bop_things(
     """The things in an image of BOP."""
     things = []
     for row, one in enumerate(objects):
-        pose = None
+        pose: Float | None = None
         if one.cam_R_m2c is not None and one.cam_t_m2c is not None:
             where = f"{files.object_file}: image {captured.name}"
             pose = np.linalg.inv(camera_to_world(one.cam_R_m2c, one.cam_t_m2c, where))

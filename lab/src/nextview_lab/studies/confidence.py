@@ -43,8 +43,8 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     found: dict[str, list[tuple[int, int]]] = {RIGHT: [], NAMED: []}
-    on = {
-        (row["folder"], row["frame"], row["number"]): []
+    strangers = {
+        (row["folder"], row["frame"], row["number"])
         for row in rows
         if row["taught"] == "False" and row["number"] != "0"
     }
@@ -53,12 +53,12 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
         for row in rows:
             if row["named"] == "True" and low <= float(row["belief"]) < high:
                 thing = row["folder"], row["frame"], row["number"]
-                if thing in on:
+                if thing in strangers:
                     named.add(thing)
                 else:
                     right.append(row["right"] == "True")
         found[RIGHT].append((sum(right), len(right)))
-        found[NAMED].append((len(named), len(on)))
+        found[NAMED].append((len(named), len(strangers)))
     return found
 
 
