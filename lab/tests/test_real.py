@@ -143,7 +143,7 @@ def test_a_table_of_all_things_and_a_run_that_goes_on(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        recognise_real((labelled, posed), out, track=stopped)
+        recognise_real(labelled, (posed,), out=out, track=stopped)
     assert not out.exists()
 
     # the first frame is not looked at again: now it shows nothing

@@ -1,9 +1,9 @@
 """What the depth of captured frames is good for: its noise, how flat planes are, and its scale.
 
-The depth is taken to be off by a factor and a constant, true = factor * measured + offset. A plane
-that posed frames see from different distances tells the factor: the heights of the cameras above it
-differ, by their poses, as much as those by the right depth. The offset, which looks as if the plane
-were elsewhere, is taken into account, and is not told.
+What is measured along a ray is taken to be off by a factor and a constant, true = factor * measured
++ offset. A plane that posed frames see from different distances tells the factor: the heights of
+the cameras above it differ, by their poses, as much as those by the right depth. The offset, which
+looks as if the plane were elsewhere, is taken into account, and is not told.
 """
 
 from collections.abc import Sequence
@@ -22,18 +22,15 @@ from nextview.types import Float
 FRAMES_READ = 12
 SPARSE = 101  # each so manyth pixel is asked for its depth
 MEDIAN_OF_NORMAL = 0.6745  # median of the size of a normal deviate
-SAME_PLANE = (
-    0.05  # metres, and such a share of the distance, between sightings of one plane
-)
+# metres, and such a share of the distance, between sightings of one plane
+SAME_PLANE = 0.05
 # standard deviations before anything is measured
 FACTOR_SPREAD, OFFSET_SPREAD = 0.1, 0.02  # of 1; metres
 USUAL_MISFITS = 4  # so many sightings count for the usual errors of poses
 TOLD = 0.015  # largest uncertainty of a scale that is told
 # pixels of single things from which on most are named, docs/your_camera.md
 NAMED_PIXELS = 1000
-Sighting = tuple[
-    Plane, Samples, Float
-]  # with the direction in which the camera looks, (3,)
+Sighting = tuple[Plane, Samples]  # those on the plane
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,6 @@ class DepthQuality:
     Attributes:
         depths: near, middle and far depth, (3,), metres.
         noise: standard deviation of a pixel at each, (3,), metres.
-        grain: distance within which the errors of pixels are alike, pixels.
         focal: focal length, pixels.
         uneven: standard deviation of the largest plane from a plane, metres; None if none is seen.
         scale: by how much that of the depth is wrong; None if that cannot be told.
@@ -71,7 +67,6 @@ class DepthQuality:
 
     depths: Float
     noise: Float
-    grain: int
     focal: float
     uneven: float | None
     scale: ScaleError | None
@@ -138,16 +133,14 @@ def depth_quality(frames: Sequence[Frame], still: bool = True) -> DepthQuality:
         samples = sample(frame, frame.depth > 0, noise)
         plane = find_plane(samples, rng)
         if plane is not None:
-            ahead = frame.camera_to_world[:3, 2]
-            sightings.append((plane, samples.some(plane.holds(samples)), ahead))
+            sightings.append((plane, samples.some(plane.holds(samples))))
     uneven = [
         np.median(np.abs(plane.height(samples.points))) / MEDIAN_OF_NORMAL
-        for plane, samples, _ in sightings
+        for plane, samples in sightings
     ]
     return DepthQuality(
         depths,
         np.median([noise.at(depths) * depths**2 for noise in noises], axis=0),
-        int(np.median([noise.grain for noise in noises])),
         float(frames[0].intrinsics[0, 0]),
         float(np.median(uneven)) if uneven else None,
         _scale_error(sightings) if still else None,
@@ -157,19 +150,20 @@ def depth_quality(frames: Sequence[Frame], still: bool = True) -> DepthQuality:
 def _scale_error(sightings: Sequence[Sighting]) -> ScaleError | None:
     """Compare the heights of cameras above the plane that most of them see; None if too few do."""
     seen: list[Sighting] = []
-    for plane, samples, _ in sightings:
+    for plane, samples in sightings:
         here = [other for other in sightings if _same(plane, samples, other[0])]
         seen = max(seen, here, key=len)
     if len(seen) < 2:
         return None
-    normal = np.mean([plane.normal for plane, _, _ in seen], axis=0)
+    normal = np.mean([plane.normal for plane, _ in seen], axis=0)
     normal /= np.linalg.norm(normal)
     rows, heights, deviations = [], [], []
-    for plane, samples, ahead in seen:
+    for plane, samples in seen:
         above = float(plane.height(samples.camera))
         points = samples.points - samples.camera
         aside = np.linalg.norm(points.mean(0) + above * plane.normal)
-        rows.append([above, above * np.mean(1 / (points @ ahead)), 1.0])
+        along = np.mean(above / np.linalg.norm(points, axis=1))
+        rows.append([above, along, 1.0])
         heights.append(normal @ samples.camera)
         deviations.append(np.hypot(CAMERA_PLACE, CAMERA_AIM * aside))
 
@@ -179,7 +173,6 @@ def _scale_error(sightings: Sequence[Sighting]) -> ScaleError | None:
     prior = np.array([FACTOR_SPREAD, OFFSET_SPREAD, np.inf]) ** -2.0
     precision = weighed.T @ weighed + np.diag(prior)
     found = np.linalg.solve(precision, weighed.T @ goal + prior * [1, 0, 0])
-    misfit = float(((weighed @ found - goal) ** 2).sum()) / max(1, len(seen) - 3)
     misfit = float(((weighed @ found - goal) ** 2).sum())
     usual = (USUAL_MISFITS + misfit) / (USUAL_MISFITS + max(0, len(seen) - 3))
     deviation = float(np.sqrt(usual * np.linalg.inv(precision)[0, 0]))

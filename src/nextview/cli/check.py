@@ -5,7 +5,7 @@ from pathlib import Path
 from nextview.captured.check import check_capture, errors_of_cameras
 from nextview.captured.depth_quality import DepthQuality, quality_of
 from nextview.captured.folders import read_capture
-from nextview.cli.common_options import check_there
+from nextview.cli.common_options import check_file, check_there
 from nextview.cli.progress import console
 from nextview.files import new_file
 
@@ -18,6 +18,7 @@ def check(
     intrinsics: tuple[float, float, float, float] | Path | None = None,
     depth_scale: float | None = None,
     figure: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Check captured frames, their depth, and the poses of their cameras.
 
@@ -37,8 +38,10 @@ def check(
             millimetres; by default read from the folder.
         figure: draw which things the first camera can tell apart at which
             distance, PNG.
+        overwrite: replace it.
     """
     check_there(path)
+    check_file(figure, overwrite)
     read = read_capture(path, intrinsics, depth_scale=depth_scale)
     console.print(f"{read!r}", soft_wrap=True)
     capture, left_out = check_capture(read, masked=False)
@@ -56,7 +59,7 @@ def check(
             said = f"camera {camera}: {sentence}" if camera else sentence
             console.print(said, soft_wrap=True)
         if figure is not None and camera == cameras[0]:
-            _draw(quality, figure)
+            _draw(quality, figure, overwrite)
     if len(cameras) < 2:
         return
 
@@ -82,7 +85,7 @@ def check(
             )
 
 
-def _draw(quality: DepthQuality, path: Path) -> None:
+def _draw(quality: DepthQuality, path: Path, overwrite: bool) -> None:
     """Draw which things can be told apart at which distance."""
     from nextview.session.style import (  # slow to import
         ACCENT,
@@ -116,5 +119,5 @@ def _draw(quality: DepthQuality, path: Path) -> None:
         )
     axes.set_xlabel("distance, m")
     legend(axes)
-    with new_file(path, overwrite=True) as part:
+    with new_file(path, overwrite) as part:
         to_png(figure, part)

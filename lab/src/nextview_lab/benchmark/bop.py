@@ -5,7 +5,7 @@ import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
@@ -14,7 +14,6 @@ from msgspec import Struct
 
 from nextview.captured.bop_scene import (
     EVERY_SCENE_CAMERAS,
-    BopCamera,
     BopFiles,
     bop_files,
     camera_to_world,
@@ -39,6 +38,7 @@ from nextview_lab.data.real_frames import bop_frame
 
 MODELS_FOLDER = "models"
 TARGETS_FILES = ("test_targets_bop19.json", "test_targets_bop24.json")
+_cameras = cache(read_bop_cameras)
 MODEL_NAME = re.compile(r"obj_0*(\d+)")
 
 
@@ -66,22 +66,6 @@ class BopImage:
 
 
 @dataclass(frozen=True)
-class BopScene:
-    """A scene, as yet unread.
-
-    Attributes:
-        files: of the camera that is used.
-    """
-
-    files: BopFiles
-
-    @cached_property
-    def cameras(self) -> dict[int, BopCamera]:
-        """By the numbers of the images; a DatasetError if they cannot be read."""
-        return read_bop_cameras(self.files)
-
-
-@dataclass(frozen=True)
 class BopDataset:
     """A dataset whose images are as yet unread.
 
@@ -89,29 +73,13 @@ class BopDataset:
         folder: the whole of it.
         models: mesh file of each model, by its number.
         images: that are looked at, in order, each once.
-        scenes: that they are of, by their numbers.
+        scenes: files of the cameras of those that they are of, by their numbers.
     """
 
     folder: Path
     models: dict[int, Path]
     images: tuple[BopImage, ...]
-    scenes: dict[int, BopScene]
-
-    def camera(self, image: BopImage) -> BopCamera:
-        """The camera of an image.
-
-        Args:
-            image: one of ``images``.
-
-        Raises:
-            DatasetError: it is not known.
-        """
-        scene = self.scenes[image.scene]
-        if image.image not in scene.cameras:
-            raise DatasetError(
-                f"{scene.files.camera_file}: has no camera of the image {image.image}"
-            )
-        return scene.cameras[image.image]
+    scenes: dict[int, BopFiles]
 
     def frame(self, image: BopImage, in_world: bool = False) -> CapturedFrame:
         """A depth image, as yet unread.
@@ -124,8 +92,12 @@ class BopDataset:
         Raises:
             DatasetError: its camera is not known.
         """
-        files = self.scenes[image.scene].files
-        camera = self.camera(image)
+        files = self.scenes[image.scene]
+        camera = _cameras(files).get(image.image)
+        if camera is None:
+            raise DatasetError(
+                f"{files.camera_file}: has no camera of the image {image.image}"
+            )
         pose = None
         if in_world:
             where = f"image {image.image} of {files.camera_file}"
@@ -208,7 +180,7 @@ def _scenes(
     split: str,
     numbers: set[int],
     camera: str | None,
-) -> dict[int, BopScene]:
+) -> dict[int, BopFiles]:
     """The scenes of some numbers in a split."""
     if Path(split).name != split:
         raise UsageError(f"--split is the name of a folder of {folder}, not {split!r}")
@@ -232,7 +204,7 @@ def _scenes(
             raise DatasetError(
                 f"{scene}: has depth images of several cameras: --camera names one of {named}"
             )
-        scenes[number] = BopScene(files[0])
+        scenes[number] = files[0]
     return scenes
 
 

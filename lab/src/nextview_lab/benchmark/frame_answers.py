@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from msgspec import Struct
 
+from nextview.captured.check import evenly_spread
 from nextview.errors import DatasetError, NextviewError, ObservationError, UsageError
 from nextview.files import read_record, write_record
 from nextview.scene.scene import Scene
@@ -37,9 +38,7 @@ def evenly(items: Sequence[Item], most: int | None) -> Sequence[Item]:
     """
     if most is not None and most < 1:
         raise UsageError(f"at least one frame is looked at, not {most}")
-    if most is None or most >= len(items):
-        return items
-    few = np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))
+    few = evenly_spread(len(items), len(items) if most is None else most)
     return [items[row] for row in few]
 
 

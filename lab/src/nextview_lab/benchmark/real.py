@@ -30,7 +30,6 @@ SURFACE_POINTS = 4000  # on each scan
 NEAR = (
     0.03  # metres between the middles of a posed scan and the true one, without pixels
 )
-ALL = "all"  # the column of all folders
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,8 @@ class RealRun:
 
 
 def recognise_real(
-    folders: tuple[Path, ...],
+    folder: Path,
+    more: tuple[Path, ...] = (),
     /,
     out: Path = Path("real_frames.csv"),
     models: str = "ycb",
@@ -103,7 +103,8 @@ def recognise_real(
     of BOP, YCB-Video and GraspNet: docs/your_camera.md. An interrupted run resumes.
 
     Args:
-        folders: of frames, in any layout that nextview recognise reads.
+        folder: of frames, in any layout that nextview recognise reads.
+        more: further folders.
         out: file to write, .csv: a line for each thing and each object that was found.
         models: what is taught: a bundled collection, or a folder of nextview learn.
         intrinsics: FX FY CX CY in pixels, or a camera file; by default those in the folders.
@@ -127,10 +128,10 @@ def recognise_real(
     card, _ = open_memory(card_of(models))
     system = load(models)
     there = {
-        f"{folder}: {frame.name}": frame
-        for folder in folders
+        f"{each}: {frame.name}": frame
+        for each in (folder, *more)
         for frame in evenly(
-            real_frames(folder, intrinsics, depth_scale, first_label), frames
+            real_frames(each, intrinsics, depth_scale, first_label), frames
         )
     }
     depends = str((card.sha256, intrinsics, depth_scale, Path.cwd()))
@@ -147,11 +148,14 @@ def recognise_real(
             for row in compared(frame, answer, clouds)
         ]
         if not rows:
-            raise DatasetError(
-                f"{folders[0]}: no frame can be looked at{answers.why()}"
-            )
-        with new_file(out, overwrite) as new:
-            _write(new, rows)
+            raise DatasetError(f"{folder}: no frame can be looked at{answers.why()}")
+        with (
+            new_file(out, overwrite) as new,
+            new.open("w", newline="", encoding="utf-8") as file,
+        ):
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(field.name for field in fields(RealThing))
+            writer.writerows(map(astuple, rows))
     return RealRun(out, tuple(rows), answers.left_out)
 
 
@@ -269,14 +273,6 @@ def pixels_met(points: Float, intrinsics: Float, pixels: Mask) -> int:
     return int(pixels[rows[inside], columns[inside]].sum())
 
 
-def _write(path: Path, rows: Sequence[RealThing]) -> None:
-    """Write the table of all things."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(field.name for field in fields(RealThing))
-        writer.writerows(map(astuple, rows))
-
-
 def real_table(rows: Sequence[RealThing]) -> WrittenTable:
     """A table of what was right, with a column for each folder.
 
@@ -284,19 +280,17 @@ def real_table(rows: Sequence[RealThing]) -> WrittenTable:
         rows: of all things.
     """
     folders = list(dict.fromkeys(row.folder for row in rows))
-    columns = {
-        Path(folder).name: _figures([row for row in rows if row.folder == folder])
-        for folder in folders
-    }
+    groups = [[row for row in rows if row.folder == each] for each in folders]
+    headings = [Path(each).name for each in folders]
     if len(folders) > 1:
-        columns[ALL] = _figures(rows)
-    cells = zip(*(column.values() for column in columns.values()), strict=True)
-    names = next(iter(columns.values()))
+        groups.append(list(rows))
+        headings.append("all")
+    columns = [_figures(group) for group in groups]
     return WrittenTable(
         "in brackets: 95 % intervals (Wilson)",
         "",
-        ("each frame alone", *columns),
-        tuple((name, *cell) for name, cell in zip(names, cells, strict=True)),
+        ("each frame alone", *headings),
+        tuple((name, *(column[name] for column in columns)) for name in columns[0]),
     )
 
 
