@@ -1,4 +1,4 @@
-"""Real frames against what is known of them: three kinds of truth, and a run that goes on."""
+"""Real frames against what is known of them: several kinds of truth, and a run that goes on."""
 
 import csv
 import json
@@ -9,6 +9,7 @@ from bop_datasets import pose_as
 from factories import camera_over, meshes_of, view
 from lab_programs import main, refused
 from PIL import Image
+from scipy.io import savemat
 
 from nextview.errors import DatasetError
 from nextview_lab.benchmark.frame_answers import FoundObject, FrameAnswer
@@ -84,6 +85,24 @@ def posed(seen, tmp_path):
     return folder
 
 
+@pytest.fixture
+def video(seen, tmp_path):
+    """The same frame in the layout of YCB-Video, with labels; only the taught things have names."""
+    depth, matrix, labels, poses = seen
+    folder = tmp_path / "video"
+    folder.mkdir()
+    Image.fromarray(depth).save(folder / "000001-depth.png")
+    Image.fromarray(labels).save(folder / "000001-label.png")
+    camera = {"intrinsic_matrix": matrix, "factor_depth": 1000.0}
+    of_labels = {
+        "cls_indexes": np.arange(1, len(poses) + 1)[:, None],
+        "poses": np.stack([pose[:3] for pose in poses.values()], axis=2),
+    }
+    savemat(folder / "000001-meta.mat", camera | of_labels)
+    (folder / "names.txt").write_text(" ".join(["none", *NAMES[:2]]))
+    return folder
+
+
 def said(poses, **shifts):
     """Confident names of the taught things, some of them shifted along x, metres."""
     found = []
@@ -95,7 +114,7 @@ def said(poses, **shifts):
     return FrameAnswer(tuple(found), 0.5, 0.4)
 
 
-@pytest.mark.parametrize("truth", ["labelled", "pointed", "posed"])
+@pytest.mark.parametrize("truth", ["labelled", "pointed", "posed", "video"])
 def test_what_is_right_by_each_kind_of_truth(truth, seen, clouds, request):
     (frame,) = real_frames(request.getfixturevalue(truth))
     assert frame.read().pose is None
@@ -103,6 +122,8 @@ def test_what_is_right_by_each_kind_of_truth(truth, seen, clouds, request):
 
     rows = compared(frame, said(seen[3]), clouds)
     assert [row.name for row in rows if row.right] == list(TAUGHT)
+    known = [row.add_s is not None for row in rows if row.right]
+    assert known == [truth != "pointed"] * 2
     assert {row.thing for row in rows if row.taught} == set(TAUGHT)
     # no name was given to the banana, if anything is known of it
     assert sum(not row.taught for row in rows) == (truth != "pointed")
