@@ -114,6 +114,21 @@ def said(poses, **shifts):
     return FrameAnswer(tuple(found), 0.5, 0.4)
 
 
+def test_frames_without_poses_are_read_from_one_folder(seen, tmp_path):
+    depth, matrix, labels, _ = seen
+    for name in ("a", "b"):
+        for kind, image in (("depth", depth), ("labels", labels)):
+            (tmp_path / kind).mkdir(exist_ok=True)
+            Image.fromarray(image).save(tmp_path / kind / f"{name}.png")
+    camera = {"K": matrix.ravel().tolist(), "depth_scale": 0.001}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    frames = real_frames(tmp_path)
+    assert [frame.name for frame in frames] == ["a", "b"]
+    # without names the things are strangers
+    assert [one.name for one in frames[1].things()] == [""] * 3
+    assert len(real_frames(tmp_path, first_label=2)[1].things()) == 2
+
+
 @pytest.mark.parametrize("truth", ["labelled", "pointed", "posed", "video"])
 def test_what_is_right_by_each_kind_of_truth(truth, seen, clouds, request):
     (frame,) = real_frames(request.getfixturevalue(truth))

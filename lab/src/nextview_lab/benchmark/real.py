@@ -107,8 +107,8 @@ def recognise_real(
         more: further folders.
         out: file to write, .csv: a line for each thing and each object that was found.
         models: what is taught: a bundled collection, or a folder of nextview learn.
-        intrinsics: FX FY CX CY in pixels, or a camera file; by default those in the folders.
-        depth_scale: metres a step of the depth images; by default that in the folders.
+        intrinsics: FX FY CX CY in pixels, or a camera file, for folders that have none.
+        depth_scale: metres a step of the depth images, for folders that do not tell it.
         first_label: smallest number of a thing in images of labels, such as 2 in OCID.
         frames: number of frames of each folder, evenly spread, for a first try; by default all.
         overwrite: replace OUT.

@@ -1,9 +1,9 @@
 """Frames of depth cameras, and what is known of the things in them.
 
-Frames are read in every layout of ``nextview.captured``, and from folders that hold for each frame
-a folder with depth.png and K.json ([fx, fy, cx, cy], the middle of the first pixel at 0;
-scale.json has metres a step, if it is not a millimetre), or files NAME.depth.png. The truth is in
-whichever of these is there:
+Frames are read in every layout of ``nextview.captured``; depth/NAME.png and clouds need no poses
+here. Further layouts are files NAME.depth.png, and for each frame a folder with depth.png and
+K.json ([fx, fy, cx, cy], the middle of the first pixel at 0; scale.json has metres a step, if it is
+not a millimetre). The truth is in whichever of these is there:
 
 | file | what is known |
 |---|---|
@@ -41,7 +41,13 @@ from nextview.captured.bop_scene import (
     read_bop_cameras,
     read_bop_objects,
 )
-from nextview.captured.folders import Intrinsics, read_capture
+from nextview.captured.depth_folder import CAMERA_FILES, CAMERA_TABLES
+from nextview.captured.folders import (
+    INTRINSICS,
+    LAYOUT_MARKS,
+    Intrinsics,
+    read_capture,
+)
 from nextview.captured.frames import (
     MILLIMETRES,
     CapturedFrame,
@@ -64,6 +70,7 @@ LABELS = (
     "{}-label.png",
     "{}/labels.png",
 )
+FRAMES = ("*/depth.png", "*.depth.png", "depth/*.png", "pcd/*.pcd", "*.pcd")
 METAS = ("{}-meta.mat", "meta/{}.mat")
 CAMERA, SCALE, TRUTH, NAMES = "K.json", "scale.json", "truth.json", "names.txt"
 
@@ -164,26 +171,31 @@ def _captured(
     intrinsics: Intrinsics,
     scale: float | None,
 ) -> Sequence[CapturedFrame]:
-    """The frames of a folder that is no scene of BOP."""
-    single = {path.parent.name: path for path in sorted(folder.glob("*/depth.png"))}
-    if not single and not next(folder.glob("frame-*.depth.png"), None):
-        files = sorted(folder.glob("*.depth.png"))
-        single = {path.name.removesuffix(".depth.png"): path for path in files}
-    if not single:
+    """The frames of a folder that is no scene of BOP; their poses are not needed."""
+    marked = any(next(folder.glob(mark), None) for mark in LAYOUT_MARKS.values())
+    several = () if marked else map(sorted, map(folder.glob, FRAMES))
+    paths = next(filter(None, several), [])
+    if not paths:
         return read_capture(folder, intrinsics, depth_scale=scale).frames
+
+    names = (*CAMERA_FILES, *CAMERA_TABLES, INTRINSICS)
+    described = [folder / name for name in names if (folder / name).exists()]
     found = []
-    for name, path in single.items():
+    for path in paths:
         camera, steps = path.with_name(CAMERA), path.with_name(SCALE)
-        given = intrinsics
+        given: Intrinsics = described[0] if described else intrinsics
         if camera.exists():
             what = "fx, fy, cx, cy"
             fx, fy, cx, cy = read_record(camera, FourNumbers, what, DatasetError)
             given = fx, fy, cx, cy
-        step = MILLIMETRES if scale is None else scale
+        step = scale
         if steps.exists():
             step = read_record(steps, float, "metres a step", DatasetError)
+        elif scale is None and isinstance(given, tuple) and path.suffix == ".png":
+            step = MILLIMETRES
         (frame,) = read_capture(path, given, depth_scale=step).frames
-        found.append(replace(frame, name=name))
+        name = path.stem.removesuffix(".depth")
+        found.append(replace(frame, name=path.parent.name if name == "depth" else name))
     return found
 
 
@@ -256,7 +268,8 @@ def _bop_things(
         pose: Float | None = None
         if one.cam_R_m2c is not None and one.cam_t_m2c is not None:
             where = f"{files.object_file}: image {captured.name}"
-            pose = np.linalg.inv(camera_to_world(one.cam_R_m2c, one.cam_t_m2c, where))
+            to_model = camera_to_world(one.cam_R_m2c, one.cam_t_m2c, where)
+            pose = np.asarray(np.linalg.inv(to_model), np.float64)
         mask = files.mask(captured.name, [row])
         pixels = None if mask is None else _numbers(mask, captured) > 0
         name = _named(one.obj_id, names) or f"obj_{one.obj_id:06d}"
