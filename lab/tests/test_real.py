@@ -15,6 +15,7 @@ from nextview.errors import DatasetError
 from nextview_lab.benchmark.frame_answers import FoundObject, FrameAnswer
 from nextview_lab.benchmark.real import compared, recognise_real
 from nextview_lab.data.real_frames import Told, real_frames, write_frames
+from nextview_lab.studies.confidence import NAMED, RIGHT, shares
 
 NAMES = ("mug", "cracker_box", "banana")
 TAUGHT = NAMES[:2]  # nobody taught the banana
@@ -193,6 +194,10 @@ def test_a_table_of_all_things_and_a_run_that_goes_on(
     right = [row for row in rows if row["right"] == "True" and row["named"] == "True"]
     assert {row["frame"] for row in right} == {"first", "000007"}
     assert all(float(row["add_s"]) < 10 for row in right)
+    by_belief = shares(out)
+    assert sum(count for count, _ in by_belief[RIGHT]) == len(right)
+    # the banana that has no name
+    assert {total for _, total in by_belief[NAMED]} == {1}
     assert not list(tmp_path.glob(".*"))
 
 
