@@ -3,12 +3,10 @@
     python -m benchmarks.gate [DATA] [--out FILE] [--against FILE] [--only PART ...] [--quick]
 
 DATA, by default the environment variable NEXTVIEW_DATA, holds the scans of the bundled memory,
-YCB/NAME.ply, in metres, and three folders of real frames: real_taught and real_tables have a folder
-a frame, with depth.png (uint16, millimetres; scale.json has metres a step, if it is another one)
-and K.json (fx, fy, cx, cy, the middle of the first pixel at 0), and real_taught has truth.json, for
-each frame its things as {"name", "column", "row"}; real_ycb has NAME.depth.png, NAME.labels.png
-and names.txt, a line for each label. All other frames are drawn once by ``benchmarks.gate_frames``
-and kept in the folder ``--frames``. Only the public interface of nextview is used.
+YCB/NAME.ply, in metres, and three folders of real frames, real_taught, real_ycb and real_tables,
+that ``nextview_lab.data.real_frames`` reads. All other frames are drawn once by
+``benchmarks.gate_frames`` and kept in the folder ``--frames``. Only the public interface of
+nextview is used.
 
 | part | what |
 |---|---|
@@ -47,7 +45,6 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.spatial import cKDTree
 
 import nextview
@@ -65,6 +62,14 @@ from benchmarks.gate_frames import (
     scan,
 )
 from nextview.sensing import Frame
+from nextview_lab.benchmark.real import pixels_met
+from nextview_lab.data.real_frames import (
+    RealFrame,
+    Shot,
+    Told,
+    real_frames,
+    write_frames,
+)
 
 Part = Literal["tables", "single", "parts", "moves", "places", "real", "counts"]
 Row = dict[str, Any]
@@ -73,10 +78,11 @@ Shapes = dict[str, tuple[Float, Float]]  # points on each scan and normals there
 
 IN_VIEW = 500  # pixels of a thing, from which on it counts
 NEAR = 0.03  # metres from the true middle
-PIXELS_NEAR = 8  # of a given pixel in a real frame
-LEAST_LABEL = 200  # pixels of a label in a real frame
-REAL_YCB = np.array([[618.017, 0, 312.377], [0, 618.003, 232.375], [0, 0, 1]])
-REAL_TABLES = 12  # frames
+REAL = {  # folder: what is in it, intrinsics that it does not hold, and how many frames
+    "real_taught": ("taught", None, 5),
+    "real_ycb": ("labelled", (618.017, 618.003, 312.377, 232.375), 2),
+    "real_tables": ("none taught", None, 12),
+}
 CHANGED = 3  # number of the first frame after a move
 SPREAD = ("mm", "seconds")  # columns of which median and worst are shown
 
@@ -306,69 +312,48 @@ def moves(bench: Bench) -> Iterator[Row]:
 def real(bench: Bench) -> Iterator[Row]:
     """Real frames, each alone and without a pose."""
     system, shapes = bench.taught()
-    for group, name, frame, things in real_frames(bench):
+    for group, seen in real_cases(bench):
         scene = nextview.Scene(system, up=None)
-        cost = updated(scene, frame)[1]
+        cost = updated(scene, seen.read())[1]
         judged = []
-        left = dict(things)
+        left = {
+            one.name: one.pixels
+            for one in seen.things()
+            if one.name and one.pixels is not None
+        }
+        known = set(left)
         for one in named_in(scene):
-            right = one.name in left and meets(one, left[one.name], frame, shapes)
-            judged.append((one, right))
+            points = moved(shapes[one.name][0], one.pose)
+            right = one.name in left and pixels_met(
+                points, seen.captured.intrinsics, left[one.name]
+            )
+            judged.append((one, bool(right)))
             if right:
                 del left[one.name]
-        yield {"group": group, "case": name, **row_of(set(things), judged), **cost}
+        yield {"group": group, "case": seen.name, **row_of(known, judged), **cost}
 
 
-def real_frames(bench: Bench) -> Iterator[tuple[str, str, Frame, dict[str, Mask]]]:
-    """Group, name, frame, and some of the pixels of each taught thing in it."""
-    taught, labelled, untaught = (
-        bench.data / name for name in ("real_taught", "real_ycb", "real_tables")
-    )
-    truth = json.loads((taught / "truth.json").read_text())
-    for name in sorted(truth)[:: bench.every]:
-        frame = frame_in(taught / name)
-        places = {one["name"]: (one["row"], one["column"]) for one in truth[name]}
-        rows, columns = np.indices(frame.depth.shape)
-        things = {
-            thing: np.hypot(rows - row, columns - column) <= PIXELS_NEAR
-            for thing, (row, column) in places.items()
-        }
-        yield "taught", name, frame, things
-
-    names = (labelled / "names.txt").read_text().split()
-    for path in sorted(labelled.glob("*.depth.png"))[:: bench.every]:
-        labels = np.asarray(Image.open(str(path).replace("depth", "labels")))
-        things = {name: labels == number for number, name in enumerate(names) if number}
-        things = {name: own for name, own in things.items() if own.sum() >= LEAST_LABEL}
-        yield (
-            "labelled",
-            path.stem,
-            Frame(np.asarray(Image.open(path)), REAL_YCB),
-            things,
-        )
-
-    files = sorted(untaught.glob("*/depth.png"))
-    for path in files[:: len(files) // REAL_TABLES][: REAL_TABLES : bench.every]:
-        yield "none taught", path.parent.name, frame_in(path.parent), {}
+def real_cases(bench: Bench) -> Iterator[tuple[str, RealFrame]]:
+    """Real frames, each with its group."""
+    for folder, (group, camera, most) in REAL.items():
+        frames = real_frames(bench.data / folder, camera)
+        for seen in frames[:: max(1, len(frames) // most)][: most : bench.every]:
+            yield group, seen
 
 
-def frame_in(folder: Path) -> Frame:
-    """The frame in a folder, without a pose."""
-    fx, fy, cx, cy = json.loads((folder / "K.json").read_text())
-    depth = np.asarray(Image.open(folder / "depth.png"))
-    scale = folder / "scale.json"
-    if scale.exists():
-        depth = depth.astype(np.float32) * json.loads(scale.read_text())
-    return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-
-
-def meets(one: Any, pixels: Mask, frame: Frame, shapes: Shapes) -> bool:
-    """Whether a posed scan shows in some of the pixels of a frame without a pose."""
-    seen = moved(shapes[one.name][0], one.pose) @ frame.intrinsics.T
-    columns, rows = np.floor(seen[:, :2] / seen[:, 2:]).astype(int).T
-    height, width = pixels.shape
-    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    return bool(pixels[rows[inside], columns[inside]].any())
+def write_tables(bench: Bench, folder: Path) -> None:
+    """Write the frames of all tables as ``nextview-lab real`` reads them."""
+    shots: dict[str, Shot] = {}
+    for name, seen in bench.cases("tables"):
+        told = [
+            Told(name="" if thing.startswith(STRANGER) else thing, label=number)
+            for number, thing in enumerate(seen.names.tolist(), 1)
+        ]
+        for frame, (depth, labels) in enumerate(
+            zip(seen.depth, seen.labels, strict=True)
+        ):
+            shots[f"{name}, {frame}"] = depth, labels, told
+    write_frames(folder, INTRINSICS, shots)
 
 
 def counts(bench: Bench) -> Iterator[Row]:
@@ -490,6 +475,7 @@ def main(
     only: tuple[Part, ...] = (),
     quick: bool = False,
     frames: Path = Path("~/.cache/nextview/gate"),
+    write_to: Path | None = None,
 ) -> None:
     """Measure all parts, and print a table for each.
 
@@ -500,8 +486,12 @@ def main(
         only: parts to measure.
         quick: measure a third of the cases.
         frames: folder of the drawn frames.
+        write_to: write the frames of the tables to this folder, and measure nothing.
     """
     bench = Bench(data, frames.expanduser(), 3 if quick else 1)
+    if write_to is not None:
+        write_tables(bench, write_to)
+        return
     kept, other = (
         run_in(out if out and out.exists() else None, quick),
         run_in(against, quick),

@@ -78,7 +78,9 @@ TOLERANCE = (
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"lmo": "needs a dataset of BOP: lab/tests/test_bop.py writes one and runs it",
-    r"benchmarks\.gate|studies\.segmentation": "needs scans and real frames, which are not here",
+    r"benchmarks\.gate|studies\.(segmentation|confidence|distances)|^nextview-lab real": (
+        "needs scans and real frames, which are not here: lab/tests/test_real.py writes some"
+    ),
     r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
@@ -780,6 +782,7 @@ PICTURES = {
 SLOW = r"YCB|ModelNet10|examples/|explorer_pictures"  # made only with --data
 SLOW_LIMIT = 7200  # seconds for one of them
 NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
+    "confidence.png": "needs real frames, which are not here",
     "measures.png": "drawn by an earlier version of nextview_lab.thesis.measure_study",
     "picking.gif": "drawn by an earlier version, whose script is gone",
 }

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 """Of the repository."""
 
 sys.path.insert(0, str(ROOT))
-from nextview_lab.studies.shared import wilson
+from nextview_lab.benchmark.statistics import wilson
 
 PARTS = {"README.md": ("measured", "citation")}
 """What a page repeats."""

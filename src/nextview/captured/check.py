@@ -117,13 +117,15 @@ def _evenly_spread(capture: Capture) -> list[int]:
     moments = capture.moments
     # so many frames are compared with each other
     most = max(1, 60 // len(capture.cameras))
-    names = {frame.name for k in _spread(len(moments), most) for frame in moments[k]}
+    names = {
+        frame.name for k in evenly_spread(len(moments), most) for frame in moments[k]
+    }
     if capture.stands:
         names |= {frame.name for frame in max(moments, key=len)}
     return [i for i, frame in enumerate(capture.frames) if frame.name in names]
 
 
-def _spread(count: int, most: int) -> Index:
+def evenly_spread(count: int, most: int) -> Index:
     """Return evenly spaced numbers below a count."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
@@ -258,7 +260,7 @@ def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
 
 def _some(posed: PosedViews) -> PosedViews:
     """Return frames among which a search is fast."""
-    rows = _spread(len(posed.views), 20)
+    rows = evenly_spread(len(posed.views), 20)
     return PosedViews([posed.views[row] for row in rows], posed.poses[rows])
 
 
@@ -422,6 +424,6 @@ def errors_of_cameras(capture: Capture) -> list[CameraOffset]:
     return camera_offsets(
         [
             [captured.read(masked=False) for captured in moments[k]]
-            for k in _spread(len(moments), 6)  # a second each
+            for k in evenly_spread(len(moments), 6)  # a second each
         ]
     )

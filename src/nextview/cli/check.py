@@ -3,9 +3,13 @@
 from pathlib import Path
 
 from nextview.captured.check import check_capture, errors_of_cameras
+from nextview.captured.depth_quality import DepthQuality, quality_of
 from nextview.captured.folders import read_capture
-from nextview.cli.common_options import check_there
+from nextview.cli.common_options import check_file, check_there
 from nextview.cli.progress import console
+from nextview.files import new_file
+
+GUIDES = {"die": 1.6, "golf ball": 4.3, "mug": 9.0, "bottle": 25.0}  # centimetres
 
 
 def check(
@@ -13,12 +17,16 @@ def check(
     /,
     intrinsics: tuple[float, float, float, float] | Path | None = None,
     depth_scale: float | None = None,
+    figure: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Check captured frames, and the poses of their cameras.
+    """Check captured frames, their depth, and the poses of their cameras.
 
-    Captured frames are compared with each other: wrong poses, units and axes are named. If several
-    cameras took them, the error of the pose of each camera is estimated from the surfaces that it
-    sees in common with others, relative to the first camera by name.
+    Captured frames are compared with each other: wrong poses, units and axes are named. Of each
+    camera it is told how noisy its depth is, by how much it is too long or too short, and which
+    things can be told apart at which distance. If several cameras took the frames, the error of
+    the pose of each camera is estimated from the surfaces that it sees in common with others,
+    relative to the first camera by name.
 
     The exit status is 2 if the frames contradict each other.
 
@@ -28,18 +36,30 @@ def check(
             from the folder.
         depth_scale: metres per unit of the depth images, such as 0.001 for
             millimetres; by default read from the folder.
+        figure: draw which things the first camera can tell apart at which
+            distance, PNG.
+        overwrite: replace it.
     """
     check_there(path)
+    check_file(figure, overwrite)
     read = read_capture(path, intrinsics, depth_scale=depth_scale)
     console.print(f"{read!r}", soft_wrap=True)
     capture, left_out = check_capture(read, masked=False)
     for name, reason in left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
-    console.print(
-        f"{capture.folder}: {len(capture.frames)} frames contradict each other nowhere",
-        soft_wrap=True,
-    )
+    if len(capture.frames) > 1:
+        console.print(
+            f"{capture.folder}: {len(capture.frames)} frames contradict each other nowhere",
+            soft_wrap=True,
+        )
     cameras = capture.cameras
+    for camera in cameras:
+        quality = quality_of(capture, camera)
+        for sentence in quality.sentences():
+            said = f"camera {camera}: {sentence}" if camera else sentence
+            console.print(said, soft_wrap=True)
+        if figure is not None and camera == cameras[0]:
+            _draw(quality, figure, overwrite)
     if len(cameras) < 2:
         return
 
@@ -63,3 +83,41 @@ def check(
                 style="yellow",
                 soft_wrap=True,
             )
+
+
+def _draw(quality: DepthQuality, path: Path, overwrite: bool) -> None:
+    """Draw which things can be told apart at which distance."""
+    from nextview.session.style import (  # slow to import
+        ACCENT,
+        BLUE,
+        GREY,
+        legend,
+        new_figure,
+        to_png,
+    )
+
+    figure, axes = new_figure(5.6, 3.6)
+    for size, colour, label in (
+        (quality.smallest(), BLUE, "smallest thing that gets a name"),
+        (quality.detail(), ACCENT, "smallest difference"),
+    ):
+        axes.plot(quality.depths, 100 * size, "o-", color=colour, label=label)
+    axes.set_yscale("log")
+    axes.set_ylim(0.05, 50)
+    axes.set_yticks([0.1, 1, 10], ["1 mm", "1 cm", "10 cm"])
+    axes.minorticks_off()
+    for name, guide in GUIDES.items():
+        axes.axhline(guide, color=GREY, linewidth=0.8, linestyle=":")
+        axes.annotate(
+            name,
+            (0, guide),
+            (3, 2),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            color=GREY,
+            fontsize=8.5,
+        )
+    axes.set_xlabel("distance, m")
+    legend(axes)
+    with new_file(path, overwrite) as part:
+        to_png(figure, part)

@@ -142,6 +142,7 @@ LAB = (
     "evaluate",
     "benchmark",
     "bop",
+    "real",
     "submit",
     "leaderboard",
     "report",

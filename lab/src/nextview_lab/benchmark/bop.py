@@ -3,10 +3,9 @@
 import csv
 import hashlib
 import re
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
@@ -15,32 +14,31 @@ from msgspec import Struct
 
 from nextview.captured.bop_scene import (
     EVERY_SCENE_CAMERAS,
-    BopCamera,
     BopFiles,
     bop_files,
     camera_to_world,
     read_bop_cameras,
 )
-from nextview.captured.frames import MILLIMETRES, CapturedFrame, DepthFile
+from nextview.captured.frames import MILLIMETRES, CapturedFrame
 from nextview.checks import one_line
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, ObservationError, UsageError
-from nextview.files import (
-    check_new,
-    new_file,
-    only_one,
-    read_record,
-    unfinished,
-    write_record,
-)
-from nextview.scene.scene import Scene
-from nextview.session.system import System, load
-from nextview.teaching.learn import CARD
+from nextview.errors import DatasetError, NextviewError, UsageError
+from nextview.files import check_new, new_file, only_one, read_record, unfinished
+from nextview.sensing.frame import Frame
+from nextview.session.system import load
 from nextview.things.memory import open_memory
-from nextview.types import Float
+from nextview_lab.benchmark.frame_answers import (
+    FoundObject,
+    FrameAnswer,
+    FrameAnswers,
+    card_of,
+    evenly,
+)
+from nextview_lab.data.real_frames import bop_frame
 
 MODELS_FOLDER = "models"
 TARGETS_FILES = ("test_targets_bop19.json", "test_targets_bop24.json")
+_cameras = cache(read_bop_cameras)
 MODEL_NAME = re.compile(r"obj_0*(\d+)")
 
 
@@ -68,22 +66,6 @@ class BopImage:
 
 
 @dataclass(frozen=True)
-class BopScene:
-    """A scene, as yet unread.
-
-    Attributes:
-        files: of the camera that is used.
-    """
-
-    files: BopFiles
-
-    @cached_property
-    def cameras(self) -> dict[int, BopCamera]:
-        """By the numbers of the images; a DatasetError if they cannot be read."""
-        return read_bop_cameras(self.files)
-
-
-@dataclass(frozen=True)
 class BopDataset:
     """A dataset whose images are as yet unread.
 
@@ -91,29 +73,13 @@ class BopDataset:
         folder: the whole of it.
         models: mesh file of each model, by its number.
         images: that are looked at, in order, each once.
-        scenes: that they are of, by their numbers.
+        scenes: files of the cameras of those that they are of, by their numbers.
     """
 
     folder: Path
     models: dict[int, Path]
     images: tuple[BopImage, ...]
-    scenes: dict[int, BopScene]
-
-    def camera(self, image: BopImage) -> BopCamera:
-        """The camera of an image.
-
-        Args:
-            image: one of ``images``.
-
-        Raises:
-            DatasetError: it is not known.
-        """
-        scene = self.scenes[image.scene]
-        if image.image not in scene.cameras:
-            raise DatasetError(
-                f"{scene.files.camera_file}: has no camera of the image {image.image}"
-            )
-        return scene.cameras[image.image]
+    scenes: dict[int, BopFiles]
 
     def frame(self, image: BopImage, in_world: bool = False) -> CapturedFrame:
         """A depth image, as yet unread.
@@ -126,9 +92,13 @@ class BopDataset:
         Raises:
             DatasetError: its camera is not known.
         """
-        files = self.scenes[image.scene].files
-        camera = self.camera(image)
-        pose = np.eye(4)
+        files = self.scenes[image.scene]
+        camera = _cameras(files).get(image.image)
+        if camera is None:
+            raise DatasetError(
+                f"{files.camera_file}: has no camera of the image {image.image}"
+            )
+        pose = None
         if in_world:
             where = f"image {image.image} of {files.camera_file}"
             if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
@@ -137,16 +107,7 @@ class BopDataset:
                     " --camera-poses"
                 )
             pose = camera_to_world(camera.cam_R_w2c, camera.cam_t_w2c, where)
-
-        name = f"{image.image:06d}"
-        return CapturedFrame(
-            image.name,
-            DepthFile(files.depth(name)),
-            camera.depth_scale * MILLIMETRES,
-            camera.intrinsics,
-            pose,
-            image=files.picture(name),
-        )
+        return replace(bop_frame(files, camera, image.image, pose), name=image.name)
 
 
 def read_bop_dataset(
@@ -219,7 +180,7 @@ def _scenes(
     split: str,
     numbers: set[int],
     camera: str | None,
-) -> dict[int, BopScene]:
+) -> dict[int, BopFiles]:
     """The scenes of some numbers in a split."""
     if Path(split).name != split:
         raise UsageError(f"--split is the name of a folder of {folder}, not {split!r}")
@@ -243,7 +204,7 @@ def _scenes(
             raise DatasetError(
                 f"{scene}: has depth images of several cameras: --camera names one of {named}"
             )
-        scenes[number] = BopScene(files[0])
+        scenes[number] = files[0]
     return scenes
 
 
@@ -281,39 +242,6 @@ class BopOptions:
     camera_poses: bool = False
 
 
-class FoundPose(msgspec.Struct, frozen=True):
-    """A model that was found in an image.
-
-    Attributes:
-        model: its number.
-        score: belief that it is this one, 0 to 1.
-        pose: of the model in the camera, (3, 4) row by row, millimetres.
-    """
-
-    model: int
-    score: float
-    pose: tuple[float, ...]
-
-    @property
-    def matrix(self) -> Float:
-        """The pose, (4, 4) float64, millimetres."""
-        return np.vstack([np.reshape(self.pose, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-
-
-class FoundInImage(msgspec.Struct, frozen=True):
-    """What was found in an image.
-
-    Attributes:
-        poses: of all things that were named.
-        seconds: that it took to read the image and to look at it.
-        others: names of things that were found and are no models of the dataset.
-    """
-
-    poses: tuple[FoundPose, ...]
-    seconds: float
-    others: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True)
 class BopRun:
     """What was found in a dataset.
@@ -330,7 +258,7 @@ class BopRun:
 
     out: Path
     images: int
-    left_out: dict[str, str]
+    left_out: dict[str, NextviewError]
     poses: int
     seconds: float
     others: dict[str, int]
@@ -371,48 +299,51 @@ def look_for_models(
     check_new(out, overwrite)
     if out.suffix.lower() != ".csv":
         raise UsageError(f"{out}: the name ends in .csv")
-    if how.frames is not None and how.frames < 1:
-        raise UsageError(f"at least one frame is looked at, not {how.frames}")
     read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
-    images = _evenly(read.images, how.frames)
+    images = evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
     numbers = _numbers_of_things(how.models, given, read)
     system = load(how.models)
 
-    left_out: dict[str, str] = {}
+    up = np.array(UPWARDS) if how.camera_poses else None
     with only_one(out), unfinished(out, _key(read, how)) as parts:
-        looks = _looks(read, images, system, numbers, how.camera_poses, parts, left_out)
-        track(looks, len(images), "images")
+        answers = FrameAnswers(parts, system, up)
+        reads = {image.name: partial(_frame, read, image, how) for image in images}
+        track(answers.look_at(reads), len(images), "images")
         found = {
-            image: _part(parts, image)
+            image: answer
             for image in images
-            if _part_file(parts, image).exists()
+            if (answer := answers[image.name]) is not None
         }
         if not found:
-            raise DatasetError(
-                f"{dataset}: no image can be looked at: {next(iter(left_out.values()))}"
-            )
+            raise DatasetError(f"{dataset}: no image can be looked at{answers.why()}")
+        lines = {
+            image: [one for one in answer.objects if one.named and one.name in numbers]
+            for image, answer in found.items()
+        }
         with new_file(out, overwrite) as new:
-            _write(new, found)
+            _write(new, found, lines, numbers)
 
-    names = [name for one in found.values() for name in one.others]
+    others = [
+        one.name
+        for answer in found.values()
+        for one in answer.objects
+        if one.named and one.name not in numbers
+    ]
     return BopRun(
         out,
         len(found),
-        left_out,
-        sum(len(one.poses) for one in found.values()),
+        answers.left_out,
+        sum(map(len, lines.values())),
         float(np.mean([one.seconds for one in found.values()])),
-        {name: names.count(name) for name in sorted(set(names))},
+        {name: others.count(name) for name in sorted(set(others))},
         tuple(sorted(set(read.models) - set(numbers.values()))),
     )
 
 
-def _evenly(images: Sequence[BopImage], most: int | None) -> tuple[BopImage, ...]:
-    """At most so many images, evenly spread."""
-    if most is None or most >= len(images):
-        return tuple(images)
-    few = np.unique(np.linspace(0, len(images) - 1, most).round().astype(int))
-    return tuple(images[row] for row in few)
+def _frame(dataset: BopDataset, image: BopImage, how: BopOptions) -> Frame:
+    """Read an image."""
+    return dataset.frame(image, how.camera_poses).read(masked=False)
 
 
 def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
@@ -441,7 +372,7 @@ def _numbers_of_things(
     dataset: BopDataset,
 ) -> dict[str, int]:
     """The number of each thing that is a model of the dataset, by its name."""
-    card, _ = open_memory(_card_of(memory))
+    card, _ = open_memory(card_of(memory))
     assert card.memory is not None
     things = [thing.name for thing in card.memory.things]
     for name in given:
@@ -471,14 +402,9 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(one_line(name) for name in names[:MOST_NAMED]) + more
 
 
-def _card_of(memory: str) -> Path | str:
-    """The card of a memory that is named, or given as a folder."""
-    return Path(memory) / CARD if Path(memory).is_dir() else memory
-
-
 def _key(dataset: BopDataset, how: BopOptions) -> str:
     """What the part of each image depends on."""
-    card, _ = open_memory(_card_of(how.models))
+    card, _ = open_memory(card_of(how.models))
     depends = [
         str(dataset.folder.resolve()),
         how.split,
@@ -490,90 +416,29 @@ def _key(dataset: BopDataset, how: BopOptions) -> str:
     return hashlib.sha256(msgspec.json.encode(depends)).hexdigest()
 
 
-def _part_file(parts: Path, image: BopImage) -> Path:
-    return parts / f"{image.scene:06d}-{image.image:06d}.json"
-
-
-def _part(parts: Path, image: BopImage) -> FoundInImage:
-    what = "what was found in an image"
-    return read_record(_part_file(parts, image), FoundInImage, what, DatasetError)
-
-
-def _looks(
-    dataset: BopDataset,
-    images: Sequence[BopImage],
-    system: System,
-    numbers: dict[str, int],
-    in_world: bool,
-    parts: Path,
-    left_out: dict[str, str],
-) -> Iterator[int]:
-    """Look at each image that is not done, and write what is found; yields how many are done."""
-    for done, image in enumerate(images, 1):
-        if not _part_file(parts, image).exists():
-            try:
-                found = _look(dataset, image, system, numbers, in_world)
-            except (DatasetError, ObservationError) as error:
-                left_out[image.name] = str(error)
-            else:
-                write_record(_part_file(parts, image), found)
-        yield done
-
-
-def _look(
-    dataset: BopDataset,
-    image: BopImage,
-    system: System,
-    numbers: dict[str, int],
-    in_world: bool,
-) -> FoundInImage:
-    """Look at one image.
-
-    Raises:
-        DatasetError: a file is missing or damaged.
-        ObservationError: it shows no plane, or nothing.
-    """
-    begun = time.perf_counter()
-    captured = dataset.frame(image, in_world)
-    scene = Scene(system, UPWARDS if in_world else None)
-    scene.update(captured.read())
-    to_camera = np.linalg.inv(captured.pose)
-
-    poses = []
-    others = []
-    for thing in scene.objects:
-        name = thing.name
-        pose = thing.pose
-        if pose is None:
-            continue
-        if name not in numbers:
-            others.append(name)
-            continue
-        in_camera = (to_camera @ pose)[:3]
-        in_camera[:, 3] /= MILLIMETRES
-        flat = tuple(in_camera.ravel().tolist())
-        poses.append(FoundPose(numbers[name], thing.confidence, flat))
-    seconds = time.perf_counter() - begun
-    return FoundInImage(tuple(poses), seconds, tuple(others))
-
-
-def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
+def _write(
+    path: Path,
+    found: Mapping[BopImage, FrameAnswer],
+    lines: Mapping[BopImage, Sequence[FoundObject]],
+    numbers: Mapping[str, int],
+) -> None:
     """Write the file of results: all lines of an image have one time, as bop_toolkit checks."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(BOP_COLUMNS)
 
-        for image, one in found.items():
-            for pose in one.poses:
-                matrix = pose.matrix
+        for image, answer in found.items():
+            for one in lines[image]:
+                rotation = one.matrix[:3, :3].ravel()
+                shift = one.matrix[:3, 3] / MILLIMETRES
                 writer.writerow(
                     [
                         image.scene,
                         image.image,
-                        pose.model,
-                        f"{pose.score:.6f}",
-                        " ".join(f"{value:.9f}" for value in matrix[:3, :3].ravel()),
-                        " ".join(f"{value:.6f}" for value in matrix[:3, 3]),
-                        f"{one.seconds:.6f}",
+                        numbers[one.name],
+                        f"{one.belief:.6f}",
+                        " ".join(f"{value:.9f}" for value in rotation),
+                        " ".join(f"{value:.6f}" for value in shift),
+                        f"{answer.seconds:.6f}",
                     ]
                 )

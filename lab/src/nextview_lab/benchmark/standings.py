@@ -10,7 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import binomtest
 
 from nextview.checks import number_of, one_line, whole
 from nextview.data.progress import TrackProgress, silently
@@ -480,9 +479,7 @@ def _with_interval(number: tuple[float, float, float], things: int) -> str:
     """
     value, low, high = number
     if value in (0, 1):
-        agreed = binomtest(int(value) * things, things).proportion_ci(method="wilson")
-        low = agreed.low
-        high = agreed.high
+        low, high = st.wilson(int(value) * things, things)
     return f"{value:.3f} ({low:.3f} to {high:.3f})"
 
 

@@ -6,6 +6,7 @@ Objects are resampled, because the views and runs of one object are not independ
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.stats import binomtest
 
 from nextview.types import Float, Index
 from nextview_lab.data import metrics
@@ -177,3 +178,14 @@ def holm(p: Float) -> Float:
         np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)),
     )
     return adjusted
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % Wilson interval of a share.
+
+    Args:
+        count: of what has a property.
+        total: of all.
+    """
+    low, high = binomtest(count, total).proportion_ci(method="wilson")
+    return float(low), float(high)

@@ -1,7 +1,7 @@
 """Print the results of benchmarks and evaluations as tables in the terminal."""
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from math import isfinite
 from typing import Any
@@ -24,6 +24,7 @@ from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant
 from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import Number, numbers
+from nextview_lab.benchmark.real import RealRun, real_table
 from nextview_lab.benchmark.results import ComparedTables
 from nextview_lab.benchmark.submit import Submitted
 from nextview_lab.errors import EntryError
@@ -266,8 +267,7 @@ def print_bop(run: BopRun) -> None:
             style="yellow",
             soft_wrap=True,
         )
-    for name, reason in run.left_out.items():
-        console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
+    _print_left_out(run.left_out)
     for name, count in run.others.items():
         console.print(
             f"{name}: is no model of the dataset, found {number_of(count, 'time')} and not written",
@@ -280,3 +280,19 @@ def print_bop(run: BopRun) -> None:
         f" {run.seconds:.2f} s an image",
         soft_wrap=True,
     )
+
+
+def print_real(run: RealRun) -> None:
+    """Print what was right in real frames, and what was left out.
+
+    Args:
+        run: what was said of them.
+    """
+    _print_left_out(run.left_out)
+    print_tables([real_table(run.rows)])
+
+
+def _print_left_out(left_out: Mapping[str, Exception]) -> None:
+    """Print why frames were left out, by their names."""
+    for name, reason in left_out.items():
+        console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)

@@ -161,6 +161,13 @@ COMMANDS = {
         f"{CLI}.benchmark_tables:print_bop",
         example="bop lmo nextview_lmo-test.csv --models lmo_memory",
     ),
+    "real": Command(
+        "nextview_lab.benchmark.real:recognise_real",
+        "compare what is said of real frames with the truth",
+        "wrote {out}, a line for each thing",
+        f"{CLI}.benchmark_tables:print_real",
+        example="real ycbv/test/000048 my_frames --out real.csv --models mine",
+    ),
     "submit": Command(
         "nextview_lab.benchmark.submit:submit",
         "run a method over a frozen archive of episodes",
@@ -227,6 +234,7 @@ LABORATORY = Program(
         "train map",
         "train segmentation",
         "bop",
+        "real",
         "submit",
         "benchmark things",
         "benchmark tables",

@@ -2,9 +2,8 @@
 
     python -m nextview_lab.studies.segmentation FOLDER [--network CARD]
 
-FOLDER holds a folder a frame: depth.png (uint16, millimetres), K.json (fx, fy, cx, cy, the middle
-of the first pixel at 0) and labels.png (0: none, 1: table, else the tens digit is the thing). No
-pose is known, so neither is gravity.
+FOLDER holds frames with images of labels, as ``nextview_lab.data.real_frames`` reads them. No pose
+is known, so neither is gravity.
 
 Printed are, over all things that show in at least ``LEAST_PIXELS`` pixels: the mean intersection
 over union (IoU) of each with the segment that fits it best, the shares with more than .5, .75 and
@@ -16,21 +15,19 @@ network of ``nextview-lab train segmentation``; without it the bundled one is as
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from PIL import Image
 
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import UsageError
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
+from nextview_lab.data.real_frames import TrueThing, real_frames
 from nextview_lab.studies.shared import progress
 
 LEAST_PIXELS = 200  # of a thing that counts; of a segment half as many
@@ -105,20 +102,13 @@ class Counts:
         )
 
 
-def frame_in(folder: Path) -> Frame:
-    """The frame without a pose in a folder."""
-    fx, fy, cx, cy = json.loads((folder / "K.json").read_text())
-    depth = np.asarray(Image.open(folder / "depth.png"))
-    return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
-
-
-def real_frames(folder: Path) -> Iterator[tuple[Frame, Labels]]:
-    """The frames of a folder, and the number of the thing of each pixel, 0 for none, (H, W)."""
-    for path in sorted(folder.glob("*/labels.png")):
-        frame = frame_in(path.parent)
-        given = np.asarray(Image.open(path)).astype(np.int64)
-        labels = np.where((given >= 10) & (frame.depth > 0), given // 10, 0)
-        yield frame, labels
+def labels_of(frame: Frame, things: Sequence[TrueThing]) -> Labels:
+    """The number of the thing of each pixel with depth, 0 for none, (H, W)."""
+    labels = np.zeros(frame.shape, np.int64)
+    for number, thing in enumerate(things, 1):
+        if thing.pixels is not None:
+            labels[thing.pixels & (frame.depth > 0)] = number
+    return labels
 
 
 def main(folder: tyro.conf.Positional[Path], network: Path | None = None) -> None:
@@ -128,16 +118,14 @@ def main(folder: tyro.conf.Positional[Path], network: Path | None = None) -> Non
         folder: of the frames.
         network: card of a segmentation network; None for the bundled one.
     """
-    frames = list(real_frames(folder))
-    if not frames:
-        raise UsageError(f"{folder}: holds no folder with a labels.png")
     learned = LearnedSegmenter(network)
     counts = Counts()
-    for frame, labels in progress(frames, "frames"):
+    for real in progress(real_frames(folder), "frames"):
+        frame = real.read()
         begun = time.perf_counter()
         found = learned(frame).labels
         counts.seconds += time.perf_counter() - begun
-        counts.add(labels, found)
+        counts.add(labels_of(frame, real.things()), found)
     counts.print_out()
 
 

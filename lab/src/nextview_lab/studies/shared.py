@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.progress import track
-from scipy.stats import binomtest
 
 from nextview.cli.progress import console
 from nextview.errors import UsageError
@@ -116,9 +115,3 @@ def progress(items: Sequence[Item], what: str) -> Iterator[Item]:
         if time.monotonic() - said > SECONDS_BETWEEN_LINES:
             print(f"{what}: {number} of {total}", file=sys.stderr, flush=True)
             said = time.monotonic()
-
-
-def wilson(count: int, total: int) -> tuple[float, float]:
-    """The 95 % Wilson interval of a share."""
-    low, high = binomtest(count, total).proportion_ci(method="wilson")
-    return float(low), float(high)
