@@ -371,8 +371,8 @@ _ALL = (
 SENSORS = {sensor.name: sensor for sensor in _ALL}
 """Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense
 D435 of 848 x 480; "tof" is like an Azure Kinect, which measures the time of flight; "scanner" is
-like a Zivid 2, which projects stripes; "setup" has only errors of pose, object frame, table and image; "wrist" is
-"stereo" in such a setup."""
+like a Zivid 2, which projects stripes; "setup" has only errors of pose, object frame, table and
+image; "wrist" is "stereo" in such a setup."""
 
 _SIDE = 224
 _RADIUS = SENSORS["none"].radius

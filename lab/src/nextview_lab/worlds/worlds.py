@@ -53,7 +53,8 @@ LEANING = 0.15
 MOST_LEAN = 55.0
 FIXTURE_SCALE = 5.0  # of fixtures relative to objects: only their size tells them apart
 SENSORS_DRAWN = ("none", "kinect", "kinect", "stereo", "stereo", "tof", "scanner")
-SMEARED = 0.25  # share of depth images that are smeared, by at most this share of the depth
+# share of depth images that are smeared, by at most this share of the depth
+SMEARED = 0.25
 MOST_SMEARED = 0.3
 # share of levels whose objects are rotated by quarter turns, so that their sides are parallel
 ALIGNED = 0.4
