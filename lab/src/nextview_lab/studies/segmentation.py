@@ -206,7 +206,7 @@ def draw_worst(things: Sequence[Parted], out: Path) -> None:
     with new_file(out, overwrite=True) as part:
         figure.savefig(part, format="png", dpi=110, facecolor="white")
         # fewer colours make a smaller file
-        Image.open(part).convert("RGB").quantize(64).save(part, "png", optimize=True)
+        Image.open(part).convert("RGB").quantize(256).save(part, "png", optimize=True)
 
 
 def frame_in(folder: Path) -> Frame:
