@@ -13,7 +13,14 @@ from nextview import ViewSphere
 from nextview.data.samples import sample_mesh
 from nextview.geometry.mesh import make_mesh
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.simulation.sensor import ERRORS, SENSORS, Sensor, SensorMix
+from nextview.simulation.sensor import (
+    ERRORS,
+    MOST_BENT,
+    SENSORS,
+    WIGGLE_LENGTH,
+    Sensor,
+    SensorMix,
+)
 
 SPHERE, FEW = ViewSphere.named("40"), ViewSphere((20.0,), 3)
 BALL = meshed(trimesh.creation.icosphere(4))
@@ -124,7 +131,45 @@ def test_shadows_are_where_rays_from_the_projector_do_not_arrive(baseline):
     assert inner.sum() < 0.005 * hidden.sum()
 
 
-@pytest.mark.parametrize("name", ["kinect", "wrist"])
+@pytest.mark.parametrize("tilt", [0, 40])
+def test_a_plane_is_not_bent(tilt):
+    sensor = replace(SENSORS["none"], bent=2.5)
+    depth, _ = plane(sensor, 1.0, tilt)
+    measured, _ = sensor.measure(depth, rng(3))
+    inner = slice(20, -20), slice(20, -20)
+    np.testing.assert_allclose(measured[inner], depth[inner], rtol=1e-5)
+
+
+@pytest.mark.parametrize("width", [1.5, 3.0])
+@pytest.mark.parametrize("slope", [-2e-3, 2e-3])  # of the inverse depth: ridge, groove
+def test_a_corner_is_averaged_under_a_gaussian(width, slope):
+    sensor = replace(SENSORS["none"], bent=width)
+    column = np.abs(np.arange(sensor.width) - sensor.width // 2)
+    inverse = np.tile(1 + slope * np.minimum(column, 50), (sensor.height, 1))
+    measured, _ = sensor.measure((1 / inverse).astype(np.float32), rng(4))
+    averaged = 1 + slope * width * np.sqrt(2 / np.pi)  # mean of |x| under the window
+    middle = measured[100, sensor.width // 2]
+    assert 1 / middle == pytest.approx(averaged, abs=0.1 * abs(averaged - 1))
+
+
+def test_corners_are_bent_by_at_most_a_share_of_the_depth():
+    sensor = replace(SENSORS["none"], bent=3.0)
+    depth = edge(sensor)
+    measured, _ = sensor.measure(depth, rng(5))
+    assert np.abs(depth / measured - 1).max() == pytest.approx(MOST_BENT, rel=1e-3)
+
+
+@pytest.mark.parametrize("distance", [0.5, 0.8, 1.7])
+def test_the_distance_error_of_time_of_flight_is_periodic(distance):
+    sensor = replace(SENSORS["none"], wiggle=0.004)
+    for at in (distance, distance + 3 * WIGGLE_LENGTH):
+        depth = np.full(sensor.shape, at, np.float32)
+        measured, _ = sensor.measure(depth, rng(6))
+        wrong = 0.004 * np.sin(2 * np.pi * distance / WIGGLE_LENGTH)
+        assert measured - depth == pytest.approx(wrong, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["kinect", "tof", "wrist"])
 def test_no_strength_no_error_to_the_bit(name):
     sensor = SENSORS[name].scaled(0)
     depth, _ = plane(sensor, 1.0, 30)
@@ -184,7 +229,7 @@ def test_a_mix_is_another_sensor_for_every_object():
         )
 
 
-@pytest.mark.parametrize("name", ["none", "stereo", "kinect"])
+@pytest.mark.parametrize("name", ["none", "stereo", "kinect", "tof"])
 @pytest.mark.parametrize("radius", [0.02, 0.08, 0.3, 1.1])
 def test_a_mesh_of_known_unit_is_simulated_at_true_size(name, radius):
     ball = make_mesh(BALL.vertices * radius * 1000 + 40, BALL.faces, unit="mm")
@@ -192,7 +237,7 @@ def test_a_mesh_of_known_unit_is_simulated_at_true_size(name, radius):
     assert camera.sensor.radius == pytest.approx(radius)
     clear = radius + max(0.25, camera.sensor.nearest)
     assert camera.sensor.distance >= clear - 1e-9
-    assert camera.sensor.distance <= max(0.45, clear, 3 * radius)
+    assert camera.sensor.distance <= max(0.45, clear, 3 * radius) + 1e-9
 
     frame = camera.frame(SPHERE.poses[13])
     border = [frame.mask[0], frame.mask[-1], frame.mask[:, 0], frame.mask[:, -1]]

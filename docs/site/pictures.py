@@ -309,7 +309,7 @@ def samples(views: tuple[int, ...]) -> Figure:
 
 def sensors(view: int) -> Figure:
     """The depth of each sensor, and what the networks get of it, raw and denoised."""
-    names = ("none", "kinect", "stereo", "setup", "wrist", "kinect:2")
+    names = ("none", "kinect", "stereo", "tof", "scanner", "wrist")
     figure = PlainFigure((7.0, 3.8), layout="constrained")
     axes = figure.subplots(3, len(names))
     for column, name in zip(axes.T, names, strict=True):

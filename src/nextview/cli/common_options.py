@@ -81,8 +81,8 @@ class ObjectOptions:
             direction in the world frame; by default z, and for 7-Scenes the normal of the support
             plane.
         unit: unit of length of a mesh file; if it is given, size counts as evidence.
-        sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
-            (docs/your_camera.md); by default renders are free of noise.
+        sensor: simulated depth camera: kinect, stereo, tof, scanner, setup, wrist or none, or
+            NAME:STRENGTH (docs/your_camera.md); by default renders are free of noise.
         max_faces: largest number of triangles in a mesh; also limits the file to 60 bytes per
             triangle.
         largest_part: keep only the largest connected part of a mesh, without tables or loose

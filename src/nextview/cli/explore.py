@@ -37,7 +37,8 @@ def explore(
         path: mesh file, or folder of meshes or of class folders; by default the sample objects.
         looking: Models and policies. More views can be taken after the end of an episode.
         compare: second policy, which runs side by side with the first.
-        sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
+        sensor: simulated depth camera: kinect, stereo, tof, scanner, setup, wrist or none, or
+            NAME:STRENGTH.
         start: index of the first view; by default random.
         up: up axis of the mesh files; by default z, and y for GLB.
         unit: unit of length of the mesh files; if it is given, size counts as evidence.

@@ -193,8 +193,8 @@ class System:
             unit: unit of length of a mesh file, one of ``mesh.UNITS``; if it is given, size counts
                 as evidence.
             sensor: simulated depth camera: a ``Sensor``, or NAME or NAME:STRENGTH of
-                ``known_sensors.SENSORS``; its errors are drawn with the seed. None for noise-free
-                renders.
+                ``simulation.sensor.SENSORS``; its errors are drawn with the seed. None for
+                renders without noise.
             largest_part: keep only the largest connected part of a mesh file, see ``load_mesh``.
                 Likely problems of a mesh file are reported as Python warnings.
 

@@ -28,6 +28,11 @@ NO_GRAIN = 0.1
 NARROWEST = 1.0
 # largest distance of neighbouring pixels of one surface in projector columns
 WIDEST_STEP = 8
+# corners are bent by at most this share of the depth
+MOST_BENT = 0.01
+# metres: period of the distance error of a time-of-flight camera, a quarter of its unambiguous
+# range at 80 MHz
+WIGGLE_LENGTH = 0.47
 # limits of settings, sides of images, grain and strength
 LARGEST_SETTING = 10_000
 SIDE = 4096
@@ -74,6 +79,9 @@ class Sensor:
         flying: share of the pixels at edges that are measured between the two surfaces.
         shadow: pixels occluded from a point at this distance beside the camera, along x, are not
             measured, metres.
+        bent: standard deviation of the window over which surfaces that meet in a corner are
+            averaged, pixels; planes are unchanged.
+        wiggle: amplitude of a depth error that is periodic in the depth, metres.
         holes: share of the pixels without depth.
         turned: rotation error of the camera, degrees, drawn for every view.
         moved: position error of the camera, metres, drawn for every view.
@@ -104,6 +112,8 @@ class Sensor:
     grazing: float = 0.0
     flying: float = 0.0
     shadow: float = 0.0
+    bent: float = 0.0
+    wiggle: float = 0.0
     holes: float = 0.0
 
     turned: float = 0.0
@@ -225,12 +235,17 @@ class Sensor:
             steep = cosine < self.grazing
             lost[steep] |= cosine[steep] < self.grazing * ndtr(share[steep])
         changed = q
+        if self.bent:
+            changed = with_bent_corners(q, self.bent)
+        if self.wiggle:
+            turn = 2 * np.pi / WIGGLE_LENGTH * depth
+            changed = changed / (1 + self.wiggle * np.sin(turn) * q)
         if self.flying:
             at = flying.random(q.shape)
             to = flying.random(q.shape)
             other = across_edges(q, slope)
             flies = (at < self.flying) & (other != q)
-            changed = np.where(flies, q + to * (other - q), q)
+            changed = np.where(flies, q + to * (other - q), changed)
             source = np.where(flies, -1, source)
         if self.lateral:
             reach = self.lateral * kinect_lateral(angle)
@@ -312,17 +327,52 @@ _STEREO = Sensor(
     shadow=0.05,
     holes=0.03,
 )
+_TOF = Sensor(
+    "tof",
+    height=576,
+    width=640,
+    focal=504.0,
+    grain=0.5,
+    nearest=0.5,
+    farthest=3.86,
+    axial=0.5,
+    lateral=0.5,
+    grazing=0.1,
+    flying=0.6,
+    bent=2.5,
+    wiggle=0.003,
+    holes=0.01,
+)
+_SCANNER = Sensor(
+    "scanner",
+    height=600,
+    width=972,
+    focal=902.0,
+    baseline=0.11,
+    grain=1.0,
+    nearest=0.3,
+    farthest=1.3,
+    disparity=0.011,
+    lateral=0.3,
+    grazing=0.3,
+    flying=0.02,
+    shadow=0.11,
+    holes=0.02,
+)
 _ALL = (
     Sensor(),
     _KINECT,
     _STEREO,
+    _TOF,
+    _SCANNER,
     Sensor("setup", **_SETUP),
     replace(_STEREO, name="wrist", **_SETUP),
 )
 SENSORS = {sensor.name: sensor for sensor in _ALL}
 """Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense
-D435 of 848 x 480; "setup" has only errors of pose, object frame, table and image; "wrist" is
-"stereo" in such a setup."""
+D435 of 848 x 480; "tof" is like an Azure Kinect, which measures the time of flight; "scanner" is
+like a Zivid 2, which projects stripes; "setup" has only errors of pose, object frame, table and
+image; "wrist" is "stereo" in such a setup."""
 
 _SIDE = 224
 _RADIUS = SENSORS["none"].radius
@@ -522,6 +572,21 @@ def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
         other[over] = beside[over]
         highest[over] = step[over]
     return other
+
+
+def with_bent_corners(q: Float, width: float) -> Float:
+    """Average surfaces over their corners, as light that is reflected twice does.
+
+    Args:
+        q: inverse depth, (H, W).
+        width: standard deviation of the Gaussian window, pixels.
+
+    Returns:
+        Inverse depth, (H, W), changed by at most MOST_BENT of it.
+    """
+    seen = gaussian_filter((q > 0).astype(float), width)
+    smooth = gaussian_filter(q, width) / np.maximum(seen, 1e-6)
+    return q + np.clip(smooth - q, -MOST_BENT * q, MOST_BENT * q)
 
 
 def in_shadow(q: Float, focal: float, baseline: float) -> Mask:

@@ -64,8 +64,8 @@ class TeachingOptions:
             recognised by their geometry.
         up: up axis of the mesh files; by default z, and y for GLB.
         upright: the things stand only as in their files; by default they may also lie.
-        sensor: camera that will look at the things: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH.
+        sensor: camera that will look at the things: kinect, stereo, tof, scanner, setup, wrist or
+            none, or NAME:STRENGTH.
         largest_part: keep only the largest connected part of each mesh.
         any_size: accept things of very different sizes.
         one_class: things that are all in one folder are one class; --add assumes this.

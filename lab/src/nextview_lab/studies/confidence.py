@@ -14,9 +14,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import tyro
-
-from nextview.cli.exit_status import orderly_end
-from nextview.files import new_file
 from nextview.session.style import (
     ACCENT,
     BLUE,
@@ -26,6 +23,9 @@ from nextview.session.style import (
     percent_axis,
     to_png,
 )
+
+from nextview.cli.exit_status import orderly_end
+from nextview.files import new_file
 from nextview_lab.benchmark.statistics import wilson
 
 BELIEFS = (0.5, 0.8, 0.95, 0.97, 1.01)  # a confident name has at least the last but one

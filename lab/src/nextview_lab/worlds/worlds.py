@@ -45,10 +45,17 @@ DROPS_TRIED = 25
 CONTACT_RAYS = 1500
 STACKED = 0.5  # share of piled objects that are placed on the last one
 # share of worlds with groceries or flat objects alone; of cameras aimed beside the objects; of bins
-# that are seen at a corner
-ONE_FAMILY = 0.5
+# that are seen at a corner; of objects that lean, and their steepest lean, degrees
+ONE_FAMILY = 0.6
 ASIDE = 0.25
 CORNERS = 0.25
+LEANING = 0.15
+MOST_LEAN = 55.0
+FIXTURE_SCALE = 5.0  # of fixtures relative to objects: only their size tells them apart
+SENSORS_DRAWN = ("none", "kinect", "kinect", "stereo", "stereo", "tof", "scanner")
+# share of depth images that are smeared, by at most this share of the depth
+SMEARED = 0.25
+MOST_SMEARED = 0.3
 # share of levels whose objects are rotated by quarter turns, so that their sides are parallel
 ALIGNED = 0.4
 STEPS_OUTWARDS = 60
@@ -401,7 +408,7 @@ def draw_world(
     if kind == "room" and len(furniture):
         return _room(shapes, furniture, rng)
     if rng.random() < ONE_FAMILY:
-        family = rng.choice(["groceries", "flat"])
+        family = rng.choice(["groceries", "groceries", "flat"])
         shapes = [one for one in shapes if one.family == family] or shapes
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.17))))
     if kind == "bin":
@@ -439,7 +446,7 @@ def _level(
         rng,
         int(rng.choice([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24])),
         gap,
-        float(rng.choice([0, 0.2, 0.4, 0.7])),
+        float(rng.choice([0, 0.2, 0.4, 0.7, 1.0])),
     )
     _beside(world, rng, min(7 * scale, reach))
     _hands(world, rng)
@@ -454,11 +461,11 @@ def _beside(world: World, rng: Generator, reach: float) -> None:
         rng: source of all random numbers.
         reach: largest distance of one from the centre, metres.
     """
-    size = max(0.15, 2.5 * world.scale)
+    size = max(0.3, FIXTURE_SCALE * world.scale)
     objects = [
         s for s, label in zip(world.solids, world.labels, strict=True) if label >= 0
     ]
-    for _ in range(int(rng.choice([0, 0, 1, 3]))):
+    for _ in range(int(rng.choice([0, 0, 0, 1, 2]))):
         angle = rng.uniform(0, 2 * np.pi)
         at = rng.uniform(0.3, 1) * reach * np.array([np.cos(angle), np.sin(angle)])
         apart = [np.linalg.norm(s[0][:, :2] - at, axis=1).min() for s in objects]
@@ -642,22 +649,18 @@ def _fill(
         if free and rng.random() < 0.5:
             turn = Rotation.random(random_state=rng)
         yaw = rng.choice(quarters) if aligned else rng.uniform(0, 2 * np.pi)
+        on_others = bool(rng.random() < piled)
+        near = () if gap or rng.random() < 0.3 else beside
+        ways = axes if aligned else None
+        if near and not on_others and rng.random() < LEANING:
+            lean = rng.uniform(8, MOST_LEAN)
+            turn = Rotation.from_euler("y", lean, degrees=True) * turn
+            ways = np.array([[np.cos(yaw), np.sin(yaw), 0.0]])
         turn = Rotation.from_euler("z", yaw) * turn
         solid = turn.apply(shape.solid[0] * size), shape.solid[1]
 
         spread = min(ground.reach, world.scale * rng.uniform(0.3, 2.0) * np.sqrt(count))
-        on_others = bool(rng.random() < piled)
-        near = () if gap or rng.random() < 0.3 else beside
-        dropped = ground.drop(
-            solid,
-            rng,
-            on_others,
-            gap,
-            spread,
-            ceiling,
-            near,
-            axes if aligned else None,
-        )
+        dropped = ground.drop(solid, rng, on_others, gap, spread, ceiling, near, ways)
         if dropped is not None:
             world.add(dropped, world.things)
             if not on_others:
@@ -861,7 +864,7 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
 
 def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
     """Draw a sensor whose images are downscaled to this shape, with its errors at that size."""
-    known = SENSORS[str(rng.choice(["none", "kinect", "stereo", "stereo"]))]
+    known = SENSORS[str(rng.choice(SENSORS_DRAWN))]
     focal = known.focal / known.width * shape[1] * rng.uniform(0.8, 1.6)
     smaller = shape[1] / known.width
 
@@ -876,8 +879,10 @@ def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
         lateral=known.lateral * strength * smaller,
         flying=known.flying * strength * 0.4,
         grain=float(rng.uniform(0.0, 1.5)) if known.grain else 0.0,
+        bent=known.bent * strength * smaller,
         holes=known.holes * strength * 0.5,
         nearest=0.0,
+        farthest=SENSORS["stereo"].farthest,
     )
 
 
@@ -892,13 +897,13 @@ def _warp(rng: Generator, shape: tuple[int, int]) -> Float32:
 
 
 def _smeared(depth: Float32, rng: Generator) -> Float32:
-    """Smear depth across outlines, as stereo does, or bend corners alone, as time of flight."""
-    if rng.random() < 0.5:
+    """Smear depth across outlines, as stereo does."""
+    if rng.random() > SMEARED:
         return depth
     width = rng.uniform(0.4, 1.6)
     seen = ndimage.gaussian_filter((depth > 0).astype(np.float32), width)
     smooth = ndimage.gaussian_filter(depth, width) / np.maximum(seen, 1e-6)
-    most = depth * float(rng.choice([0.01, 0.3]))
+    most = MOST_SMEARED * depth
     return np.where(depth > 0, depth + np.clip(smooth - depth, -most, most), 0)
 
 
