@@ -87,7 +87,7 @@ def check(
 
 def _draw(quality: DepthQuality, path: Path, overwrite: bool) -> None:
     """Draw which things can be told apart at which distance."""
-    from nextview.session.style import (  # slow to import
+    from nextview.figures.style import (  # slow to import
         ACCENT,
         BLUE,
         GREY,

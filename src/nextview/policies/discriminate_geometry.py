@@ -23,7 +23,7 @@ LEAST_INFORMATION = 1e-3  # nats; views with less are considered uninformative
 class DiscriminateGeometry:
     """Chooses the view with the most expected information about the object's identity.
 
-    The leading hypotheses are rendered from each candidate view, see ``things.expected_views``.
+    The leading hypotheses are rendered from each candidate view, see ``views.expected_views``.
     Among views of similar value, the one with the shortest travel is taken. If no view is
     informative, or nothing can be predicted, the view farthest from all visited ones is taken, as
     it tests the belief most.

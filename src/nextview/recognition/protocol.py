@@ -120,7 +120,7 @@ class LooksAhead(Protocol):
             joint: what they say together.
 
         Returns:
-            A ``things.expected_views.Outlook``; None where nothing can be foreseen.
+            A ``views.expected_views.Outlook``; None where nothing can be foreseen.
         """
 
 

@@ -2,7 +2,7 @@
 
 The expected information of a view is summed over the objects. Each object is rendered from each
 candidate view in its likeliest hypotheses, behind everything known to stand in front of it; see
-``things.expected_views``. Occluded areas may contain further objects. The part of the table that no
+``views.expected_views``. Occluded areas may contain further objects. The part of the table that no
 frame has shown therefore counts too, weighted with the density of objects on the visible part.
 ``view_policies`` chooses by these values.
 """

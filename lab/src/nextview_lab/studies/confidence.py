@@ -14,7 +14,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import tyro
-from nextview.session.style import (
+
+from nextview.cli.exit_status import orderly_end
+from nextview.figures.style import (
     ACCENT,
     BLUE,
     FAINT,
@@ -23,8 +25,6 @@ from nextview.session.style import (
     percent_axis,
     to_png,
 )
-
-from nextview.cli.exit_status import orderly_end
 from nextview.files import new_file
 from nextview_lab.benchmark.statistics import wilson
 

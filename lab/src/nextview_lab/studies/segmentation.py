@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from nextview.session.style import ACCENT, BLUE, PlainFigure
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
 from nextview.cli.exit_status import orderly_end
+from nextview.figures.style import ACCENT, BLUE, PlainFigure
 from nextview.files import new_file
 from nextview.scene.figure import grey_picture
 from nextview.segmentation.instances import LearnedSegmenter
