@@ -211,7 +211,8 @@ def _scored(
     held = np.bincount(key[got], minlength=len(mine))
     ahead = np.bincount(key[front], minlength=len(mine))
     paid += LEFT_OVER * _left_over(grid, window, shown, mine, held, ahead)
-    seen = np.bincount(row, weight * (got & ~front), count)
+    # what is on a surface may be the surface: it says nothing
+    seen = np.bincount(row, weight * (got & ~front & ~(on & carries)), count)
     hidden = np.bincount(row, weight * front, count)
 
     kept = on | front

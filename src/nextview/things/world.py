@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from nextview.sensing.view import View
 from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
-from nextview.things.propose import COARSER, COARSEST, best, propose
+from nextview.things.propose import COARSER, COARSEST, SAME_POSE, best, propose
 from nextview.things.register import camera_error, register
 from nextview.things.score import PIXEL_GAIN, Score, score, total
 from nextview.types import Float, Float32, Index, Mask
@@ -433,6 +433,7 @@ class World:
         totals = self.totals
         taught = some.taught
         radii = self.library.radii[some.things]
+        turns = some.rotations.reshape(-1, 9)
         kept = {one.row for one in self.things if one.row >= 0}
         places: list[int] = []
         for row in np.argsort(-totals).tolist():
@@ -440,10 +441,12 @@ class World:
             near = apart < 0.5 * np.minimum(radii[places], radii[row])
             same = near & (some.things[places] == some.things[row])
             same &= taught[places] == taught[row]
+            angle = np.sqrt(np.maximum(3 - turns[places] @ turns[row], 0))
+            again = same & (angle + apart / radii[row] < SAME_POSE)
 
-            best = totals[places][near].max(initial=0.0)
-            likely = totals[row] > AS_LIKELY * best and same.sum() < RIVALS_OF_ONE
-            if row in kept or likely:
+            most = totals[places][near].max(initial=0.0)
+            few = same.sum() < RIVALS_OF_ONE and not again.any()
+            if row in kept or (few and totals[row] > AS_LIKELY * most):
                 kept.add(row)
                 places.append(row)
         return self.with_rows(np.array(sorted(kept), np.int64))
