@@ -82,6 +82,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
+    r"^python3 -m venv": ".ci/base_installation makes such an environment, and uses it",
     r"^make ": "the workflow is run by lab/tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; each command runs where only the extras of its page are",
     r"^nextview-lab download": (
@@ -118,6 +119,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"--ensemble runs/second": "needs the run of the line before",
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
+    r"nextview learn |\blearn\(": "nextview[teach]",
     r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
@@ -662,8 +664,9 @@ def run_page(
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
         why_not = step.why_not
-        if environments.base is not None and step.needs and why_not is None:
-            why_not = f"needs {', '.join(sorted(step.needs))}"
+        missing = step.needs - {"nextview[teach]"}  # which a base that is given has
+        if environments.base is not None and missing and why_not is None:
+            why_not = f"needs {', '.join(sorted(missing))}"
         if why_not is not None:
             print(f"  not run  {where}  {step.text}  ({why_not})", flush=True)
             continue
