@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -34,105 +34,99 @@ from benchmarks import gate
 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "src/nextview"
+LIST = tomllib.loads((HERE / "numbers.toml").read_text())
+RESULTS = HERE / "numbers.json"
 CASES = {"tables": (3, 4, 6, 7, 8, 10), "moves": (0, 1, 2, 3)}  # of the gate
+FRAMES = "first frames", "later frames"
 REAL_EVERY = 3  # each so manyth real frame
-CHANGES = {"halved": 0.5, "doubled": 2.0}
-NOT_SCALED, LATER = "not scaled", "(later frames)"  # how entries of the list may begin
-FIGURES = "known", "right", "sure right", "sure wrong", "told", "false alarms"
+FIGURES = "right", "sure right", "sure wrong", "told", "false alarms"
 LOUD = 25  # percent of the CPU time, from which on a change of it is no noise
-INTRODUCTION = """# The numbers
-
-Every constant that a frame meets on [its path](../CONTRIBUTING.md#the-path-of-a-frame) through `src/nextview`, the most important modules first:
-its value, its meaning (the comment in the source), and what it was chosen on. "By hand" means: one value that worked, no search.
-
-`python -m benchmarks.numbers DATA --measure` halves and doubles each one. Of a number between 0.5 and 1, the distance to 1 is doubled and
-halved instead; of a factor, what exceeds 1. The two last columns are differences in right names, confident right names and confident wrong
-names, on {first[known]} known things: six tables of [the gate](gate.py) and seven real frames, one view each. As it is, {first[right]} are
-right, {first[sure right]} with confidence, {first[sure wrong]} confident ones are wrong. "Later frames": on four tables on which a thing is moved or removed, {later[known]} known things
-({later[right]} right, {later[sure right]} with confidence, {later[told]} of four changes noticed, {later[false alarms]} false alarms). **Two names are noise**: four of 261 are,
-on all tables of the gate. "=": no name, no confidence and no pose changed, to the last digit. CPU time is given from a change by a quarter on.
-
-| number | value | meaning | chosen on | halved | doubled |
-|---|---|---|---|---|---|"""
 
 
 class Number(NamedTuple):
-    """A constant: its name, MODULE.NAME, its value, its comment, and the line where it ends."""
+    """A constant, MODULE.NAME: the line where it ends, the frames that measure it."""
 
     name: str
     value: Any
     meaning: str
     line: int
+    chosen: str
+    frames: str
 
     def scaled(self, factor: float) -> Any:
-        """The value times a factor; of what is near 1 and below, or a factor, the distance to 1."""
+        """The value times a factor; of a factor, or a value near 1 and below, the distance to 1."""
         if isinstance(self.value, tuple):
             return tuple(one * factor for one in self.value)
         near = 0.5 < self.value < 1
         origin = int(near or self.meaning.startswith(("factor", "times")))
         value = origin + (self.value - origin) * (1 / factor if near else factor)
-        return max(1, round(value)) if isinstance(self.value, int) else float(f"{value:.6g}")
+        return (
+            max(1, round(value))
+            if isinstance(self.value, int)
+            else float(f"{value:.6g}")
+        )
 
 
-def listed() -> dict[Number, str]:
-    """The numbers of the list, with what each was chosen on."""
-    choices = tomllib.loads((HERE / "numbers.toml").read_text())
-    return {
-        number: names[number.name.partition(".")[2]]
-        for module, names in choices.items()
-        for number in sorted(numbers_of(module, names), key=lambda one: list(names).index(one.name.partition(".")[2]))
-    }
-
-
-def numbers_of(module: str, names: Collection[str]) -> Iterator[Number]:
-    """Constants of a module, such as ``things/score``."""
-    lines = (PACKAGE / f"{module}.py").read_text().splitlines()
-    for node in ast.parse("\n".join(lines)).body:
-        if isinstance(node, ast.Assign):
-            first = node.lineno - 1
-            while lines[first - 1].startswith("# "):
-                first -= 1
-            words = re.findall(r"# (.*)", "\n".join(lines[first : node.end_lineno]))
-            target, value = node.targets[0], node.value
-            many = isinstance(target, ast.Tuple)
-            for one, own in zip(target.elts, value.elts) if many else [(target, value)]:
-                if one.id in names:
-                    code = compile(ast.Expression(own), module, "eval")
-                    number = eval(code, {"np": np})
-                    yield Number(f"{module}.{one.id}", number, " ".join(words), node.end_lineno)
+def numbers() -> Iterator[Number]:
+    """The numbers of the list, in its order."""
+    for frames, module in (
+        (one, two) for one in (*FRAMES, "none") for two in LIST[one]
+    ):
+        text = (PACKAGE / f"{module}.py").read_text()
+        lines = text.splitlines()
+        found = {}
+        for node in ast.parse(text).body:
+            if isinstance(node, ast.Assign):
+                first = node.lineno - 1
+                while lines[first - 1].startswith("# "):
+                    first -= 1
+                own = "\n".join(lines[first : node.end_lineno])
+                words = " ".join(re.findall(r"# (.*)", own))
+                names = ast.unparse(node.targets[0]).strip("()").split(", ")
+                parts = node.value.elts if len(names) > 1 else [node.value]
+                for name, part in zip(names, parts, strict=True):
+                    found[name] = part, words, node.end_lineno
+        for name, chosen in LIST[frames][module].items():
+            part, words, line = found[name]
+            value = eval(ast.unparse(part), {"np": np})
+            yield Number(f"{module}.{name}", value, words, line, chosen, frames)
 
 
 class Few(gate.Bench):
     """A bench of few cases: of tables the first frame, of moves all frames."""
 
-    @cache
-    def taught(self) -> tuple[Any, gate.Shapes]:
-        """The same as of all benches, once."""
-        return super().taught()
+    taught = cache(gate.Bench.taught)
 
     def cases(self, part: str) -> Iterator[tuple[str, gate.Case]]:
         """The few cases of a part, each with its name."""
         for number in CASES[part]:
             seen = gate.case(part, number, self.scans, self.frames)
-            first = replace(seen, depth=seen.depth[:1])
-            yield f"{part} {number}", seen if part == "moves" else first
+            frames = 1 if part == "tables" else len(seen.depth)
+            yield f"{part} {number}", replace(seen, depth=seen.depth[:frames])
 
 
-def answers(data: Path, later: bool) -> dict[str, Any]:
+def answers(data: Path, frames: str) -> dict[str, Any]:
     """What the package answers on the frames, and the seconds that it takes."""
     bench = Few(data, Path("~/.cache/nextview/gate").expanduser(), REAL_EVERY)
-    rows = [*gate.moves(bench)] if later else [*gate.tables(bench), *gate.real(bench)]
+    first = frames == "first frames"
+    rows = (
+        [*gate.tables(bench), *gate.real(bench)] if first else list(gate.moves(bench))
+    )
     seconds = sum(sum(row.pop("seconds")) for row in rows)
-    figures = {key: sum(row.get(key, 0) for row in rows) for key in FIGURES}
+    figures = {key: sum(row.get(key, 0) for row in rows) for key in ("known", *FIGURES)}
     digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()[:16]
     return {**figures, "seconds": round(seconds, 1), "answers": digest}
 
 
-def measured(package: Path, data: Path, later: bool) -> dict[str, Any]:
+def answers_of(package: Path, data: Path, frames: str) -> dict[str, Any]:
     """The answers of a copy of the package, in a process of its own."""
-    call = f"answers(Path({str(data)!r}), {later})"
+    call = f"answers(Path({str(data)!r}), {frames!r})"
     run = subprocess.run(
-        [sys.executable, "-c", f"from benchmarks.numbers import *; print(json.dumps({call}))"],
+        [
+            sys.executable,
+            "-c",
+            f"from benchmarks.numbers import *; print(json.dumps({call}))",
+        ],
         cwd=HERE.parent,
         env={**os.environ, "PYTHONPATH": str(package.parent), "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -142,77 +136,88 @@ def measured(package: Path, data: Path, later: bool) -> dict[str, Any]:
     return {"error": lines[-1]} if run.returncode else json.loads(lines[-1])
 
 
-def measure_all(data: Path, results: dict[str, Any]) -> Iterator[None]:
+def measure_all(
+    data: Path, only: tuple[str, ...], results: dict[str, Any]
+) -> Iterator[None]:
     """Measure what is not measured yet, in the order of the list."""
     with tempfile.TemporaryDirectory() as folder:
         package = Path(folder, "nextview")
         shutil.copytree(PACKAGE, package)
-        for kind, later in (("first frames", False), ("later frames", True)):
-            if kind not in results:
-                results[kind] = measured(package, data, later)
+        for frames in FRAMES:
+            if frames not in results:
+                results[frames] = answers_of(package, data, frames)
                 yield
-        for number, chosen in listed().items():
-            if chosen.startswith(NOT_SCALED) or is_measured(number, results):
-                continue
-            file = package / f"{number.name.partition('.')[0]}.py"
-            text = file.read_text()
-            lines = text.splitlines()
-            result: dict[str, Any] = {"value": repr(number.value)}
-            for change, factor in CHANGES.items():
-                name, value = number.name.partition(".")[2], number.scaled(factor)
-                changed = [*lines[: number.line], f"{name} = {value!r}", *lines[number.line :]]
-                file.write_text("\n".join(changed))
-                result[change] = measured(package, data, chosen.startswith(LATER))
-            file.write_text(text)
-            results[number.name] = result
-            yield
+        for one in numbers():
+            wanted = one.frames in FRAMES and one.name.startswith(only)
+            if wanted and changes_of(one, results) is None:
+                module, _, name = one.name.partition(".")
+                file = package / f"{module}.py"
+                text = file.read_text()
+                lines = text.splitlines()
+                result: dict[str, Any] = {"value": repr(one.value)}
+                for change, factor in (("halved", 0.5), ("doubled", 2.0)):
+                    value = f"{name} = {one.scaled(factor)!r}"
+                    file.write_text(
+                        "\n".join([*lines[: one.line], value, *lines[one.line :]])
+                    )
+                    result[change] = answers_of(package, data, one.frames)
+                file.write_text(text)
+                results[one.name] = result
+                yield
 
 
-def is_measured(number: Number, results: dict[str, Any]) -> bool:
-    """Whether a number was measured with its present value."""
-    return results.get(number.name, {}).get("value") == repr(number.value)
-
-
-def changed(number: Number, change: str, chosen: str, results: dict[str, Any]) -> str:
-    """What a change of a number changed, in a cell of the table."""
-    if chosen.startswith(NOT_SCALED):
-        return ""
-    if not is_measured(number, results):
-        return "not measured"
-    now = results[number.name][change]
-    before = results["later frames" if chosen.startswith(LATER) else "first frames"]
-    if now.get("answers") == before["answers"]:
-        return "="
-    if "error" in now:
-        return "fails"
-    cost = round(100 * (now["seconds"] / before["seconds"] - 1))
-    figures = ", ".join(f"{now[key] - before[key]:+d}" for key in FIGURES[1:] if before[key])
-    return figures + f"; CPU {cost:+d} %" * (abs(cost) >= LOUD)
+def changes_of(number: Number, results: dict[str, Any]) -> tuple[str, str] | None:
+    """What it changes to halve and to double a number, in words; None if it is not measured."""
+    result = results.get(number.name, {})
+    before = results.get(number.frames)
+    if before is None or result.get("value") != repr(number.value):
+        return None
+    said = []
+    for now in (result["halved"], result["doubled"]):
+        if "error" in now:
+            said.append("fails")
+        elif now["answers"] == before["answers"]:
+            said.append("=")
+        else:
+            keys = FIGURES if before["told"] else FIGURES[:3]
+            figures = ", ".join(f"{now[key] - before[key]:+d}" for key in keys)
+            cost = round(100 * (now["seconds"] / before["seconds"] - 1))
+            said.append(figures + f"; CPU {cost:+d} %" * (abs(cost) >= LOUD))
+    return said[0], said[1]
 
 
 def page(results: dict[str, Any]) -> str:
     """The page, in Markdown."""
     first, later = results["first frames"], results["later frames"]
-    lines = [INTRODUCTION.format(first=first, later=later)]
-    for number, chosen in listed().items():
-        module, _, name = number.name.partition(".")
-        values = number.value if isinstance(number.value, tuple) else [number.value]
-        value = ", ".join(f"{one:.6g}" for one in values)
-        cells = [changed(number, change, chosen, results) for change in CHANGES]
-        chosen = chosen.removeprefix(LATER).strip() + " (later frames)" * chosen.startswith(LATER)
-        lines.append(" | ".join(["", f"`{module}` `{name}`", value, number.meaning, chosen, *cells, ""]))
-    return "\n".join(lines).strip() + "\n"
+    lines = [LIST["introduction"].format(first=first, later=later).strip()]
+    for one in numbers():
+        module, _, name = one.name.partition(".")
+        values = one.value if isinstance(one.value, tuple) else [one.value]
+        value = ", ".join(f"{value:.6g}" for value in values)
+        changes = changes_of(one, results) or (
+            "not measured" * (one.frames in FRAMES),
+            "",
+        )
+        cells = [f"`{module}` `{name}`", value, one.meaning, one.chosen, *changes]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def main(
     data: tyro.conf.Positional[Path] = Path(os.environ.get("NEXTVIEW_DATA", "data")),
     measure: bool = False,
+    only: tuple[str, ...] = ("",),
 ) -> None:
-    """Write numbers.md; measure before what is not measured yet."""
-    file = HERE / "numbers.json"
-    results = json.loads(file.read_text()) if file.exists() else {}
-    for _ in measure_all(data, results) if measure else ():
-        file.write_text(json.dumps(results, indent=1) + "\n")
+    """Write numbers.md.
+
+    Args:
+        data: folder of the gate.
+        measure: first measure what is not measured yet.
+        only: how the names of the numbers to measure begin, such as things/score.
+    """
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    for _ in measure_all(data, only, results) if measure else ():
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
     (HERE / "numbers.md").write_text(page(results))
 
 
