@@ -544,7 +544,8 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
 ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
 # pages whose Python blocks do again what their commands did: in a folder of its own
 BESIDE = ("docs/your_objects.md", "docs/your_table.md")
-STORES = (  # made once, for all pages
+MADE_FROM_STORES = re.compile(r"\.zarr|\.npz|ViewStore|modelnet10")
+STORES = (  # made once, for all pages that need them
     "nextview-lab render data/ModelNet10 views.zarr --workers 1",
     "nextview-lab predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
     "nextview-lab predict views.zarr test.npz --split test --workers 1",
@@ -889,7 +890,12 @@ def main(
         make_inputs(inputs)
         if base is None:  # which has nothing of the tests
             make_rig(inputs / "my_rig")
-        for command in STORES if pages else ():
+        texts = [
+            PREPARED.get(page, "") + step.text
+            for page in pages
+            for step in steps_of(page)
+        ]
+        for command in STORES if any(map(MADE_FROM_STORES.search, texts)) else ():
             environments.run_or_end(command, inputs)
 
         for page in pages:
