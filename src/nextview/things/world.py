@@ -33,7 +33,7 @@ EXPLAINED_OF_UNION = (
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 RIVALS = 12  # hypotheses of one place that are kept
-RIVALS_OF_ONE = 2  # the same of one thing
+RIVALS_OF_ONE = 2
 LOOKALIKES, LOOKALIKES_OF_ONE = 4, 2  # of a new or doubtful thing that are kept
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
