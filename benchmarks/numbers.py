@@ -40,7 +40,7 @@ CASES = {"tables": (3, 4, 6, 7, 8, 10), "moves": (0, 1, 2, 3)}  # of the gate
 FRAMES = "first frames", "later frames"
 REAL_EVERY = 3  # each so manyth real frame
 FIGURES = "right", "sure right", "sure wrong", "told", "false alarms"
-LOUD = 25  # percent of the CPU time, from which on a change of it is no noise
+LOUD = 40  # percent of the CPU time, from which on a change of it is no noise
 
 
 class Number(NamedTuple):
@@ -147,7 +147,7 @@ def measure_all(
             if frames not in results:
                 results[frames] = answers_of(package, data, frames)
                 yield
-        for one in numbers():
+        for one in list(numbers()):  # of the source that is copied
             wanted = one.frames in FRAMES and one.name.startswith(only)
             if wanted and changes_of(one, results) is None:
                 module, _, name = one.name.partition(".")
