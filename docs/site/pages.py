@@ -1,8 +1,8 @@
 """MkDocs hook: makes the pages that would drift if they were written, and mends links for the site.
 
-Start, Contributing, Security, Changelog, Numbers and the examples are files of the repository; commands,
-models and the API describe themselves. Links in all of them are written for the repository, where
-docs/ is a folder among others.
+Start, Contributing, Security, Changelog, Numbers and the examples are files of the repository;
+commands, models and the API describe themselves. Links in all of them are written for the
+repository, where docs/ is a folder among others.
 """
 
 from __future__ import annotations
