@@ -1,7 +1,7 @@
 """Five machine parts for picking from a bin; generated, so they are free of any rights (CC0).
 
 python examples/bin_parts.py PARTS          # writes five STL files in millimetres
-nextview learn PARTS taught --unit mm
+nextview learn PARTS taught --unit mm       # needs nextview[teach]
 
 Each part is a union of convex pieces with holes. A physics engine uses the pieces; the meshes that
 are taught and seen have the holes, too. No finger of a gripper fits into a hole.

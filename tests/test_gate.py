@@ -1,10 +1,13 @@
 """The gate counts what is right, wrong, and on things that nobody taught."""
 
+import ast
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks import numbers
 from benchmarks.gate import compared, nearest_of, summed, table_of
 from benchmarks.gate_frames import INTRINSICS, case, cloud, machine_parts
 
@@ -89,3 +92,26 @@ def test_tables_beside_another_run():
 def test_what_is_gone_is_nearest_to_nothing():
     here, gone = np.zeros((1, 3)), np.full((1, 3), np.nan)
     assert nearest_of({"gone": gone, "here": here}, np.ones(3)) == "here"
+
+
+def test_the_page_of_the_numbers_is_what_its_script_writes():
+    results = json.loads(numbers.RESULTS.read_text())
+    page = (numbers.HERE / "numbers.md").read_text()
+    assert page == numbers.page(results), "python -m benchmarks.numbers writes it"
+
+
+@pytest.mark.parametrize(
+    "module", ["flat", "naming", "point_pairs", "propose", "register", "score", "world"]
+)
+def test_no_number_of_the_explanation_is_missing_on_the_page(module):
+    text = (numbers.PACKAGE / f"things/{module}.py").read_text()
+    constants = {
+        name
+        for node in ast.parse(text).body
+        if isinstance(node, ast.Assign)
+        and any(isinstance(one, ast.Constant) for one in ast.walk(node.value))
+        for name in ast.unparse(node.targets[0]).strip("()").split(", ")
+        if name.isupper()
+    }
+    listed = {one.name for one in numbers.numbers()}
+    assert {f"things/{module}.{name}" for name in constants} <= listed

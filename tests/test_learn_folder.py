@@ -130,4 +130,4 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
         return check_sizes(names, np.array(radii), unit_given)
     with pytest.raises(DatasetError, match=said) as raised:
         check_sizes(names, np.array(radii), unit_given)
-    assert "any_size=True takes it as it is" in str(raised.value)
+    assert "any_size=True accepts it" in str(raised.value)

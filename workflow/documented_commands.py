@@ -84,6 +84,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
+    r"^python3 -m venv": ".ci/base_installation makes such an environment, and uses it",
     r"^make ": "the workflow is run by lab/tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; each command runs where only the extras of its page are",
     r"^nextview-lab download": (
@@ -120,6 +121,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"--ensemble runs/second": "needs the run of the line before",
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
+    r"nextview learn |\blearn\(": "nextview[teach]",
     r"nextview-lab |nextview_lab": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
@@ -544,7 +546,8 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
 ALONE = ("README.md", "docs/your_camera.md", "docs/your_objects.md")
 # pages whose Python blocks do again what their commands did: in a folder of its own
 BESIDE = ("docs/your_objects.md", "docs/your_table.md")
-STORES = (  # made once, for all pages
+MADE_FROM_STORES = re.compile(r"\.zarr|\.npz|ViewStore|modelnet10")
+STORES = (  # made once, for all pages that need them
     "nextview-lab render data/ModelNet10 views.zarr --workers 1",
     "nextview-lab predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
     "nextview-lab predict views.zarr test.npz --split test --workers 1",
@@ -664,8 +667,9 @@ def run_page(
     for step in steps_of(page):
         where = f"{step.page}:{step.line}"
         why_not = step.why_not
-        if environments.base is not None and step.needs and why_not is None:
-            why_not = f"needs {', '.join(sorted(step.needs))}"
+        missing = step.needs - {"nextview[teach]"}  # which a base that is given has
+        if environments.base is not None and missing and why_not is None:
+            why_not = f"needs {', '.join(sorted(missing))}"
         if why_not is not None:
             print(f"  not run  {where}  {step.text}  ({why_not})", flush=True)
             continue
@@ -890,7 +894,12 @@ def main(
         make_inputs(inputs)
         if base is None:  # which has nothing of the tests
             make_rig(inputs / "my_rig")
-        for command in STORES if pages else ():
+        texts = [
+            PREPARED.get(page, "") + step.text
+            for page in pages
+            for step in steps_of(page)
+        ]
+        for command in STORES if any(map(MADE_FROM_STORES.search, texts)) else ():
             environments.run_or_end(command, inputs)
 
         for page in pages:

@@ -1,8 +1,8 @@
 """MkDocs hook: makes the pages that would drift if they were written, and mends links for the site.
 
-Start, Contributing, Security, Changelog and the examples are files of the repository; commands,
-models and the API describe themselves. Links in all of them are written for the repository, where
-docs/ is a folder among others.
+Start, Contributing, Security, Changelog, Numbers and the examples are files of the repository;
+commands, models and the API describe themselves. Links in all of them are written for the
+repository, where docs/ is a folder among others.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ REPOSITORY_PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
+    "benchmarks/numbers.md": "numbers.md",
 } | {
     f"examples/{path.name}": f"examples/{path.stem}.md"
     for path in sorted(ROOT.glob("examples/*.py"))

@@ -62,7 +62,7 @@ def missing_extra(
     Args:
         error: of an import.
         packages: those of each optional part.
-        project: whose parts they are, as pip is told.
+        project: whose parts they are, by its name for pip.
     """
     package = (error.name or "").partition(".")[0]
     extra = next(
@@ -81,7 +81,7 @@ def extras(
 
     Args:
         packages: those of each optional part.
-        project: whose parts they are, as pip is told.
+        project: whose parts they are, by its name for pip.
 
     Raises:
         MissingExtraError: such a part is not installed; the sentence says how to install it.

@@ -126,7 +126,7 @@ class LooksAhead(Protocol):
 
 @runtime_checkable
 class RulesOut(Protocol):
-    """A recogniser that can be told that an object is none of some classes."""
+    """A recogniser that can leave out classes: an object is none of them."""
 
     def without(self, names: Collection[str]) -> Recogniser:
         """The same for an object that is none of some classes; ``classes`` stay as they are.

@@ -113,7 +113,7 @@ class SceneObject:
         )
 
 
-SEEN_POINTS = 400
+SEEN_POINTS = 400  # of an object, that a frame adds at most
 
 
 def objects_of(

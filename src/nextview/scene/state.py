@@ -111,7 +111,7 @@ class SceneState:
         if self.unexplained:
             area = 1e4 * sum(patch.area for patch in self.unexplained)
             what = f"{area:.0f} square centimetres in view are neither ground nor an object"
-            why = "is the ground another plane, or is much of a thing not told apart?"
+            why = "is the ground another plane, or did the segmentation miss things?"
             remarks.append(ViewWarning("unexplained", f"{what}: {why}", holds=False))
         elif self.tops and not self.objects and not left_out:
             remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)

@@ -13,13 +13,13 @@ LONG_SIDE = 213  # pixels of the longer side of the network's picture, about
 SIDE_MULTIPLE = 16  # its sides are padded to multiples of this
 # pixels of a block whose depths differ by less, relatively, are averaged
 NEAR_IN_DEPTH = 0.015
-PLANES = 4  # largest planes of a frame that the network is told
+PLANES = 4  # largest planes of a frame, input of the network
 # along each side of the picture, a plane through its surface is tried
 PLANE_TRIALS = 12
 PLANE_SAMPLES = 40  # along each side, pixels that a plane is compared with
 PLANE_TOLERANCE = 0.012  # of the depth, within which a pixel lies on a plane
-HEIGHT_SCALE = 30.0  # heights of a thirtieth of the distance are told well from 0
-PICTURE_CHANNELS = 15
+HEIGHT_SCALE = 30.0  # heights of a thirtieth of the distance differ clearly from 0
+PICTURE_CHANNELS = 15  # of the picture that the network gets
 # part of a direction that lies in the picture, from which on it tells how the picture is turned
 LEAST_UPRIGHT = 0.3
 

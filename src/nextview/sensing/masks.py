@@ -15,7 +15,7 @@ from nextview.types import Float, Float32, Mask
 # A point is on a plane if its height is at most so many deviations of its noise, and this share of
 # its distance.
 PLANE_NOISE = 4.0
-PLANE_SHARE = 0.003
+PLANE_SHARE = 0.003  # the same as a share of the distance
 BESIDE = 20  # width of the margin around a mask in which the noise of the plane is measured, pixels
 SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixels lie
 

@@ -44,9 +44,9 @@ from nextview.types import Float, Mask
 # change of centre or radius, in object radii, below which the object frame is kept
 SAME_FRAME = 0.01
 NO_OUTLINE = (
-    "an object that stands on no plane (support=False) is told from what holds it by a mask in each"
-    " frame, Frame(..., mask=...), by a point on it, ObservedObject(point=...), or by a box,"
-    " ObservedObject(box=...)"
+    "an object that stands on no plane (support=False) needs a mask in each frame, Frame(...,"
+    " mask=...), a point on it, ObservedObject(point=...), or a box, ObservedObject(box=...), which"
+    " separates it from what grips it"
 )
 NO_PLANE = ViewWarning(
     "support",

@@ -19,7 +19,7 @@ LEAST_SUPPORT = 0.04
 STEEP_LAG = 2  # distance of two samples whose slope is measured
 # largest pose error, which displaces a known plane in a new frame
 POSE_SHIFT = 0.02  # metres
-POSE_TURN = np.radians(2.0)
+POSE_TURN = np.radians(2.0)  # radians, of the same error
 # distance from a visible plane, in tolerances, up to which few samples are off the plane
 TOLERANCES_ASIDE = 3.0
 

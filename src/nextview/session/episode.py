@@ -447,7 +447,9 @@ class Episodes:
             visited = np.zeros((len(now), len(self.sphere)), bool)
             return np.zeros((len(now), 1)), np.zeros(len(now)), visited, []
         if placed != (last.places is not None):
-            raise UsageError("where the cameras stood is told of all views or of none")
+            raise UsageError(
+                "give the places of the cameras for all views, or for none"
+            )
         going = ~self.steps[-1].stopped
         earlier = [] if last.places is None else [last.places[going]]
         return (

@@ -61,7 +61,7 @@ class SeveralRecognisers:
             if isinstance(member, VerifiedRecogniser):
                 memories[name] = member
             elif isinstance(member, TaughtRecogniser):
-                what = "knows no geometry of its things, by which they are told from others"
+                what = "knows no geometry of its things"
                 raise ModelError(
                     f"{name}: {what}; teach them again from meshes with {option('unit')}"
                 )

@@ -749,9 +749,8 @@ def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
     notes = []
     if len(taught) == 1:
         notes.append(
-            f"{names[0]} is all it knows: whatever is shown is {names[0]} or unknown, and what is"
-            f" unknown is told from views of {names[0]} alone; teach what it may be mistaken for,"
-            " too"
+            f"{names[0]} is all it knows: every object is {names[0]} or unknown; teach what it may"
+            " be mistaken for, too"
         )
 
     first: dict[bytes, str] = {}

@@ -43,9 +43,7 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
                 if times > 1
                 else f"{1 / times:,.0f} times smaller"
             )
-            hint = (
-                f"is it in another unit? {option('any_size', True)} takes it as it is"
-            )
+            hint = f"is it in another unit? {option('any_size', True)} accepts it"
             raise DatasetError(f"{path}: is {how} than most others; {hint}")
 
 
@@ -65,7 +63,7 @@ def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> 
         if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
             likely.append(f"{option('unit', other)} ({_length(radius)})")
     hint = f"is it {' or '.join(likely)}?" if likely else "is that right?"
-    return f"{who}; {hint} {option('any_size', True)} takes it as it is"
+    return f"{who}; {hint} {option('any_size', True)} accepts it"
 
 
 def _length(metres: float) -> str:

@@ -23,7 +23,7 @@ REFERENCES = 25  # of these, whose pairs are compared
 # metres: steps of short distances, and the distance from which on they grow with it; and how many
 # steps there are
 DISTANCE_STEP, LONG_DISTANCE, DISTANCES = 0.008, 0.15, 64
-ANGLE_STEP = np.radians(15)
+ANGLE_STEP = np.radians(15)  # between a normal and a line, or two normals
 ANGLES = 13  # steps of an angle
 TURNS = 20  # steps of the turn about a normal
 COMMONEST, COMMON_WEIGHT = 600, 0.25  # pairs that are alike at most, and what more tell

@@ -25,9 +25,9 @@ LEAST_MATCH = (
 MATCHED = 40  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 4  # the same of one thing
 SCORED = 16  # hypotheses that are rendered, at most
-SCORED_OF_ONE = 3
+SCORED_OF_ONE = 3  # the same of one thing
 KEPT = 8  # hypotheses of one segment that are kept, at most
-KEPT_OF_ONE = 2
+KEPT_OF_ONE = 2  # the same of one thing
 SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
 COARSER, COARSEST = 2, 3  # grids on which they are rendered to choose among them
 

@@ -24,7 +24,7 @@ LARGEST_TURN = 0.3  # radians in one step
 LARGEST_SHIFT = 0.25  # radii of the thing in one step
 LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a thing
 DAMPING = 0.01  # weight of the present pose, points
-OUTLINE_STEP = 4  # pixels, to which the outline of a segment is told
+OUTLINE_STEP = 4  # pixels, accuracy of the outline of a segment
 OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matches
 # of a point where nothing is measured, against one that is seen through, as in the score
 MISSING_WEIGHT = np.float32(NOT_MEASURED / OUTLIER)

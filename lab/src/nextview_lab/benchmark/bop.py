@@ -274,8 +274,8 @@ def look_for_models(
 ) -> BopRun:
     """Name and locate the models of a BOP dataset in its depth images.
 
-    Each image of the targets is looked at by itself: nothing is told of what is in it, nor of where
-    its camera is. Every thing that is named becomes a line of OUT with the belief as its score, as
+    Each image of the targets is looked at by itself; its things and the pose of its camera are
+    not known. Every thing that is named becomes a line of OUT with the belief as its score, as
     BOP's 6D detection wants it and bop_toolkit, which evaluates it, reads it. An interrupted run
     resumes.
 

@@ -64,7 +64,7 @@ class FrozenThing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: of the thing, the answer that is right.
-        sha256: of its scan file, in whose frame poses are told.
+        sha256: of its scan file, in whose frame poses are given.
         licence: of the scan.
         source: where the scan comes from.
     """
@@ -76,15 +76,15 @@ class FrozenThing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FrozenEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a method is told of an episode before it looks.
+    """What a method knows of an episode before it looks.
 
     Attributes:
         held: whether a gripper holds the thing, so that it need not lie on anything.
         first: number of the first view.
         metres_per_unit: of the depth images.
         intrinsics: pinhole matrix, (3, 3), pixels, the centre of the first pixel at 0.
-        poses: told camera-to-world pose of each candidate view, (V, 4, 4), OpenCV axes, metres, in
-            a world with z up.
+        poses: reported camera-to-world pose of each candidate view, (V, 4, 4), OpenCV axes,
+            metres, in a world with z up.
     """
 
     held: bool
@@ -207,7 +207,7 @@ class FrozenArchive:
         )
 
     def episode(self, number: str) -> FrozenEpisode:
-        """Read what a method is told of an episode.
+        """Read what a method knows of an episode.
 
         Args:
             number: of the episode.

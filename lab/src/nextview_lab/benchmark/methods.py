@@ -231,8 +231,8 @@ class FrozenLook(msgspec.Struct, frozen=True):
         mask: path of the mask, PNG: the pixels of the thing are not 0.
         metres_per_unit: of the depth image.
         intrinsics: (3, 3), pixels, the centre of the first pixel at 0.
-        poses: told camera-to-world poses of all candidate views, (V, 4, 4), OpenCV axes, metres; z
-            is up in the world. That of this view is ``poses[view]``.
+        poses: reported camera-to-world poses of all candidate views, (V, 4, 4), OpenCV axes,
+            metres; z is up in the world. That of this view is ``poses[view]``.
         free: numbers of the views that may come next; empty after the last one.
         held: whether a gripper holds the thing.
         things: names that may be right.

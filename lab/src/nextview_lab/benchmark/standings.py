@@ -397,7 +397,7 @@ def _board(
         f"{len(truths)} episodes with {number_of(len(order), 'thing')}; episodes with one thing are"
         " resampled together.",
         "All of it is simulated, with true masks. Poses are compared in the world, with the error"
-        " of the told poses of the cameras.",
+        " of the reported poses of the cameras.",
     ]
     if compared is not None and len(scored) > 1:
         tests = counted.tests(

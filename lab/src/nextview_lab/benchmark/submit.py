@@ -169,9 +169,9 @@ def submit(
 ) -> Submitted:
     """Run a method over the episodes of a frozen archive, and write its answers.
 
-    A method sees a depth image, a mask and poses of cameras, names what it sees, and says which
-    view it wants next. It is not told what the images show: the truth is read by nextview-lab
-    leaderboard alone. Without --command the method is nextview itself. An interrupted run resumes.
+    A method sees a depth image, a mask and poses of cameras, names what it sees, and chooses
+    the next view. It does not know what the images show: only nextview-lab leaderboard reads the
+    truth. Without --command the method is nextview itself. An interrupted run resumes.
 
     Args:
         archive: folder of the archive, such as nextview-bench-1.0.

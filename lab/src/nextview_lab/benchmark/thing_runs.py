@@ -255,7 +255,7 @@ def scan_of(
     for other in UNITS:
         if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
             raise DatasetError(
-                f"{file}: is not in {unit}, by what was taught of it; give"
+                f"{file}: is not in {unit}: another size was taught; give"
                 f" {option('unit', other)}"
             )
     raise DatasetError(
