@@ -15,7 +15,8 @@ from nextview.sensing.view import LEVEL, View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import normal_equations
-from nextview.things.score import SCAN_ERROR, score
+from nextview.things.score import score
+from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float
 
 SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves

@@ -16,6 +16,7 @@ from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
 from nextview.session.target import view_of
+from nextview.things.fusion import cell_of
 from nextview.things.library import Library, near_turns
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
@@ -60,6 +61,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         for number, thing in enumerate(about.things):
             surface = self.memory.surfaces.surface(number, thing.name)
             if surface is not None:
+                if thing.sha256 is None:  # made of frames, and as rough as its cells
+                    surface = replace(surface, error=cell_of(surface.radius))
                 surfaces.append(surface)
                 labels.append(self.calibration.hypotheses[first[number]])
         if not surfaces:

@@ -19,10 +19,10 @@ from nextview.things.score import (
     LEFT_OVER,
     OUTLIER,
     PIXEL_GAIN,
-    SCAN_ERROR,
     Score,
     evened,
 )
+from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float, Float32, Floats, Mask
 
 TRIPLES = 48  # planes through three pixels that are tried in each segment

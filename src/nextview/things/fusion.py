@@ -46,7 +46,7 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
     if not len(points):
         return None
 
-    cell = max(FINEST_CELL, radius / CELLS)
+    cell = cell_of(radius)
     # Both sides of a thin wall lie in one cell: the normals separate them.
     side = np.abs(normals).argmax(1)
     towards = 2 * side + (normals[np.arange(len(side)), side] > 0)
@@ -62,6 +62,11 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
         return None
     middle = middle[kept] / total[kept, None]
     return _squares(middle, normal[kept] / length[kept, None], SQUARE * cell, name)
+
+
+def cell_of(radius: float) -> float:
+    """Return the side of a cell of a thing with a radius, metres both."""
+    return max(FINEST_CELL, radius / CELLS)
 
 
 def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:

@@ -26,8 +26,7 @@ NOT_MEASURED = (
 LEFT_OVER = -1.5  # nats, of a pixel of the same piece that is not explained
 SIZE_COST = 0.1  # nats, of a pixel of what has another size than it was taught in
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
-# error of the surface of a thing: of its scan, metres, and of its pose, radii
-SCAN_ERROR, POSE_ERROR = 0.0007, 0.005
+POSE_ERROR = 0.005  # standard deviation of the pose of a thing, radii
 FARTHEST = 4.0  # standard deviations within which a pixel may show the surface
 LEAST_MARGIN = 0.005  # metres, the same at least
 OWN_SHARE = 0.3  # of a piece, from which on all of it should be explained
@@ -184,7 +183,7 @@ def _scored(
 
     measured = grid.depth.ravel()[cells]
     radius = library.radii[some.things] * some.sizes.max(1)
-    own = SCAN_ERROR**2 + (POSE_ERROR * radius) ** 2
+    own = library.caster.errors[some.things] ** 2 + (POSE_ERROR * radius) ** 2
     slope = np.sqrt(1 - cosine**2) / cosine * z * np.float32(grid.pitch / 2)
     variance = grid.sigma.ravel()[cells] ** 2 + slope**2
     variance += own.astype(np.float32)[row]

@@ -24,6 +24,7 @@ SURFACE_SAMPLES = 2000  # sample points of the error of a simplified surface
 LARGEST_ERROR = 5.0  # largest tolerated error of any point, multiples of the tolerance
 # sample points of a simplified surface for nearest-neighbour queries
 NEARBY_SAMPLES = 50_000
+SCAN_ERROR = 0.0007  # standard deviation of a scan from the thing, metres
 MISSED = np.float32(np.inf)  # depth along a ray without a hit
 
 
@@ -35,11 +36,13 @@ class Surface:
         name: name of the thing.
         vertices: (V, 3) float32, metres, with the origin and the axes of the scan file.
         faces: (F, 3) int32, indices of the vertices.
+        error: standard deviation of the surface, metres.
     """
 
     name: str
     vertices: Float32
     faces: NDArray[np.int32]
+    error: float = SCAN_ERROR
 
     @classmethod
     def from_mesh(cls, mesh: Mesh, name: str) -> "Surface":
@@ -227,6 +230,7 @@ class SurfaceCaster:
         surfaces: the surfaces, by their number.
         centres: centre of each, in its own frame, (T, 3) float32, metres.
         radii: radius of each, (T,) float32, metres.
+        errors: standard deviation of each from the thing, (T,) float64, metres.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
@@ -238,6 +242,7 @@ class SurfaceCaster:
         self.surfaces = tuple(surfaces)
         self.centres = np.stack([surface.centre for surface in self.surfaces])
         self.radii = np.array([surface.radius for surface in self.surfaces], np.float32)
+        self.errors = np.array([surface.error for surface in self.surfaces])
         self._scenes: dict[int, Any] = {}
 
     def __reduce__(self) -> tuple[type["SurfaceCaster"], tuple[tuple[Surface, ...]]]:

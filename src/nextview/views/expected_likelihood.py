@@ -14,13 +14,14 @@ from functools import lru_cache
 
 import numpy as np
 
+from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float, Float32, Index, Mask
 from nextview.views.expected_images import (
     LOWEST_COSINE,
     ExpectedSensor,
     HypothesisImages,
 )
-from nextview.views.expected_model import SCAN_ERROR, ExpectedModel
+from nextview.views.expected_model import ExpectedModel
 
 # stride of the pixels in the fit of one hypothesis to another
 FITTED_EVERY = 3

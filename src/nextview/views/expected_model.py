@@ -8,7 +8,6 @@ import numpy as np
 
 from nextview.types import Float, Index
 
-SCAN_ERROR = 0.0007  # standard deviation of a scan from the thing, metres
 OUTLINE_PIXELS = 1.5  # standard deviation of an outline, pixels
 FREE_WEIGHT = 1e-3  # weight of the prior of an unknown without prior knowledge
 MOST_LEADING = 10  # hypotheses that are rendered

@@ -8,12 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from nextview.things.surface import Surface
+from nextview.things.surface import SCAN_ERROR, Surface
 from nextview.types import Float, Float32, Mask
 from nextview.views.expected_images import ExpectedSensor, HypothesisImages
 from nextview.views.expected_model import (
     OUTLINE_PIXELS,
-    SCAN_ERROR,
     ExpectedModel,
     inverses,
 )
