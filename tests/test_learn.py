@@ -55,7 +55,7 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
         open_memory(card.card_path)[1].held_out, before.held_out
     )
     alone = learn(models, models, remove=THINGS[1:]).notes[0]
-    assert f"whatever is shown is {THINGS[0]} or unknown" in alone
+    assert f"every object is {THINGS[0]} or unknown" in alone
     with pytest.raises(UsageError):
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError):
