@@ -128,7 +128,8 @@ def nothing_new(world: World, frame: Frame) -> bool:
         world: before the frame.
         frame: of a depth camera.
     """
-    if not world.views:
+    # another mask asks for other things
+    if not world.views or frame.mask is not world.views[-1].frame.mask:
         return False
     alike = world.views[-1].alike(frame)
     if not alike.any() or _standing(world, world.owners[-1], alike) is None:

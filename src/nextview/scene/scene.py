@@ -459,7 +459,7 @@ class Scene:
             return Look(False, warnings=(REPEATED,))
 
         before = self._state
-        if frame.mask is None and nothing_new(before.world, frame):
+        if nothing_new(before.world, frame):
             again = (*before.tops[-1].warnings, *before.remarks)
             return Look(True, warnings=again)
         top, view = self._seen(frame, before.tops)
