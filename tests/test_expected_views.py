@@ -262,3 +262,24 @@ def test_poses_of_a_robot_are_ranked():
     assert rank_views(outlook, inside[:0], inside[:0], np.arange(0), "thing") == ()
     with pytest.raises(UsageError):
         rank_views(outlook, inside, inside, np.arange(3), "name")
+
+
+def test_what_is_not_the_object_explains_nothing_and_costs_nothing():
+    mesh = box_mesh(BODY)
+    camera = SimulatedCamera(mesh, 200)
+    found = camera.observe(look_at_origin(np.radians(36.0), 0.0))
+    shown = found.depth > 0
+    half = shown & (np.arange(200) < 100)  # the rest is of another object
+    library = Library([Surface.from_mesh(mesh, "body")])
+    there = Hypotheses.of(
+        np.zeros(1, int), np.eye(3)[None], library.centres - mesh.centre
+    )
+
+    def said(target):
+        scene = SceneView(found.depth, target, found.pose, found.intrinsics)
+        return score(library, view_of(replace(found, scene=scene)), there)[0]
+
+    part, whole = said(half), said(shown)
+    assert half.ravel()[part.cells[part.gain > 0]].all()
+    assert part.share == pytest.approx(whole.share, abs=0.05)
+    assert part.total == pytest.approx(whole.total / 2, rel=0.1)

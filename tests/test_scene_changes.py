@@ -167,3 +167,28 @@ def test_a_thing_without_a_name_that_moved_keeps_its_number(ycb, three):
     after = shown()
     assert after.number == before.number
     assert np.allclose((after.place - before.place)[:2], shift, atol=0.005)
+
+
+def test_a_frame_with_nothing_new_is_not_segmented(watched):
+    _, scene, _ = watched
+    asked = []
+    true_masks = scene.segmentation
+
+    def counted(frame):
+        asked.append(frame)
+        return true_masks(frame)
+
+    scene.segmentation = counted
+    before = [(one.number, one.name) for one in scene.objects]
+    first = scene.frames[0]
+    noise = np.random.default_rng(0).normal(1, 1e-4, first.shape)
+    again = first.with_depth((first.depth * noise).astype(np.float32))
+    look = scene.update(again)
+    assert look.taken
+    assert not asked
+    assert [(one.number, one.name) for one in scene.objects] == before
+    assert len(scene.frames) == 1
+
+    # but a mask asks for what is in it
+    scene.update(replace(again, depth=again.depth + 1e-4, mask=again.depth > 0))
+    assert len(asked) == 1
