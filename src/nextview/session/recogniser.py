@@ -61,7 +61,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         for number, thing in enumerate(about.things):
             surface = self.memory.surfaces.surface(number, thing.name)
             if surface is not None:
-                if thing.sha256 is None:  # made of frames, and as rough as its cells
+                # made of frames, and as rough as its cells
+                if thing.upright and thing.sha256 is None:
                     surface = replace(surface, error=cell_of(surface.radius))
                 surfaces.append(surface)
                 labels.append(self.calibration.hypotheses[first[number]])
