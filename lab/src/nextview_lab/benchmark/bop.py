@@ -24,6 +24,7 @@ from nextview.checks import one_line
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, new_file, only_one, read_record, unfinished
+from nextview.recognition.model_card import find_models
 from nextview.sensing.frame import Frame
 from nextview.session.system import load
 from nextview.things.memory import open_memory
@@ -31,7 +32,6 @@ from nextview_lab.benchmark.frame_answers import (
     FoundObject,
     FrameAnswer,
     FrameAnswers,
-    card_of,
     evenly,
 )
 from nextview_lab.data.real_frames import bop_frame
@@ -372,7 +372,7 @@ def _numbers_of_things(
     dataset: BopDataset,
 ) -> dict[str, int]:
     """The number of each thing that is a model of the dataset, by its name."""
-    card, _ = open_memory(card_of(memory))
+    card, _ = open_memory(find_models(memory).recogniser)
     assert card.memory is not None
     things = [thing.name for thing in card.memory.things]
     for name in given:
@@ -404,7 +404,7 @@ def _few(names: Sequence[str]) -> str:
 
 def _key(dataset: BopDataset, how: BopOptions) -> str:
     """What the part of each image depends on."""
-    card, _ = open_memory(card_of(how.models))
+    card, _ = open_memory(find_models(how.models).recogniser)
     depends = [
         str(dataset.folder.resolve()),
         how.split,

@@ -15,15 +15,9 @@ from nextview.files import read_record, write_record
 from nextview.scene.scene import Scene
 from nextview.sensing.frame import Frame
 from nextview.session.system import System
-from nextview.teaching.learn import CARD
 from nextview.types import Float
 
 Item = TypeVar("Item")
-
-
-def card_of(memory: str) -> Path | str:
-    """The card of a memory that is named, or given as a folder."""
-    return Path(memory) / CARD if Path(memory).is_dir() else memory
 
 
 def evenly(items: Sequence[Item], most: int | None) -> Sequence[Item]:

@@ -11,6 +11,7 @@ import numpy as np
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, new_file, only_one, unfinished
+from nextview.recognition.model_card import find_models
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
 from nextview.things.memory import open_memory
@@ -19,7 +20,6 @@ from nextview_lab.benchmark.board_page import WrittenTable
 from nextview_lab.benchmark.frame_answers import (
     FrameAnswer,
     FrameAnswers,
-    card_of,
     evenly,
 )
 from nextview_lab.benchmark.statistics import wilson
@@ -125,7 +125,7 @@ def recognise_real(
     check_new(out, overwrite)
     if out.suffix.lower() != ".csv":
         raise UsageError(f"{out}: the name ends in .csv")
-    card, _ = open_memory(card_of(models))
+    card, _ = open_memory(find_models(models).recogniser)
     system = load(models)
     there = {
         f"{each}: {frame.name}": frame
