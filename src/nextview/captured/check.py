@@ -126,7 +126,12 @@ def _evenly_spread(capture: Capture) -> list[int]:
 
 
 def evenly_spread(count: int, most: int) -> Index:
-    """Return evenly spaced numbers below a count."""
+    """Return evenly spaced numbers below a count.
+
+    Args:
+        count: above the largest number.
+        most: of numbers that are returned.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 

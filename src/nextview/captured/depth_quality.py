@@ -8,28 +8,31 @@ looks as if the plane were elsewhere, is taken into account, and is not told.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from nextview.captured.check import evenly_spread
 from nextview.captured.frames import Capture
-from nextview.sensing.facets import noise_of
+from nextview.files import new_file
+from nextview.sensing.facets import MEDIAN_OF_NORMAL, noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import TILT, Plane, Samples, find_plane, sample
 from nextview.sensing.registration import CAMERA_AIM, CAMERA_PLACE
 from nextview.types import Float
 
-FRAMES_READ = 12
+FRAMES_READ = 12  # of each camera, at most: a second
 SPARSE = 101  # each so manyth pixel is asked for its depth
-MEDIAN_OF_NORMAL = 0.6745  # median of the size of a normal deviate
 # metres, and such a share of the distance, between sightings of one plane
 SAME_PLANE = 0.05
 # standard deviations before anything is measured
-FACTOR_SPREAD, OFFSET_SPREAD = 0.1, 0.02  # of 1; metres
+FACTOR_SPREAD = 0.1
+OFFSET_SPREAD = 0.02  # metres
 USUAL_MISFITS = 4  # so many sightings count for the usual errors of poses
 TOLD = 0.015  # largest uncertainty of a scale that is told
 # pixels of single things from which on most are named, docs/your_camera.md
 NAMED_PIXELS = 1000
+GUIDES = {"die": 1.6, "golf ball": 4.3, "mug": 9.0, "bottle": 25.0}  # centimetres
 Sighting = tuple[Plane, Samples]  # those on the plane
 
 
@@ -46,7 +49,8 @@ class ScaleError:
     uncertainty: float
 
     def __str__(self) -> str:
-        share, within = 100 * abs(self.share), 200 * self.uncertainty
+        share = 100 * abs(self.share)
+        within = 200 * self.uncertainty
         if share <= within:
             return f"the scale of the depth is right within {share + within:.1f} %"
         long = "long" if self.share > 0 else "short"
@@ -94,6 +98,7 @@ class DepthQuality:
                 strict=True,
             )
         ]
+
         if self.uneven is not None:
             said.append(f"the largest plane is flat within {1000 * self.uneven:.1f} mm")
         said.append(
@@ -103,6 +108,50 @@ class DepthQuality:
             else str(self.scale)
         )
         return said
+
+
+def draw_quality(quality: DepthQuality, path: Path, overwrite: bool) -> None:
+    """Draw which things can be told apart at which distance.
+
+    Args:
+        quality: of the depth of a camera.
+        path: output file, PNG.
+        overwrite: whether to replace an existing one.
+    """
+    from nextview.figures.style import (  # slow to import
+        ACCENT,
+        BLUE,
+        GREY,
+        legend,
+        new_figure,
+        to_png,
+    )
+
+    figure, axes = new_figure(5.6, 3.6)
+    for size, colour, label in (
+        (quality.smallest(), BLUE, "smallest thing that gets a name"),
+        (quality.detail(), ACCENT, "smallest difference"),
+    ):
+        axes.plot(quality.depths, 100 * size, "o-", color=colour, label=label)
+    axes.set_yscale("log")
+    axes.set_ylim(0.05, 50)
+    axes.set_yticks([0.1, 1, 10], ["1 mm", "1 cm", "10 cm"])
+    axes.minorticks_off()
+    for name, guide in GUIDES.items():
+        axes.axhline(guide, color=GREY, linewidth=0.8, linestyle=":")
+        axes.annotate(
+            name,
+            (0, guide),
+            (3, 2),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            color=GREY,
+            fontsize=8.5,
+        )
+    axes.set_xlabel("distance, m")
+    legend(axes)
+    with new_file(path, overwrite) as part:
+        to_png(figure, part)
 
 
 def quality_of(capture: Capture, camera: str = "") -> DepthQuality:
@@ -128,12 +177,15 @@ def depth_quality(frames: Sequence[Frame], still: bool = True) -> DepthQuality:
     noises = [noise_of(frame) for frame in frames]
     seen = np.concatenate([frame.depth[frame.depth > 0][::SPARSE] for frame in frames])
     depths = np.percentile(seen, (10, 50, 90))
+
+    # the largest plane of each
     sightings = []
     for frame, noise in zip(frames, noises, strict=True):
         samples = sample(frame, frame.depth > 0, noise)
         plane = find_plane(samples, rng)
         if plane is not None:
             sightings.append((plane, samples.some(plane.holds(samples))))
+
     uneven = [
         np.median(np.abs(plane.height(samples.points))) / MEDIAN_OF_NORMAL
         for plane, samples in sightings
@@ -157,7 +209,10 @@ def _scale_error(sightings: Sequence[Sighting]) -> ScaleError | None:
         return None
     normal = np.mean([plane.normal for plane, _ in seen], axis=0)
     normal /= np.linalg.norm(normal)
-    rows, heights, deviations = [], [], []
+
+    rows = []
+    heights = []
+    deviations = []
     for plane, samples in seen:
         above = float(plane.height(samples.camera))
         points = samples.points - samples.camera

@@ -3,13 +3,10 @@
 from pathlib import Path
 
 from nextview.captured.check import check_capture, errors_of_cameras
-from nextview.captured.depth_quality import DepthQuality, quality_of
+from nextview.captured.depth_quality import draw_quality, quality_of
 from nextview.captured.folders import read_capture
 from nextview.cli.common_options import check_file, check_there
 from nextview.cli.progress import console
-from nextview.files import new_file
-
-GUIDES = {"die": 1.6, "golf ball": 4.3, "mug": 9.0, "bottle": 25.0}  # centimetres
 
 
 def check(
@@ -59,7 +56,7 @@ def check(
             said = f"camera {camera}: {sentence}" if camera else sentence
             console.print(said, soft_wrap=True)
         if figure is not None and camera == cameras[0]:
-            _draw(quality, figure, overwrite)
+            draw_quality(quality, figure, overwrite)
     if len(cameras) < 2:
         return
 
@@ -83,41 +80,3 @@ def check(
                 style="yellow",
                 soft_wrap=True,
             )
-
-
-def _draw(quality: DepthQuality, path: Path, overwrite: bool) -> None:
-    """Draw which things can be told apart at which distance."""
-    from nextview.figures.style import (  # slow to import
-        ACCENT,
-        BLUE,
-        GREY,
-        legend,
-        new_figure,
-        to_png,
-    )
-
-    figure, axes = new_figure(5.6, 3.6)
-    for size, colour, label in (
-        (quality.smallest(), BLUE, "smallest thing that gets a name"),
-        (quality.detail(), ACCENT, "smallest difference"),
-    ):
-        axes.plot(quality.depths, 100 * size, "o-", color=colour, label=label)
-    axes.set_yscale("log")
-    axes.set_ylim(0.05, 50)
-    axes.set_yticks([0.1, 1, 10], ["1 mm", "1 cm", "10 cm"])
-    axes.minorticks_off()
-    for name, guide in GUIDES.items():
-        axes.axhline(guide, color=GREY, linewidth=0.8, linestyle=":")
-        axes.annotate(
-            name,
-            (0, guide),
-            (3, 2),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            color=GREY,
-            fontsize=8.5,
-        )
-    axes.set_xlabel("distance, m")
-    legend(axes)
-    with new_file(path, overwrite) as part:
-        to_png(figure, part)

@@ -19,6 +19,7 @@ from nextview.sensing.frame import Frame
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 SIZE = 224  # side of the observation images, the input size of the bundled networks
+MEDIAN_OF_NORMAL = 0.6745  # median of the size of a normal deviate
 LEAST_NOISE = 2e-4  # relative noise of depth assumed for noise-free frames
 ROWS_MEASURED = 20  # approximate number of image rows used to measure it
 
@@ -93,7 +94,7 @@ def _sigma(second: Floats) -> float:
     median = np.partition(second, middle)[
         list(middle)
     ].mean()  # faster than a median that checks for NaN
-    return float(median) / (0.6745 * np.sqrt(6))
+    return float(median) / (MEDIAN_OF_NORMAL * np.sqrt(6))
 
 
 @dataclass(frozen=True)

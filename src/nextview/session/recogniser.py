@@ -56,7 +56,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         self.ruled_out = np.zeros(len(self.classes), bool)
         about = self.card.memory
         assert about is not None
-        surfaces, labels = [], []
+        surfaces = []
+        labels = []
         first = np.unique(self.memory.thing, return_index=True)[1]
         for number, thing in enumerate(about.things):
             surface = self.memory.surfaces.surface(number, thing.name)

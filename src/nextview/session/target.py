@@ -22,11 +22,19 @@ def view_of(observation: Observation) -> View:
     radius = float(observation.radius or 1.0)
     scene = observation.scene
     if scene is None:
-        depth, target = observation.depth, observation.depth > 0
-        pose, intrinsics, support = observation.pose, observation.intrinsics, None
+        depth = observation.depth
+        target = depth > 0
+        pose = observation.pose
+        intrinsics = observation.intrinsics
+        support = None
     else:
-        depth, target = scene.depth, scene.target
-        pose, intrinsics, support = scene.pose, scene.intrinsics, scene.support
+        depth = scene.depth
+        target = scene.target
+        pose = scene.pose
+        intrinsics = scene.intrinsics
+        support = scene.support
+
+    # in metres
     pose = pose.copy()
     pose[:3, 3] *= radius
     metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32) * np.float32(
@@ -36,6 +44,7 @@ def view_of(observation: Observation) -> View:
     height = np.full(depth.shape, NOT_LEVEL, np.float32)
     if support is not None:
         height = frame.along(support[:3], float(support[3]) * radius)
+
     none = np.zeros(depth.shape, bool)
     measured = frame.depth > 0
     instances = Instances((target & measured,), none, none)
