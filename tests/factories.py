@@ -32,10 +32,9 @@ from nextview.geometry.resting import resting_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.inference import BINS_OUTPUT
 from nextview.recognition.map_names import measure_of
-from nextview.recognition.novelty import unit
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS, Sensor
-from nextview.things.memory import AZIMUTHS, RINGS, taught_meshes
+from nextview.things.memory import taught_meshes
 
 FURNITURE = ["chair", "monitor", "table"]
 """Of ``write_furniture``."""
@@ -104,19 +103,18 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
     return folder
 
 
-def drawn_thing(name: str, size: int = 256) -> dict[str, np.ndarray]:
-    """What is remembered of a thing, drawn instead of looked at, with features of a size."""
+def drawn_thing(name: str) -> dict[str, np.ndarray]:
+    """What is taught of a thing, drawn instead of looked at: a tetrahedron."""
     rng = np.random.default_rng([*name.encode()])
     return {
-        "views": unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, size))).astype(
-            np.float16
-        ),
         "rotations": np.eye(3, dtype=np.float32)[None],
-        "held_out": unit(rng.normal(size=(8, size))).astype(np.float16),
-        "held_out_views": np.zeros((8, 2), np.float32),
         "radii": np.array([0.1], np.float32),
         "upright": np.array([False]),
-        "pictures": np.zeros((64, 64), np.uint8),
+        "pictures": np.zeros((1, 64, 64), np.uint8),
+        "vertices": rng.uniform(-0.1, 0.1, (4, 3)).astype(np.float32),
+        "faces": np.array([(0, 1, 2), (0, 2, 3), (0, 3, 1), (1, 3, 2)], np.int32),
+        "symmetries": np.zeros((0, 4)),
+        "near_symmetries": np.zeros((0, 4)),
     }
 
 

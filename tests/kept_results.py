@@ -38,18 +38,11 @@ class Kept:
         return pickle.loads(file.read_bytes())
 
 
-def of_teach(path, name, how, threads=1, features=True) -> bytes | None:
+def of_teach(path, name, how) -> bytes | None:
     """Of ``thing_views.teach`` for a mesh file that refers to no other file."""
     if not path.is_file() or path.suffix.lower() not in (".off", ".ply", ".stl"):
         return None
-    return repr((path.name, name, how, features)).encode() + path.read_bytes()
-
-
-def of_features(lying, name, sensor, seed, threads=1) -> bytes:
-    """Of ``view_features.features_of``."""
-    meshes = [mesh.vertices.tobytes() + mesh.faces.tobytes() for mesh in lying]
-    sizes = [(len(mesh.vertices), mesh.metres) for mesh in lying]
-    return repr((sizes, name, sensor, seed)).encode() + b"".join(meshes)
+    return repr((path.name, name, how)).encode() + path.read_bytes()
 
 
 def of_show(card, sensor, seed, item) -> bytes:

@@ -99,7 +99,6 @@ def kept_things(shared):
     with pytest.MonkeyPatch.context() as patched:
         for module, name, given in (
             (learn_module, "teach", kept_results.of_teach),
-            (learn_module, "features_of", kept_results.of_features),
             (learn_module, "show", kept_results.of_show),
             (factories, "resting_poses", kept_results.of_mesh),
         ):
@@ -131,14 +130,14 @@ def kept_networks():
 @pytest.fixture
 def taught_afresh(monkeypatch):
     """Teach and test things as if for the first time, where a test asks for the same twice."""
-    for name in ("teach", "features_of", "show"):
+    for name in ("teach", "show"):
         kept = getattr(learn_module, name)
         monkeypatch.setattr(learn_module, name, kept.function)
 
 
 @pytest.fixture(scope="session")
 def scans(shared) -> Path:
-    """Three meshes in one folder, centimetres."""
+    """Three meshes in one folder, metres."""
 
     def make(folder: Path) -> None:
         for name in factories.FURNITURE:
@@ -153,7 +152,9 @@ def taught(shared, scans) -> Path:
     return (
         shared(
             "taught",
-            lambda folder: learn(scans, folder / "mine", upright=True, workers=0),
+            lambda folder: learn(
+                scans, folder / "mine", unit="m", upright=True, workers=0
+            ),
         )
         / "mine"
     )
@@ -175,30 +176,12 @@ def knobs(shared) -> Path:
 
 @pytest.fixture(scope="session")
 def knobs_memory(shared, knobs) -> Path:
-    """A memory of them that knows their geometry."""
+    """A memory of them."""
 
     def make(folder: Path) -> None:
         learn(knobs, folder / "mine", unit="m", upright=True, workers=0)
 
     return shared("knobs_memory", make) / "mine"
-
-
-@pytest.fixture(scope="session")
-def mixed_memory(shared, knobs_memory) -> Path:
-    """A memory of one of them and of a block of unknown size: with features, and the geometry of
-    that one.
-    """
-
-    def make(folder: Path) -> None:
-        shutil.copytree(knobs_memory, folder / "mine")
-        mine = folder / "mine"
-        learn(mine, mine, remove=("can", "plain"), workers=0)
-        (folder / "unsized").mkdir()
-        block = factories.box((3, 2, 1), (0, 0, 0.5))
-        block.export(folder / "unsized" / "block.ply")
-        learn(folder / "unsized", mine, add=True, upright=True, workers=0)
-
-    return shared("mixed_memory", make) / "mine"
 
 
 @pytest.fixture(scope="session")

@@ -69,29 +69,27 @@ def steps(work, place, ready, after, kinds=CHANGES | {"open"}):
 
 LEARN = """
 import shutil
-from types import SimpleNamespace
 from factories import drawn_thing
 from nextview.teaching import learn as module
 from nextview.teaching.learn import learn
 from nextview.things.memory import open_memory
 
 
-SIZE = 16  # of a feature
-module.teach = lambda path, name, *more: drawn_thing(f"{name} {path.read_text()}", SIZE)
-module.draw_learned = lambda path, pictures, fit: path.write_text(" ".join(pictures))
-module.Features = lambda threads: SimpleNamespace(size=SIZE)
+module.teach = lambda path, name, how: drawn_thing(f"{name} {path.read_text()}")
+module.show = lambda *given: []
+module.draw_learned = lambda path, pictures, *about: path.write_text(" ".join(pictures))
 folder = Path(sys.argv[1])
 old, out = folder / "old", folder / "place" / "mine"
 for name, things in {"first": "box ball", "more": "cup", "other": "ball box"}.items():
     (folder / name).mkdir()
     for thing in things.split():
         (folder / name / f"{thing}.off").write_text(name)
-learn(folder / "first", old, workers=0)
+learn(folder / "first", old, unit="m", workers=0)
 
 
 def known(out):
     card, memory = open_memory(out / "memory.json")
-    return [[thing.name for thing in card.memory.things], float(memory.views.astype(float).sum())]
+    return [[thing.name for thing in card.memory.things], memory.surfaces.boxes.tolist()]
 
 
 def ready():
@@ -100,7 +98,7 @@ def ready():
 
 
 def work():
-    learn(folder / "more", out, add=True, workers=0)
+    learn(folder / "more", out, unit="m", add=True, workers=0)
 
 
 ready()
@@ -113,7 +111,7 @@ def after():
     which = "old" if found == known(old) else "new" if found == new else str(found)
     # A further run works, and removes what the killed one has left.
     if which == "new":
-        learn(folder / "other", out, overwrite=True, workers=0)
+        learn(folder / "other", out, unit="m", overwrite=True, workers=0)
     else:
         work()
         assert known(out) == new

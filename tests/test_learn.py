@@ -26,7 +26,9 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
     assert system.policy_name == "discriminate"
     assert system.classes == THINGS
     for name in THINGS:
-        result = system.recognise(scans / f"{name}.off", sensor="wrist", seed=1)
+        result = system.recognise(
+            scans / f"{name}.off", unit="m", sensor="wrist", seed=1
+        )
         assert (result.answer, result.confident) == (name, True)
         np.testing.assert_allclose(result.views[-1].belief.sum(), 1)
 
@@ -42,27 +44,40 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
     )
     write_off(more / "bench.off", slab)
     before = open_memory(taught / "memory.json")[1]
-    learn(more, models, upright=True, add=True, workers=0)
+    learn(more, models, unit="m", upright=True, add=True, workers=0)
     card = read_card(models / "memory.json")
     assert card.classes == ("bench", *THINGS)
     np.testing.assert_array_equal(
-        open_memory(card.card_path)[1].views[1:], before.views
+        open_memory(card.card_path)[1].pictures[1:], before.pictures
     )
     learn(models, models, remove=("bench",))
     card = read_card(models / "memory.json")
     assert card.classes == THINGS
-    np.testing.assert_array_equal(
-        open_memory(card.card_path)[1].held_out, before.held_out
-    )
+    after = open_memory(card.card_path)[1]
+    np.testing.assert_array_equal(after.surfaces.places, before.surfaces.places)
+    np.testing.assert_array_equal(after.surfaces.boxes, before.surfaces.boxes)
     alone = learn(models, models, remove=THINGS[1:]).notes[0]
     assert f"every object is {THINGS[0]} or unknown" in alone
     with pytest.raises(UsageError):
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError):
-        learn(scans, models, add=True)
+        learn(scans, models, unit="m", add=True)
     assert "already knows things; --add adds others, --overwrite" in refused(
         capsys, "learn", str(scans), str(models)
     )
+
+
+def test_meshes_without_a_unit_are_refused_at_once_with_the_units_they_may_have(
+    tmp_path,
+):
+    (tmp_path / "scans").mkdir()
+    trimesh.creation.box((60, 60, 80)).export(tmp_path / "scans/tile.ply")
+    with pytest.raises(UsageError, match=r"unit='mm' \(5.8 cm\)"):
+        learn(tmp_path / "scans", tmp_path / "mine", workers=0)
+    (tmp_path / "scans/tile.ply").write_text("no mesh")
+    with pytest.raises(UsageError, match="unit='foot'"):
+        learn(tmp_path / "scans", tmp_path / "mine", workers=0)
+    assert not (tmp_path / "mine").exists()
 
 
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same(

@@ -12,33 +12,18 @@ from safetensors.numpy import load_file, save_file
 from nextview.errors import ModelError
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh
-from nextview.recognition.inference import Features
 from nextview.recognition.model_card import read_card
 from nextview.session.recogniser import open_recogniser
 from nextview.things.memory import open_memory
 
-FLOATS = (
-    "views",
-    "rotations",
-    "held_out",
-    "held_out_views",
-    "radii",
-    "head",
-    "head_bias",
-    "boxes",
-)
-ARRAYS = (*FLOATS, "thing", "pictures", "places", "faces", "counts")
+FLOATS = ("rotations", "radii", "boxes")
+ARRAYS = (*FLOATS, "pictures", "places", "faces", "counts")
 
 
 @pytest.fixture
-def models(mixed_memory, tmp_path):
-    """A copy of a memory of a thing of unknown size and three whose sizes are known."""
-    return shutil.copytree(mixed_memory, tmp_path / "mine")
-
-
-@pytest.fixture(scope="module")
-def features():
-    return Features(threads=1)
+def models(knobs_memory, tmp_path):
+    """A copy of a memory of three things."""
+    return shutil.copytree(knobs_memory, tmp_path / "mine")
 
 
 def open_weights(models):
@@ -79,13 +64,13 @@ OF_FLOATS = {
 }
 OF_ONE = {
     ("rotations", "mirrored"): lambda values: -values,
-    ("held_out_views", "in degrees"): np.degrees,
+    ("radii", "zero"): lambda values: values * 0,
     ("radii", "negative"): lambda values: values * 0 - 0.1,
     ("radii", "finite, but absurd"): lambda values: values * 0 + 1e30,
-    ("thing", "beyond the last"): lambda values: values + 1,
     ("faces", "beyond the last"): lambda values: with_value(values, len(values)),
     ("faces", "all of one vertex"): lambda values: values * 0,
     ("counts", "negative"): lambda values: values * (-1, 1),
+    ("counts", "none of one thing"): lambda values: values * [[2], [1], [0]],
     ("boxes", "mirrored"): lambda values: -values,
     ("boxes", "without extent"): lambda values: values * 0,
 }
@@ -135,21 +120,18 @@ def set_at(path, value):
 
 REFUSED = {
     "one class more": set_at("classes", lambda names: [*names, "mug"]),
-    "other input": set_at("input", {"kind": "geometry", "size": 64}),
     "one hypothesis more": set_at("calibration/hypotheses", lambda h: [*h, h[-1]]),
-    "negative correlation": set_at("calibration/bin_correlation", -0.1),
+    "negative correlation": set_at("calibration/correlation", -0.1),
     "a temperature of next to nothing": set_at("calibration/temperature", 1e-30),
     "sizes of one class less": set_at("size/log_density", lambda rows: rows[:-1]),
     "one thing more": set_at("memory/things", lambda t: [*t, t[-1] | {"name": "mug"}]),
     "a thing twice": set_at("memory/things", lambda t: [*t[:-1], t[0]]),
     "no things": set_at("memory/things", []),
-    "other features": set_at("memory/features_sha256", "0" * 64),
-    "no weight": set_at("memory/weight", 0.0),
-    "novelty of text": set_at("memory/novelty/0/0", "NaN"),
+    "things by features of an earlier version": set_at("azimuth_bins", 16),
     "a symmetry about no axis": set_at(
         "memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]
     ),
-    "an unknown field": set_at("memory/things/0/colour", "red"),
+    "an unknown field": set_at("colour", "red"),
 }
 
 
@@ -158,16 +140,26 @@ def test_a_card_that_does_not_fit_is_refused_by_its_name(models):
     content = card.read_text()
     for how, change in REFUSED.items():
         about = json.loads(content)
-        change(Missing(about) if how == "an unknown field" else about)
+        change(about)
         card.write_text(json.dumps(about))
         with pytest.raises(ModelError):
             open_recogniser(card)
             pytest.fail(how)
 
 
-class Missing(dict):
-    def __getitem__(self, key):
-        return self.get(key)
+def test_a_memory_of_an_earlier_version_is_read_where_it_knows_the_geometry(models):
+    card, weights = models / "memory.json", open_weights(models)
+    about = json.loads(card.read_text())
+    gone = {"features_sha256": None, "weight": 1.0, "novelty": [], "usual": []}
+    about["memory"] |= gone
+    about["memory"]["things"] = [
+        one | {"poses": 1} for one in about["memory"]["things"]
+    ]
+    card.write_text(json.dumps(about))
+    things = len(weights["radii"])
+    views = np.zeros((things, 5, 16, 0), np.float16)
+    write_weights(models, weights | {"thing": np.arange(things), "views": views})
+    assert open_recogniser(card).library.names == ("can", "knob", "plain")
 
 
 def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(

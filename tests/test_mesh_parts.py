@@ -191,7 +191,6 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path):
             path,
             "egg",
             thing_views.TeachingOptions(unit="m", upright=True, largest_part=largest),
-            features=False,
         )
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))

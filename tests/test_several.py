@@ -15,7 +15,6 @@ from nextview.geometry.mesh import make_mesh
 from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.session.recogniser import VerifiedRecogniser
 from nextview.session.several import SeveralRecognisers
-from nextview.things.memory import TaughtRecogniser
 
 
 def memory_of(folder) -> VerifiedRecogniser:
@@ -94,11 +93,7 @@ def test_an_object_of_neither_kind_is_unknown(system):
     assert (result.answer, result.pose) == (None, None)
 
 
-def test_incompatible_models_are_rejected(known):  # noqa: F811
+def test_incompatible_models_are_rejected():
     network = NetworkRecogniser(threads=1)
     with pytest.raises(ModelError):
         SeveralRecognisers({"a": network, "b": network})
-    with pytest.raises(ModelError):
-        SeveralRecognisers(
-            {"a": network, "mine": TaughtRecogniser(known / "memory.json", 1)}
-        )

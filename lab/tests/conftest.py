@@ -43,16 +43,6 @@ def kept_operators():
 
 
 @pytest.fixture(scope="session")
-def shown(shared, scans, taught) -> Path:
-    """They, seen through a sensor: views.zarr, and what the models say of it, predictions.npz."""
-
-    def make(folder: Path) -> None:
-        pipeline.show_taught(scans, taught, folder)
-
-    return shared("shown", make)
-
-
-@pytest.fixture(scope="session")
 def bop(shared) -> Path:
     """A dataset of two images in the layout of BOP."""
     return shared("bop", write_dataset)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from lab_programs import main
 
 from nextview.data.folders import Entry
 from nextview.geometry.observation import pinhole
@@ -84,15 +83,6 @@ def store_of(
         store.group[name if name in RENDERED_ARRAYS else f"measures/{name}"][:] = values
     store.group["status"][:] = DONE
     return store
-
-
-def show_taught(scans: Path, models: Path, folder: Path, *options: str) -> None:
-    """Taught things through a sensor: views.zarr, and what is said of them, predictions.npz."""
-    store = str(folder / "views.zarr")
-    render = ["render", str(scans), store, "--sensor", "wrist", "--rotated", *options]
-    predict = ["predict", store, str(folder / "predictions.npz")]
-    main([*render, "--workers", "0"])
-    main([*predict, "--models", str(models), "--workers", "0"])
 
 
 def of_depth(depth, distance=3.0) -> MeasuredView:

@@ -33,7 +33,7 @@ WRITES = {
         "p.npz",
         "--models {models} --maps lem --split test --workers 0",
     ),
-    "learn": ("learn {scan}", "folder", "--upright --workers 0"),
+    "learn": ("learn {scan}", "folder", "--unit cm --upright --workers 0"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
     "benchmark classes": (
         "benchmark classes {predictions}",
@@ -202,7 +202,7 @@ HOMELY = {
     "pictures": (
         "import nextview; from nextview.cli.main import main;"
         " nextview.recognise(SAMPLE).plot('e.png');"
-        " main(['learn', SCAN, 'mine', '--upright', '--workers', '0'])"
+        " main(['learn', SCAN, 'mine', '--unit', 'cm', '--workers', '0'])"
     ),
 }
 

@@ -33,9 +33,6 @@ class EpisodeState:
             live session has one, 0.
         azimuth_bins: belief, over all views, in the azimuth bin of the current view for each class,
             (B, classes, azimuth bins) float64; None unless the policy needs it.
-        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` and azimuth
-            bin of the current view, (B, hypotheses, azimuth bins) float64; None unless the policy
-            needs it.
         reachable: views that the camera can reach, (B, V) bool; None for all.
         travel: cost of moving to each view, grid cells, (B, V) float64; None for the travel of the
             viewpoints.
@@ -70,7 +67,6 @@ class EpisodeState:
     places: Float | None = None
     observations: Sequence[Sequence[Observation]] | None = None
     visibility: Float | None = None
-    joint: Float | None = None
     outlook: Sequence[Outlook | None] | None = None
 
     @property
@@ -105,8 +101,7 @@ class Policy(Protocol):
     def needs(self) -> tuple[str, ...]:
         """Names of the required inputs.
 
-        These are maps in the evidence, "azimuth_bins", "joint", "observations", "outlook" and
-        "visibility".
+        These are maps in the evidence, "azimuth_bins", "observations", "outlook" and "visibility".
         """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:

@@ -17,7 +17,6 @@ from nextview.policies.baselines import (
     Spread,
     Unidirectional,
 )
-from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
@@ -257,20 +256,18 @@ def _of_memory(
     sphere: Viewpoints,
     classes: tuple[str, ...] | None,
 ) -> Policy:
-    """Return the policy for a memory: by surfaces, or else by stored views."""
-    about, memory = open_memory(card)
+    """Return the policy for a memory."""
+    about, _ = open_memory(card)
     if classes is not None and about.classes != classes:
         known = ", ".join(about.classes[:10])
         raise OtherUseError(f"{card}: discriminates other things ({known})")
-    if memory.surfaces.counts.any():
-        return DiscriminateGeometry(sphere)
-    return Discriminate.from_card(card, sphere)
+    return DiscriminateGeometry(sphere)
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(
         policy,
-        Discriminate | DiscriminateGeometry | Gain | MostVisible | VisibleGain,
+        DiscriminateGeometry | Gain | MostVisible | VisibleGain,
     ):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:

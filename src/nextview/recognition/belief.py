@@ -86,14 +86,13 @@ def log_evidence_of(
 
     Args:
         logits: (..., classes).
-        azimuth_bins: log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth bins);
-            None without azimuth bins. The hypotheses are the classes, or see
-            ``Calibration.hypotheses``.
+        azimuth_bins: log-likelihoods of the azimuth bins seen, (..., classes, azimuth bins); None
+            without azimuth bins.
         azimuth: of the views, radians, (...).
 
     Returns:
-        (..., classes + azimuth bins * hypotheses): the logits, then for each azimuth the
-        log-evidence that bin 0 points there, given each hypothesis. Without azimuth bins the logits
+        (..., classes + azimuth bins * classes): the logits, then for each azimuth the
+        log-evidence that bin 0 points there, given each class. Without azimuth bins the logits
         alone.
     """
     if azimuth_bins is None:
@@ -216,8 +215,7 @@ class Calibration(
         risk: error bounds that ``--risk`` uses; None if they are not known.
         bin_correlation: of the azimuth bins of two views, 0 to 1; None if azimuth bins do not count
             as evidence of the class.
-        hypotheses: class of each hypothesis, ascending. The hypotheses are things, each in every
-            resting pose that was taught; () if the hypotheses are the classes.
+        hypotheses: class of each taught thing, ascending; () for a network of classes.
     """
 
     temperature: float = 1.0
@@ -278,64 +276,16 @@ class Calibration(
         top = pointing.max(-2)
         pointing -= top[..., None, :]
         agreement = top + np.log(np.exp(pointing, out=pointing).sum(-2))
-        if self.hypotheses:  # a class is the sum of its things
-            first = np.unique(self.hypotheses, return_index=True)[1]
-            top = agreement.max(-1, keepdims=True)
-            # What underflows is far below the best, but still ordered.
-            shares = np.add.reduceat(np.exp(agreement - top), first, -1)
-            agreement = (
-                np.maximum(
-                    np.log(shares + 1e-300),
-                    np.maximum.reduceat(agreement, first, -1) - top,
-                )
-                + top
-            )
         return logs + agreement
 
     def _pointing(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
-        """Log-evidence of the directions of azimuth bin 0, (..., azimuth bins, hypotheses)."""
+        """Log-evidence of the directions of azimuth bin 0, (..., azimuth bins, classes)."""
         correlation = (
             self.correlation if self.bin_correlation is None else self.bin_correlation
         )
         sums = np.asarray(total, np.float64)[..., classes:]
-        pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
+        pointing = sums.reshape(*sums.shape[:-1], -1, classes)
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
-
-    def joint(
-        self,
-        total: Floats,
-        n_views: NDArray | int,
-        classes: int,
-        azimuth: Floats,
-    ) -> Float:
-        """Return the joint belief in hypotheses and the azimuth bins from which they are seen.
-
-        Args:
-            total: sum of ``log_evidence_of`` over the views, (..., D).
-            n_views: number of views in the sum, (...).
-            classes: number of classes.
-            azimuth: from which the bins are counted, radians, (...).
-
-        Returns:
-            Belief, (..., hypotheses, azimuth bins) float64; sums to 1 over both.
-        """
-        total = np.asarray(total, np.float64)
-        logs = reorient(
-            self._pointing(total, n_views, classes).swapaxes(-1, -2),
-            azimuth,
-        )
-        of_class = total[..., :classes] / self.temperature_after(
-            np.asarray(n_views)[..., None]
-        )
-        logs = (
-            logs
-            + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[
-                ...,
-                None,
-            ]
-        )
-
-        return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
     def belief(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
         """Return the belief in each class.
@@ -360,7 +310,7 @@ class Calibration(
         classes: int,
         azimuth: Floats,
     ) -> Float | None:
-        """Return the belief in the azimuth bin seen from an azimuth, given each hypothesis.
+        """Return the belief in the azimuth bin seen from an azimuth, given each class.
 
         Args:
             total: sum of ``log_evidence_of`` over the views, (..., D).
@@ -369,7 +319,7 @@ class Calibration(
             azimuth: from which the object is seen, radians, (...).
 
         Returns:
-            Belief, (..., hypotheses, azimuth bins) float64; sums to 1 over the bins. None without
+            Belief, (..., classes, azimuth bins) float64; sums to 1 over the bins. None without
             bins.
         """
         if total.shape[-1] == classes:

@@ -1,4 +1,4 @@
-"""Run networks with ONNX Runtime: the recogniser, map networks and memories."""
+"""Run networks with ONNX Runtime: the recogniser and map networks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import ViewSphere, direction_of, elevation_of
+from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE_SUFFIX, maps_among
 from nextview.recognition.model_card import (
@@ -29,7 +29,7 @@ from nextview.recognition.novelty import (
 )
 from nextview.recognition.protocol import Recogniser
 from nextview.runtime import InputShape, check_end, open_onnx, ort, run_onnx
-from nextview.types import Float, Float32, Floats
+from nextview.types import Float, Float32
 
 INPUT = "input"
 BINS_OUTPUT = "sides"
@@ -138,22 +138,13 @@ class NetworkRecogniser:
 
     def by_shape(self, observations: Sequence[Observation]) -> Evidence:
         """Return the evidence of B views by shape alone, without their size."""
-        inputs = from_observations(self.card.input, observations)
-        elevations = np.array(
-            [elevation_of(direction_of(o.pose)) for o in observations]
-        )
-        return self.from_inputs(inputs, elevations)
+        return self.from_inputs(from_observations(self.card.input, observations))
 
-    def from_inputs(
-        self,
-        inputs: NDArray[Any],
-        elevations: Floats | None = None,
-    ) -> Evidence:
+    def from_inputs(self, inputs: NDArray[Any]) -> Evidence:
         """Return the evidence by shape alone from prepared inputs.
 
         Args:
             inputs: what the network takes, (B, ...).
-            elevations: of the cameras, radians, (B,); only memories of things use them.
 
         Returns:
             The evidence of the views.

@@ -14,7 +14,7 @@ MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}
 # how the name of a map of the whole sphere ends; without this it is the map of the local window
 SPHERE_SUFFIX = "-sphere"
 # what else a policy may need
-NO_MAPS = ("azimuth_bins", "joint", "observations", "outlook", "visibility")
+NO_MAPS = ("azimuth_bins", "observations", "outlook", "visibility")
 
 
 def map_name(measure: str) -> str:

@@ -23,7 +23,7 @@ from nextview.recognition.network_input import InputSpec
 
 BUNDLED_MODELS = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
-# the bundled network that knows no classes: what taught things are remembered by
+# the bundled network that knows no classes: the novelty of an object is that of its features
 FEATURE_NETWORK = "features"
 MEMORY_SUFFIX = ".safetensors"
 # the policy of a memory of things; its card is that of the memory
@@ -35,11 +35,9 @@ MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
 NO_FOLDER = Path()
 SCHEMA = 2  # of the cards of models; those of policies have 1
 LARGEST_CARD_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
-LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
 LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
 # by which the axis of a symmetry may be too long: cards hold rounded numbers
 UNIT_LENGTH = 1e-3
-MOST_TAUGHT_POSES = 1000  # of a thing; what is taught has a handful
 # hexadecimal digits of the SHA-256 of a memory that its file's name holds
 SHORT_HASH = 16
 
@@ -78,14 +76,13 @@ class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ModelError("the axis of a symmetry is not a unit vector")
 
 
-class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One taught thing.
+class Thing(msgspec.Struct, frozen=True):
+    """One taught thing. Fields that only earlier versions knew are ignored.
 
     Attributes:
         name: Its name, unique among the things of a memory.
         source: The file or folder that it was taught from.
-        poses: In how many resting poses it was taught.
-        symmetries: Of its surface; () for none, and where its geometry is not known.
+        symmetries: Of its surface; () for none.
         near_symmetries: Turns after which it hardly looks different; its symmetries are among them.
         upright: Whether it is known only as it stands: it was taught so, or captured.
         sha256: Hash of its mesh file; None for captured frames, and in cards of earlier versions.
@@ -93,59 +90,29 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     source: str
-    poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_TAUGHT_POSES)]
     symmetries: tuple[Symmetry, ...] = ()
     near_symmetries: tuple[Symmetry, ...] = ()
     upright: bool = False
     sha256: HashText | None = None
 
 
-class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a memory of things is of.
+class Taught(msgspec.Struct, frozen=True):
+    """What a memory of things is of. Fields that only earlier versions knew are ignored.
 
     Attributes:
         things: The things, in order.
-        features_sha256: The SHA-256 of the network whose features are remembered; None if the
-            things are recognised by their geometry alone.
-        weight: Of a cosine of features, as a log-likelihood.
         attribution: Whose work the things are, in words.
-        novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative
-            log-likelihood of known things, given the class that explains them best; () if that was
-            not fitted.
-        usual: See ``novelty.Quantiles``; () if that was not fitted.
-        sensor: Camera that the fits are for, NAME or NAME:STRENGTH; "" in cards of earlier
-            versions.
+        sensor: Camera of the test, NAME or NAME:STRENGTH; "" in cards of earlier versions.
     """
 
     things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
-    features_sha256: HashText | None = None
-    weight: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_WEIGHT)] = 1.0
     attribution: str = ""
-    novelty: tuple[tuple[float, ...], ...] = ()
-    usual: tuple[tuple[float, ...], ...] = ()
     sensor: str = ""
 
     def __post_init__(self) -> None:
         names = {thing.name for thing in self.things}
         if len(names) < len(self.things):
             raise ModelError("two things have the same name")
-
-        levels = {len(row) for row in self.novelty}
-        if self.novelty and (len(levels) > 1 or min(levels) < 2):
-            raise ModelError(
-                "the quantiles of the novelty are not of the same length, two at least"
-            )
-
-        for row in self.novelty:
-            if list(row) != sorted(row):
-                raise ModelError("the quantiles of the novelty do not ascend")
-
-    @property
-    def poses(self) -> tuple[int, ...]:
-        """The index of the thing of each resting pose, as in ``Memory.thing``."""
-        return tuple(
-            index for index, thing in enumerate(self.things) for _ in range(thing.poses)
-        )
 
 
 class ModelCard(
@@ -160,8 +127,7 @@ class ModelCard(
 
     The weights of a network are an ONNX file, those of a memory of taught things (a recogniser too)
     a safetensors file. ModelError is raised for a recogniser without classes, sizes of other
-    classes, a network without an input, or a memory whose classes or resting poses do not match its
-    things.
+    classes, a network without an input, or a memory whose classes do not match its things.
 
     Attributes:
         name: name of the model.
@@ -228,10 +194,10 @@ class ModelCard(
                 f"sizes of {len(self.size.log_density)} classes, not {len(self.classes)}"
             )
         if self.memory is not None:
-            self._check_memory(self.memory)
+            self._check_memory()
 
-    def _check_memory(self, memory: Taught) -> None:
-        """See that things, resting poses and classes fit together."""
+    def _check_memory(self) -> None:
+        """See that things and classes fit together."""
         if not self.is_recogniser:
             raise ModelError(f"a memory of things is a recogniser, not a {self.kind}")
 
@@ -241,23 +207,6 @@ class ModelCard(
         if not hypotheses or hypotheses[-1] + 1 != len(self.classes):
             raise ModelError(
                 f"its hypotheses are not of its {len(self.classes)} classes"
-            )
-        has_features = memory.features_sha256 is not None
-        if has_features and self.calibration.bin_correlation is None:
-            raise ModelError("a memory of views has a calibration of its azimuth bins")
-
-        poses = memory.poses
-        if len(poses) != len(hypotheses):
-            raise ModelError(
-                f"its things have {len(poses)} resting poses, and its hypotheses are"
-                f" {len(hypotheses)}"
-            )
-        if len(set(zip(poses, hypotheses, strict=True))) > len(memory.things):
-            raise ModelError("a thing is of two classes")
-
-        if any(len(row) != len(self.classes) for row in memory.usual):
-            raise ModelError(
-                f"its usual novelty is not of its {len(self.classes)} classes"
             )
 
     @property

@@ -6,9 +6,8 @@ This is out-of-distribution detection.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,16 +43,10 @@ class Quantiles:
         quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of
             probability from 0 to 1, (views, Q) float32.
         objects: how many known objects they are of, (1,) int64.
-        joint: whether a view's score is that of all views up to it, see ``of_belief``; else the
-            score of several is their mean.
-        usual: how much more novel than others those of each class are after 1, 2, ... views,
-            (views, classes): it is taken off a joint score; None where that is not known.
     """
 
     quantiles: Floats
     objects: Index
-    joint: bool = field(default=False, kw_only=True)
-    usual: Floats | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_array("its quantiles", self.quantiles, np.floating, (None, None))
@@ -66,21 +59,16 @@ class Quantiles:
         if self.objects[0] < 1:
             raise ModelError(f"it is of {self.objects[0]} known objects")
 
-        if self.usual is not None:
-            check_array("its usual", self.usual, np.floating, (None, None))
-
     @property
     def least_p_value(self) -> float:
-        """Smallest possible p-value; 0 for a joint score, whose p-values have no lower bound."""
-        return 0.0 if self.joint else 1 / (1 + int(self.objects[0]))
+        """Smallest possible p-value."""
+        return 1 / (1 + int(self.objects[0]))
 
     def p_value(self, score: Floats | float, n_views: Index | int) -> Float:
         """Return the share of known objects that are at least as novel.
 
         This is a conformal p-value (Vovk et al., 2005): an object of a known class falls below p in
-        a share p of the cases. It cannot fall below one in all known objects and one. Few things
-        have few known views, so a joint score beyond all of these has the p-value of a normal
-        distribution if that is smaller.
+        a share p of the cases. It cannot fall below one in all known objects and one.
 
         Args:
             score: mean novelty score over the views, (...).
@@ -100,39 +88,14 @@ class Quantiles:
             found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (
                 n + 1
             )
-            if self.joint and score[index] > row[-1]:
-                off = float((score[index] - row.mean()) / max(row.std(), 1e-9))
-                found[index] = min(
-                    float(found[index]),
-                    math.erfc(off / math.sqrt(2)) / 2,
-                )
 
         return found
-
-    def of_belief(self, log_belief: Floats, n_views: int) -> float:
-        """Return the joint novelty score of an object.
-
-        Args:
-            log_belief: log-belief in each class, up to a constant, (C,).
-            n_views: number of views that it is based on.
-
-        Returns:
-            The score: the higher, the more novel.
-        """
-        best = int(log_belief.argmax())
-        usual = (
-            0.0
-            if self.usual is None
-            else self.usual[min(n_views, len(self.usual)) - 1, best]
-        )
-        return float(-log_belief[best] - usual)
 
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
         if not scores:
             return 1.0
-        score = scores[-1] if self.joint else float(np.mean(scores))
-        return float(self.p_value(score, len(scores)))
+        return float(self.p_value(float(np.mean(scores)), len(scores)))
 
 
 @dataclass(frozen=True)

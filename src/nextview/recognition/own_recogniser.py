@@ -82,8 +82,7 @@ class OwnRecogniser:
         wanted = (len(observations), len(self.classes))
         self._check("logits", evidence.logits, wanted)
         if self.azimuth_bins:
-            hypotheses = len(self.calibration.hypotheses) or len(self.classes)
-            bins = (len(observations), hypotheses, self.azimuth_bins)
+            bins = (*wanted, self.azimuth_bins)
             self._check("azimuth bins", evidence.azimuth_bins, bins)
         if evidence.seen is not None:
             return evidence

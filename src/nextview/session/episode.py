@@ -317,20 +317,12 @@ class Episodes:
         step = taken.step
         needs = self.policy.needs
         azimuth_bins = None
-        joint = None
         total = step.total[going]
         weighed = np.maximum(step.seen, 1)[going]
         classes = step.belief.shape[1]
 
         if "azimuth_bins" in needs:
             azimuth_bins = self.calibration.azimuth_bins(
-                total,
-                weighed,
-                classes,
-                taken.azimuth[going],
-            )
-        if "joint" in needs:
-            joint = self.calibration.joint(
                 total,
                 weighed,
                 classes,
@@ -346,7 +338,6 @@ class Episodes:
             step.episodes[going],
             azimuth_bins,
             places=None if taken.places is None else taken.places[going],
-            joint=joint,
             observations=self._observations(step, step.episodes[going])
             if "observations" in needs
             else None,

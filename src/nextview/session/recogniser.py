@@ -1,4 +1,4 @@
-"""Recogniser of taught things: by their geometry, where it is known, and else by features."""
+"""Recogniser of taught things, by their geometry."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from nextview.errors import ModelError
 from nextview.geometry.observation import Observation
+from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
 from nextview.session.target import view_of
 from nextview.things.fusion import cell_of
 from nextview.things.library import Library, near_turns
-from nextview.things.memory import TaughtRecogniser, open_memory
+from nextview.things.memory import open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
 from nextview.things.world import World, corrected
 from nextview.types import Floats, Index, Mask
@@ -30,46 +30,43 @@ NOTHING_FITS = "no taught thing explains the views"
 OTHER_SIZE = 5.0  # times smaller or larger than all things are: it is none of them
 
 
-class VerifiedRecogniser(TaughtRecogniser):
+class VerifiedRecogniser(NetworkRecogniser):
     """Recognises taught things in all views together: by what explains their pixels best.
 
-    The evidence of single views, which policies use, comes from the features and sizes of the
-    memory.
+    The evidence of single views is that of the size alone.
 
     Attributes:
-        library: the things of known geometry.
+        library: the things.
         labels: class of each of them, (T,) int64.
         ruled_out: classes that the object is not, (C,) bool.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
-        """Open a memory with surfaces.
+        """Open a memory.
 
         Args:
             model: name of a bundled memory, or the path of its card.
-            threads: number of threads of ONNX Runtime, 0 for one on each core.
+            threads: number of threads; 0 for one on each core.
 
         Raises:
-            ModelError: see ``open_memory``, or the memory contains no geometry.
+            ModelError: see ``open_memory``.
         """
-        super().__init__(model, threads)
+        self.card, self.memory = open_memory(model)
+        self.classes = self.card.classes
+        self.azimuth_bins = 0
+        self.calibration = self.card.calibration
+        self.novelty = None
         self.ruled_out = np.zeros(len(self.classes), bool)
         about = self.card.memory
         assert about is not None
         surfaces = []
-        labels = []
-        first = np.unique(self.memory.thing, return_index=True)[1]
         for number, thing in enumerate(about.things):
             surface = self.memory.surfaces.surface(number, thing.name)
-            if surface is not None:
-                # made of frames, and as rough as its cells
-                if thing.upright and thing.sha256 is None:
-                    surface = replace(surface, error=cell_of(surface.radius))
-                surfaces.append(surface)
-                labels.append(self.calibration.hypotheses[first[number]])
-        if not surfaces:
-            raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
-        self.labels: Index = np.array(labels)
+            # made of frames, and as rough as its cells
+            if thing.upright and thing.sha256 is None:
+                surface = replace(surface, error=cell_of(surface.radius))
+            surfaces.append(surface)
+        self.labels: Index = np.array(self.calibration.hypotheses)
         symmetries = {thing.name: thing.symmetries for thing in about.things}
         near = {
             thing.name: near_turns(thing.near_symmetries, thing.symmetries)
@@ -81,6 +78,11 @@ class VerifiedRecogniser(TaughtRecogniser):
     def __getstate__(self) -> dict[str, Any]:
         """The attributes without what was explained last."""
         return vars(self) | {"_last": None}
+
+    def by_shape(self, observations: Sequence[Observation]) -> Evidence:
+        """Uniform evidence: single views are not judged by their shape."""
+        shape = len(observations), len(self.classes)
+        return Evidence(np.zeros(shape, np.float32))
 
     def without(self, names: Collection[str]) -> VerifiedRecogniser:
         """The same recogniser for an object that is none of some classes.
@@ -128,7 +130,7 @@ class VerifiedRecogniser(TaughtRecogniser):
 
         Returns:
             The belief in each class and the candidate poses. If the scale is not known, or no
-            thing explains the views, the belief by features alone and the reason.
+            thing explains the views, the belief by size alone and the reason.
         """
         classes = len(self.classes)
         if self.ruled_out.all():
@@ -139,12 +141,6 @@ class VerifiedRecogniser(TaughtRecogniser):
         alone = alone / alone.sum()
         if any(observation.radius is None for observation in observations):
             return JointBelief(alone, why_no_pose=NO_SCALE, doubt=NO_SCALE)
-        likeliest = int(alone.argmax())
-        if likeliest not in self.labels:
-            name = self.classes[likeliest]
-            return JointBelief(
-                alone, why_no_pose=f"the geometry of {name} is not known"
-            )
         radius, radii = float(observations[-1].radius or 0.0), self.library.radii
         if not radii.min() / OTHER_SIZE < radius < radii.max() * OTHER_SIZE:
             return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
@@ -227,7 +223,4 @@ def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
     """
     if find_card(model).memory is None:
         return NetworkRecogniser(model, threads)
-    _, memory = open_memory(model)
-    if memory.surfaces.counts.any():
-        return VerifiedRecogniser(model, threads)
-    return TaughtRecogniser(model, threads)
+    return VerifiedRecogniser(model, threads)

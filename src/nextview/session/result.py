@@ -140,7 +140,7 @@ class Recognition:
         if self.score is None or not self.seen:
             return None
         views = [view.score for view in self.views if view.score is not None]
-        return self.score.of_views(values_of(views, whole=not self.score.joint))
+        return self.score.of_views(values_of(views, whole=True))
 
     @property
     def unknown(self) -> bool:

@@ -1020,8 +1020,7 @@ def _check_needs(policy: Policy, models: Models) -> None:
             f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}"
         )
 
-    of_bins = {"azimuth_bins", "joint"} & set(policy.needs)
-    if of_bins and not models.recogniser.azimuth_bins:
+    if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
         raise SessionError(
             "this policy needs the azimuth bin that is seen, and the recogniser was not taught it"
         )

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from nextview.errors import ModelError, option
+from nextview.errors import ModelError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
@@ -20,7 +20,6 @@ from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_o
 from nextview.recognition.protocol import JointBelief, least_p_value
 from nextview.session.recogniser import VerifiedRecogniser
 from nextview.things.library import Library
-from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats
 
@@ -49,22 +48,17 @@ class SeveralRecognisers:
         """Combine collections.
 
         Args:
-            members: recognisers by the names of their collections: memories of things with
-                geometry, and at most one network, which is moved to the end.
+            members: recognisers by the names of their collections: memories of things, and at most
+                one network, which is moved to the end.
 
         Raises:
-            ModelError: there are two networks, no memory, or a memory without geometry.
+            ModelError: there are two networks, or no memory.
         """
         memories: dict[str, VerifiedRecogniser] = {}
         networks: dict[str, NetworkRecogniser] = {}
         for name, member in members.items():
             if isinstance(member, VerifiedRecogniser):
                 memories[name] = member
-            elif isinstance(member, TaughtRecogniser):
-                what = "knows no geometry of its things"
-                raise ModelError(
-                    f"{name}: {what}; teach them again from meshes with {option('unit')}"
-                )
             else:
                 networks[name] = member
         if len(networks) > 1 or not memories:

@@ -123,7 +123,7 @@ class View:
             arc=0.0,
             direction=direction,
             azimuth_bins=None if bins is None else bins[0],
-            score=_score(observation, evidence, total, counted, recogniser),
+            score=_score(observation, evidence, recogniser),
             joint=joint,
         )
 
@@ -143,23 +143,14 @@ class View:
 def _score(
     observation: Observation,
     evidence: Evidence | None,
-    total: Floats | None,
-    counted: float,
     recogniser: Recogniser,
 ) -> ViewScore | None:
     """Return the novelty score of a view; None if nothing is visible or without such a score."""
-    score = recogniser.novelty
-    if score is None or evidence is None or total is None or not observation.seen:
+    if recogniser.novelty is None or evidence is None or not observation.seen:
         return None
     if evidence.seen is not None and not evidence.seen[0]:
         return None
-    if not score.joint:
-        return None if evidence.novelty is None else evidence.novelty[0]
-    # by geometry: how badly known things explain all views
-    views = np.array([max(counted, 1)])
-    classes = len(recogniser.classes)
-    logs = recogniser.calibration.log_belief(total[None], views, classes)[0]
-    return ViewScore(observation, None, score.of_belief(logs, int(views[0])))
+    return None if evidence.novelty is None else evidence.novelty[0]
 
 
 def is_doubtful(warned: Sequence[Sequence[ViewWarning]]) -> bool:

@@ -26,9 +26,6 @@ from nextview.files import (
     sha256_of,
     unfinished,
 )
-from nextview.geometry.mesh import make_mesh
-from nextview.geometry.resting import resting_poses, rotated
-from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
     MEMORY_SUFFIX,
     SHORT_HASH,
@@ -43,11 +40,8 @@ from nextview.teaching.memory_card import (
     PER_THING,
     Pair,
     card_of,
-    fitted,
+    memory_of,
     with_scores,
-)
-from nextview.teaching.memory_fit import (
-    VIEWS_FITTED,
 )
 from nextview.teaching.shown_views import (
     VIEWS_SHOWN,
@@ -58,9 +52,14 @@ from nextview.teaching.shown_views import (
     summary,
     to_be_shown,
 )
-from nextview.teaching.sizes import check_sizes
+from nextview.teaching.sizes import check_sizes, refuse_without_unit
 from nextview.teaching.symmetries import named_symmetries
-from nextview.teaching.thing_sources import Found, ThingSource, find_things
+from nextview.teaching.thing_sources import (
+    Found,
+    ThingSource,
+    find_things,
+    is_of_frames,
+)
 from nextview.teaching.thing_views import (
     CONTENT,
     FACES,
@@ -69,22 +68,18 @@ from nextview.teaching.thing_views import (
     SYMMETRIES,
     UPRIGHT,
     VERTICES,
+    Arrays,
     TeachingOptions,
     rows_of,
     teach,
 )
 from nextview.teaching.unfinished_things import finished, part_of, stamp_of
-from nextview.teaching.view_features import Arrays, features_of, without_features
-from nextview.things.memory import (
-    Memory,
-    check_features,
-    open_memory,
-)
+from nextview.things.memory import Memory, open_memory
 
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"
-# folder of the preliminary memory that recognises the things during the fits
+# folder of the preliminary memory that recognises the things during the test
 JUDGED = "judged"
 # key of the things that an interrupted run has taught, see ``files.unfinished``
 PARTS = "things"
@@ -101,7 +96,6 @@ class Work:
         workers: see ``pool.each``.
         scheduler: see ``pool.each``.
         track: progress callback.
-        of_classes: whether a class has several things.
     """
 
     how: TeachingOptions
@@ -109,7 +103,6 @@ class Work:
     workers: int | None
     scheduler: str | None
     track: TrackProgress
-    of_classes: bool
 
 
 @dataclass(frozen=True)
@@ -120,10 +113,7 @@ class Learned:
         out: folder of the memory.
         things: number of things.
         classes: number of their classes.
-        accuracy: share of correct answers. With geometry: after 1, 2 and 3 simulated views.
-            Otherwise: after 1, 2, 3 and 5 held-out views, by features and size. A thing of a class
-            of several is recognised by the others of that class. () if nothing was tested, as after
-            a removal.
+        accuracy: share of correct answers after 1, 2 and 3 simulated views; () if nothing was seen.
         confused: pairs of things that are most often confused, with the share of the cases.
         notes: notes for the user, a sentence each.
         left_out: what could not be learned and why, a phrase each.
@@ -167,9 +157,8 @@ class Learned:
 
     def _how_often(self) -> str:
         """Accuracy in words."""
-        shown = self.accuracy[:3]
-        views = ", ".join(str(k) for k in VIEWS_FITTED[: len(shown)])
-        named = f"named right after {views} views: {_percent(shown)}"
+        views = ", ".join(str(k) for k in VIEWS_SHOWN[: len(self.accuracy)])
+        named = f"named right after {views} views: {_percent(self.accuracy)}"
         if self.judged in (0, self.things):
             return named
         return f"{named} ({self.judged} of them were tested)"
@@ -183,8 +172,7 @@ class LearnOptions(TypedDict, total=False):
     """Options of ``learn``.
 
     Attributes:
-        unit: of the mesh files, "mm", "cm", "inch", "foot" or "m"; with it size counts as evidence,
-            and things are recognised by their geometry.
+        unit: of the mesh files, "mm", "cm", "inch", "foot" or "m"; depth frames are in metres.
         up: up axis of the mesh files, "y" or "z"; by default z, and y for GLB.
         upright: whether the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at them, NAME or NAME:STRENGTH; "wrist" by default.
@@ -243,12 +231,12 @@ def learn(
         **options: see ``LearnOptions``.
 
     Returns:
-        What was learned, with the accuracy on held-out views.
+        What was learned, with the accuracy in simulated views.
 
     Raises:
         DatasetError: nothing can be taught.
         ResultsError: ``out`` exists, and neither ``add`` nor ``overwrite`` is set.
-        UsageError: an option is not valid.
+        UsageError: an option is not valid, or the unit of mesh files is missing.
 
     Example:
         >>> nextview.learn("scans", "mine", unit="m")  # doctest: +SKIP
@@ -292,12 +280,12 @@ def learn_things(
         track: progress callback.
 
     Returns:
-        What was learned, with the accuracy on held-out views.
+        What was learned, with the accuracy in simulated views.
 
     Raises:
         DatasetError: nothing can be taught.
         ResultsError: ``out`` exists, and neither ``add`` nor ``overwrite`` is set.
-        UsageError: an option is not valid.
+        UsageError: an option is not valid, or the unit of mesh files is missing.
     """
     folder = Path(folder)
     out = Path(out)
@@ -312,6 +300,9 @@ def learn_things(
         Found([], []) if nothing_new else find_things(folder, out, how.one_class or add)
     )
     left_out = list(found.left_out)
+    meshes = [one.path for one in found.things if not is_of_frames(one.path)]
+    if meshes and how.unit is None:
+        refuse_without_unit(meshes[0], how.up)
 
     with only_one(out), unfinished(out, PARTS) as part:
         # Read under the lock: another run may have changed it before.
@@ -319,8 +310,7 @@ def learn_things(
         taught = [] if old is None else _known(*old, remove)
         _check_names(found.things, taught)
 
-        of_classes = _of_classes([*found.things, *(source for source, _ in taught)])
-        work = Work(how, part, workers, scheduler, track, of_classes)
+        work = Work(how, part, workers, scheduler, track)
         track(
             _teach(found.things, work, taught, left_out),
             len(found.things),
@@ -335,7 +325,6 @@ def learn_things(
                 f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
             )
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
-        taught = _with_features_where_they_count(taught, work)
         _name_symmetries(taught, how.symmetry)
         if not how.any_size:
             radii = np.concatenate([arrays["radii"] for _, arrays in taught])
@@ -366,10 +355,7 @@ def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
     """The memory whose things are kept; None without one."""
     if not keeps:
         return None
-    card, memory = open_memory(out / CARD)
-    if memory.has_features:
-        check_features(card, memory, Features(threads=1).size)
-    return card, memory
+    return open_memory(out / CARD)
 
 
 def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
@@ -403,22 +389,17 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
     for index, thing in enumerate(card.memory.things):
         if thing.name in remove:
             continue
-        own = memory.thing == index
-        label = card.classes[card.calibration.hypotheses[int(np.flatnonzero(own)[0])]]
-        arrays = {name: getattr(memory, name)[own] for name in ("views", "rotations")}
-        arrays |= {name: getattr(memory, name)[index] for name in PER_THING}
-        arrays["radii"] = arrays["radii"].reshape(1)
-        arrays[UPRIGHT] = np.array([thing.upright])
+        label = card.classes[card.calibration.hypotheses[index]]
+        surface = memory.surfaces.surface(index, thing.name)
+        arrays = {name: getattr(memory, name)[[index]] for name in PER_THING} | {
+            UPRIGHT: np.array([thing.upright]),
+            VERTICES: surface.vertices,
+            FACES: surface.faces,
+            SYMMETRIES: rows_of(thing.symmetries),
+            NEAR_SYMMETRIES: rows_of(thing.near_symmetries),
+        }
         if thing.sha256 is not None:
             arrays[CONTENT] = np.frombuffer(bytes.fromhex(thing.sha256), np.uint8)
-        surface = memory.surfaces.surface(index, thing.name)
-        if surface is not None:
-            arrays |= {
-                VERTICES: surface.vertices,
-                FACES: surface.faces,
-                SYMMETRIES: rows_of(thing.symmetries),
-                NEAR_SYMMETRIES: rows_of(thing.near_symmetries),
-            }
         kept.append((ThingSource(thing.name, label, Path(thing.source)), arrays))
     return kept
 
@@ -427,7 +408,7 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
     """Replace detected symmetries by those of the user.
 
     Raises:
-        UsageError: one names an unknown thing, or a thing of unknown size.
+        UsageError: one names an unknown thing.
     """
     known = {source.name: arrays for source, arrays in taught}
     for name, symmetries in named_symmetries(given).items():
@@ -435,64 +416,7 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
             raise UsageError(
                 f"{option('symmetry')}: nothing is called {one_line(name)}"
             )
-        if VERTICES not in known[name]:
-            raise UsageError(
-                f"{option('symmetry')}: {one_line(name)} has no pose without its size; give"
-                f" {option('unit')}"
-            )
         known[name][SYMMETRIES] = rows_of(symmetries)
-
-
-def _of_classes(sources: Sequence[ThingSource]) -> bool:
-    """Whether a class has several things."""
-    return len({source.label for source in sources}) < len(sources)
-
-
-def _with_features_where_they_count(
-    taught: Sequence[Pair],
-    work: Work,
-) -> list[Pair]:
-    """Make the things uniform: all with features of their views, or none.
-
-    Geometry separates things with known surfaces. Features count where it does not: for things of
-    unknown size, and for classes of several things, whose further members resemble them without
-    being identical. The stored surface is rendered if features are missing.
-    """
-    sources = [source for source, _ in taught]
-    count = _of_classes(sources) or any(VERTICES not in each for _, each in taught)
-    if not count:
-        return [
-            (
-                source,
-                arrays | without_features(1) | {"rotations": arrays["rotations"][:1]},
-            )
-            for source, arrays in taught
-        ]
-
-    missing = [
-        (row, source.name, arrays)
-        for row, (source, arrays) in enumerate(taught)
-        if not arrays["views"].shape[-1]
-    ]
-    render = partial(_features_again, work.how)
-    results = _all_done(render, missing, work, "rendering things")
-    found = {row: arrays for (row, _, _), arrays in results}
-    return [
-        (source, arrays | found.get(row, {}))
-        for row, (source, arrays) in enumerate(taught)
-    ]
-
-
-def _features_again(how: TeachingOptions, item: tuple[int, str, Arrays]) -> Arrays:
-    """Features of views of a thing's stored surface."""
-    _, name, arrays = item
-    in_file = make_mesh(arrays[VERTICES].astype(np.float64), arrays[FACES], name, "m")
-    to_mesh = arrays["rotations"][0].astype(np.float64)
-    mesh = rotated(in_file, to_mesh)
-    poses = np.eye(3)[None] if arrays[UPRIGHT][0] else resting_poses(mesh)
-    lying = [mesh, *(rotated(mesh, pose) for pose in poses[1:])]
-    rotations = (poses @ to_mesh).astype(np.float32)
-    return {"rotations": rotations, **features_of(lying, name, how.sensor, how.seed)}
 
 
 def _teach(
@@ -504,7 +428,7 @@ def _teach(
     """Teach things in parallel, each into its own file; finished files are reused."""
     waiting = []
     for source in sources:
-        stamp = stamp_of(source, work.how, work.of_classes)
+        stamp = stamp_of(source, work.how)
         arrays = finished(part_of(work.part, source), stamp)
         if arrays is not None:
             taught.append((source, _without_phrase(source, arrays, left_out)))
@@ -512,13 +436,7 @@ def _teach(
             waiting.append((source, stamp))
     # the largest first, so that none remains alone at the end
     waiting.sort(key=lambda item: -item[0].path.stat().st_size)
-    # A single thing uses all cores.
-    threads = (
-        1
-        if work.scheduler
-        else max(1, count_workers(work.workers) // max(1, len(waiting)))
-    )
-    teach_one = partial(_teach_one, work.how, work.part, work.of_classes, threads)
+    teach_one = partial(_teach_one, work.how, work.part)
 
     before = len(sources) - len(waiting)
     yield before
@@ -542,14 +460,12 @@ def _without_phrase(source: ThingSource, arrays: Arrays, left_out: list[str]) ->
 def _teach_one(
     how: TeachingOptions,
     part: Path,
-    features: bool,
-    threads: int,
     item: tuple[ThingSource, str],
 ) -> Arrays | str:
     """Arrays of one thing; a sentence if it cannot be taught."""
     source, stamp = item
     try:
-        arrays = teach(source.path, source.name, how, threads, features)
+        arrays = teach(source.path, source.name, how)
     except NextviewError as error:
         return str(error)
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -566,7 +482,7 @@ def _write(
     old: ModelCard | None,
     work: Work,
 ) -> Learned:
-    """Fit to all things together, and write memory and card.
+    """Test all things together, and write memory and card.
 
     The file name of the new memory contains its hash. Renaming the card switches to the new memory
     atomically, so that an interrupted run leaves the old memory or the new one. The old file is
@@ -574,54 +490,46 @@ def _write(
     """
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
-    memory, fit = fitted(taught, label)
+    memory = memory_of(taught)
     card = card_of(
         taught,
         classes,
         label,
         memory,
-        fit,
         () if old is None else old.training.commands,
         work.how.sensor,
     )
     tested = _tested(card, memory, work)
-    if tested is not None and tested.accuracy:
+    if tested.accuracy:
         card = with_scores(card, tested)
-        first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
-        confused = tuple((first[a], first[b], share) for a, b, share in tested.confused)
-        fit = replace(fit, accuracy=tested.accuracy, confused=confused)
+    names = [source.name for source, _ in taught]
+    first = [names[label.tolist().index(c)] for c in range(len(classes))]
+    confused = tuple((first[a], first[b], share) for a, b, share in tested.confused)
 
     with new_folder(out, overwrite=True, last=CARD) as part:
         weights = _save(part, card, memory)
         draw_learned(
             part / LEARNED_PICTURE,
-            {source.name: arrays["pictures"] for source, arrays in taught},
-            fit,
+            {source.name: arrays["pictures"][0] for source, arrays in taught},
+            tested.accuracy,
+            confused,
         )
         # the memory has not changed
         if _is_intact(out / weights.name, read_card(part / CARD).sha256):
             weights.unlink()
     _remove_old(out, weights.name)
 
-    names = [source.name for source, _ in taught]
-    confused_names = tuple((names[a], names[b], share) for a, b, share in fit.confused)
-    learned = Learned(
+    return Learned(
         out,
         len(taught),
         len(classes),
-        fit.accuracy,
-        confused_names,
-        _notes(taught, _unseen(taught, tested)),
+        tested.accuracy,
+        confused,
+        _notes(taught, set(tested.unseen)),
         tuple(left_out),
-    )
-    if tested is None:
-        return learned
-    known = [source.name for source, arrays in taught if VERTICES in arrays]
-    return replace(
-        learned,
         judged=tested.things,
         never_confident=tuple(
-            (known[one.thing], _why_never(one, classes)) for one in tested.never
+            (names[one.thing], _why_never(one, classes)) for one in tested.never
         ),
     )
 
@@ -645,23 +553,15 @@ def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
     return weights
 
 
-def _tested(card: ModelCard, memory: Memory, work: Work) -> ShownThings | None:
-    """Recognise rendered views of things of known geometry.
-
-    All things are tested, or a random sample of very many. The result is None without known
-    geometry.
-    """
-    if not memory.surfaces.counts.any():
-        return None
-
+def _tested(card: ModelCard, memory: Memory, work: Work) -> ShownThings:
+    """Recognise rendered views of all things, or of a random sample of very many."""
     folder = work.part / JUDGED
     shutil.rmtree(folder, ignore_errors=True)  # left by an earlier run
     folder.mkdir()
     _save(folder, card, memory)
     about = card.memory
     assert about is not None
-    known = np.flatnonzero(memory.surfaces.counts[:, 0])
-    names = [about.things[int(number)].name for number in known]
+    names = [thing.name for thing in about.things]
     items = to_be_shown(len(names), np.random.default_rng(work.how.seed))
     show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
     found = dict(_all_done(show_one, items, work, "testing simulated views"))
@@ -717,27 +617,17 @@ def _remove_old(out: Path, kept: str) -> None:
             file.unlink()
 
     earlier = out / MEMORY_FILE
-    if earlier.is_file() and _holds_views(earlier):
+    if earlier.is_file() and _is_memory(earlier):
         earlier.unlink()
 
 
-def _holds_views(file: Path) -> bool:
-    """Whether a file is a memory, by the names of its arrays."""
+def _is_memory(file: Path) -> bool:
+    """Whether a file is a memory of an earlier version, by the names of its arrays."""
     try:
         with safe_open(file, "numpy") as arrays:
             return {"views", "thing", "held_out", "pictures"} <= set(arrays.keys())
     except SafetensorError:
         return False
-
-
-def _unseen(taught: Sequence[Pair], tested: ShownThings | None) -> set[str]:
-    """Names of the things that the sensor does not see."""
-    of_features = {
-        source.name
-        for source, arrays in taught
-        if arrays["held_out"].size and not arrays["held_out"].any()
-    }
-    return of_features if tested is None else of_features | set(tested.unseen)
 
 
 def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
@@ -779,12 +669,4 @@ def _notes(taught: Sequence[Pair], unseen: set[str]) -> tuple[str, ...]:
         if name in unseen
     ]
 
-    unknown = [
-        source.name for source, arrays in taught if not np.isfinite(arrays["radii"])
-    ]
-    if unknown and len(taught) > 1:
-        notes.append(
-            f"the size of {len(unknown)} of {len(taught)} things is not known;"
-            f" {option('unit')} makes it count"
-        )
     return tuple(notes)

@@ -1,6 +1,6 @@
 """Summary picture of the learned things: their accuracy and the confused pairs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.teaching.memory_fit import VIEWS_FITTED, Fit
+from nextview.teaching.shown_views import VIEWS_SHOWN
 
 PAGE_WIDTH = 11.0  # inches
 PICTURE_WIDTH = 1.05  # width and height, inches
@@ -30,9 +30,15 @@ QUIET = "#8a8a8e"
 BAR = "#2f6fde"
 
 ThingPictures = Mapping[str, NDArray[np.uint8]]
+Pairs = Sequence[tuple[str, str, float]]  # two things, and the share of the cases
 
 
-def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
+def draw_learned(
+    path: Path,
+    pictures: ThingPictures,
+    accuracy: Sequence[float],
+    confused: Pairs,
+) -> None:
     """Draw the things, the accuracy by the number of views, and the confused pairs.
 
     The height of the picture follows its content.
@@ -40,11 +46,11 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     Args:
         path: path of the PNG file.
         pictures: picture of each thing, by its name, (64, 64) uint8; 0 for background.
-        fit: fit to the things.
+        accuracy: share of correct names after each number of views; empty if none was tested.
+        confused: pairs that are confused, the most frequent first.
     """
-    names = list(pictures)
-    shown = _even_choice(names)
-    pairs = [(names[a], names[b], share) for a, b, share in fit.confused[:MOST_PAIRS]]
+    shown = _even_choice(list(pictures))
+    pairs = confused[:MOST_PAIRS]
     rows = max(THING_ROWS, 1 + _place(len(shown) - 1)[0])
     pairs_height = LINE + (LINE + ROW if pairs else 0)
     height = TITLE_HEIGHT + rows * ROW + pairs_height + PICTURE_MARGIN
@@ -59,8 +65,8 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     page.set_axis_off()
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0))  # inches from the top left corner
     _draw_things(page, pictures, shown)
-    if fit.accuracy:
-        _draw_bars(figure, fit, height)
+    if accuracy:
+        _draw_bars(figure, accuracy, height)
         _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
     # imshow changes the limits
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")
@@ -106,7 +112,7 @@ def _place(k: int) -> tuple[int, int]:
     return THING_ROWS + row, column
 
 
-def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
+def _draw_bars(figure: Figure, accuracy: Sequence[float], height: float) -> None:
     left = PICTURE_MARGIN + THING_COLUMNS * (PICTURE_WIDTH + PICTURE_GAP) + 0.4
     size = THING_ROWS * ROW - 2 * LINE - 0.5
     bottom = height - TITLE_HEIGHT - 0.3 - size
@@ -115,8 +121,8 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
         (left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height)
     )
 
-    views = [str(k) for k in VIEWS_FITTED[: len(fit.accuracy)]]
-    bars = axes.bar(views, [100 * a for a in fit.accuracy], color=BAR, width=0.6)
+    views = [str(k) for k in VIEWS_SHOWN[: len(accuracy)]]
+    bars = axes.bar(views, [100 * a for a in accuracy], color=BAR, width=0.6)
     axes.bar_label(bars, fmt="%.0f", color=PICTURE_INK, size=11)
     axes.set_ylim(0, 110)
     axes.set_yticks([])
@@ -131,7 +137,7 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
 def _draw_pairs(
     page: Axes,
     pictures: ThingPictures,
-    pairs: list[tuple[str, str, float]],
+    pairs: Pairs,
     top: float,
 ) -> None:
     heading = (

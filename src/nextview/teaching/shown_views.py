@@ -18,13 +18,13 @@ from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.belief import Stopping
 from nextview.session.recogniser import VerifiedRecogniser
 from nextview.simulation.sensed_camera import SensedCamera
-from nextview.things.memory import RINGS
 
 VIEWS_SHOWN = (1, 2, 3)  # numbers of views after which things are named
 # most rendered views per test, including those that miss the thing
 SHOWING_VIEWS_TRIED = 6
 MOST_THINGS_SHOWN = 150  # most things in the test; more are sampled
 ENOUGH_TESTS = 20  # of all things together, at least
+HIGHEST = np.radians(72.0)  # elevation of the highest view
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Shown:
     """Result of a test with one thing and some views.
 
     Attributes:
-        thing: number of the thing among those of known geometry.
+        thing: number of the thing.
         views: number of views.
         truth: class of the thing.
         named: class that it was given.
@@ -53,7 +53,7 @@ class NeverConfident:
     """A thing that was confident in none of its tests, after all their views.
 
     Attributes:
-        thing: number of the thing among those of known geometry.
+        thing: number of the thing.
         tests: number of its tests.
         confused: class that it was most often confused with; None if it was named correctly.
         doubt: the most frequent doubt about it.
@@ -107,7 +107,7 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
         card: card of a memory.
         sensor: see ``sensor_named``.
         seed: seed of all draws.
-        item: number of the thing among those of known geometry, and number of the draw.
+        item: number of the thing, and number of the draw.
 
     Returns:
         Results after one or more views; empty if the thing is not visible.
@@ -148,19 +148,15 @@ def _views(
     mesh = make_mesh(vertices, surface.faces, surface.name, "m")
     about = recogniser.card.memory
     assert about is not None
-    names = [one.name for one in about.things]
-    number = names.index(surface.name)
-    if about.things[number].upright:
-        row = int(np.flatnonzero(recogniser.memory.thing == number)[0])
-        lies, shares = recogniser.memory.rotations[row][None], np.ones(1)
+    if about.things[thing].upright:
+        lies, shares = recogniser.memory.rotations[thing][None], np.ones(1)
     else:
         stable = stable_poses(mesh)
         lies, shares = stable.rotations, stable.shares
 
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lies[rng.choice(len(lies), p=shares)]
     camera = SensedCamera(rotated(mesh, turn), sensor, rng.spawn(1)[0])
-    most = np.sin(np.radians(RINGS[-1]))
-    elevations = np.arcsin(rng.uniform(0, most, SHOWING_VIEWS_TRIED))
+    elevations = np.arcsin(rng.uniform(0, np.sin(HIGHEST), SHOWING_VIEWS_TRIED))
     azimuths = rng.uniform(0, 2 * np.pi, SHOWING_VIEWS_TRIED)
     found: list[Observation] = []
     for pose in look_at_origin(elevations, azimuths):

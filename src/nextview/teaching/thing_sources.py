@@ -152,6 +152,15 @@ def _counted(count: int, one: str, several: str) -> list[str]:
     return [f"{count} {one if count == 1 else several}"]
 
 
+def is_of_frames(path: Path) -> bool:
+    """Whether a thing is taught from depth frames, a folder or a bag, and not from a mesh file.
+
+    Args:
+        path: path of the thing.
+    """
+    return path.is_dir() or is_bag(path)
+
+
 def _of_frames(path: Path) -> ThingSource:
     """The thing of a folder of captured frames or of a bag."""
     name = path.name if path.is_dir() else path.stem

@@ -1,4 +1,4 @@
-"""Arrays of one thing: its surface and symmetries, and features of its views if they count."""
+"""Arrays of one thing: its surface and symmetries, its size and a picture."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,34 +19,26 @@ from nextview.errors import DatasetError, ObservationError, option
 from nextview.files import sha256_of
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Observation
-from nextview.geometry.resting import resting_poses, rotated
-from nextview.geometry.viewsphere import (
-    look_at_origin,
-)
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.model_card import Symmetry
 from nextview.sensing.tabletop import LOWEST_TOP
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.symmetries import named_symmetries
-from nextview.teaching.view_features import (
-    MEMORY_GRID,
-    Arrays,
-    features_captured,
-    features_of,
-    without_features,
-)
+from nextview.teaching.thing_sources import is_of_frames
 from nextview.things.fusion import fuse
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview.types import Float
 
+Arrays = dict[str, NDArray]  # arrays of a thing by their names
 # key of a phrase about unused frames, which does not enter the memory
 LEFT_OUT = "left_out"
 # key of a flag, (1,) bool: whether the thing is known in its upright pose only
 UPRIGHT = "upright"
 # key of the SHA-256 of its mesh file, (32,) uint8
 CONTENT = "content"
-# keys of its surface, if its size is known
+# keys of its surface
 VERTICES = "vertices"
 FACES = "faces"
 SYMMETRIES = "symmetries"  # axis and order of each symmetry, (S, 4)
@@ -60,8 +52,7 @@ class TeachingOptions:
     """Meshes, camera and symmetries.
 
     Attributes:
-        unit: unit of length of the mesh files; with it, size counts as evidence, and things are
-            recognised by their geometry.
+        unit: unit of length of the mesh files; depth frames are in metres.
         up: up axis of the mesh files; by default z, and y for GLB.
         upright: the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at the things: kinect, stereo, tof, scanner, setup, wrist or
@@ -113,46 +104,34 @@ def teach(
     path: Path,
     name: str,
     how: TeachingOptions,
-    threads: int = 1,
-    features: bool = True,
 ) -> Arrays:
     """Process one thing, and collect the arrays of its memory.
 
     Args:
         path: a mesh file, or a folder or a bag of captured frames.
-        name: name of the thing; together with the seed it determines all random draws.
+        name: name of the thing.
         how: options of the teaching.
-        threads: number of threads.
-        features: whether to compute the features of its views even if its geometry is known.
 
     Returns:
-        Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
-        its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
-        SYMMETRIES and NEAR_SYMMETRIES. Of a mesh file, its hash under CONTENT. If some of the
-        frames were not used, a phrase about them under LEFT_OUT.
+        Arrays by the names of the fields of ``things.memory.Memory``, one row each, and its surface
+        in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32, SYMMETRIES
+        and NEAR_SYMMETRIES. Of a mesh file, its hash under CONTENT. If some of the frames were not
+        used, a phrase about them under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: the reason why it cannot be taught, in one
             sentence.
     """
-    if path.is_dir() or is_bag(path):
-        return _of_capture(_captured(path, how), name, features)
+    if is_of_frames(path):
+        return _of_capture(_captured(path, how), name)
 
     mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
-    rotations = np.eye(3)[None]
-    views = without_features(len(rotations))
-    if features or mesh.metres is None:
-        rotations = rotations if how.upright else resting_poses(mesh)
-        lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
-        views = features_of(lying, name, how.sensor, how.seed, threads)
-
     to_mesh = Y_UP if is_y_up(path, how.up) else np.eye(3)
     return {
-        **views,
         UPRIGHT: np.array([how.upright]),
         CONTENT: np.frombuffer(bytes.fromhex(sha256_of(path)), np.uint8),
-        "rotations": (rotations @ to_mesh).astype(np.float32),
-        "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
+        "rotations": to_mesh[None].astype(np.float32),
+        "radii": np.array([mesh.radius], np.float32),
         "doubts": np.frombuffer(
             "\n".join([*mesh_warnings(mesh), *_flatness(mesh, how.upright)]).encode(),
             np.uint8,
@@ -168,8 +147,6 @@ def teach(
 
 def _flatness(mesh: Mesh, upright: bool) -> Iterator[str]:
     """A sentence for a thing that can lie too flat for a depth camera."""
-    if mesh.metres is None:
-        return
     # normal of its flattest side
     down = np.linalg.eigh(np.cov(mesh.vertices.T))[1][:, 0]
     if upright:
@@ -203,13 +180,10 @@ def _captured(path: Path, how: TeachingOptions) -> Capture:
 
 
 def _surface(mesh: Mesh, to_mesh: Float) -> Arrays:
-    """Surface of a mesh in the axes of its file; nothing without a unit."""
-    if mesh.metres is None:
-        return {}
-
+    """Surface of a mesh in the axes of its file."""
     whole = Surface.from_mesh(mesh, mesh.name)
     in_file = replace(whole, vertices=(whole.vertices @ to_mesh).astype(np.float32))
-    return of_surface(in_file, max(FINEST_ERROR, COARSER * mesh.metres))
+    return of_surface(in_file, max(FINEST_ERROR, COARSER * mesh.radius))
 
 
 def of_surface(whole: Surface, error: float = 0.0) -> Arrays:
@@ -244,30 +218,26 @@ def rows_of(symmetries: Sequence[Symmetry]) -> Float:
     return np.array(rows, np.float64).reshape(-1, 4)
 
 
-def _of_capture(capture: Capture, name: str, features: bool) -> Arrays:
-    """Arrays of captured frames: the surface, and features of the views if they count.
-
-    Surface and resting pose are in the world frame of the capture.
-    """
+def _of_capture(capture: Capture, name: str) -> Arrays:
+    """Arrays of captured frames; the surface is in the world frame of the capture."""
     camera = CapturedCamera(capture)
-    camera.take_all(MEMORY_GRID.poses[0])
+    camera.take_all(look_at_origin(0.0, 0.0))
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")
 
     found = camera.object.object_frame
     surface = fuse(camera.object.sightings, found.radius, name)
-    views = without_features(1)
-    if features or surface is None:
-        views = features_captured(seen)
-
+    if surface is None:
+        raise ObservationError(
+            f"{capture.folder}: its frames show too little of the object for a surface"
+        )
     return {
-        **views,
         UPRIGHT: np.array([True]),
         "rotations": found.axes[None].astype(np.float32),
         "radii": np.array([found.radius], np.float32),
         "pictures": _picture(seen[0]),
-        **({} if surface is None else of_surface(surface)),
+        **of_surface(surface),
         **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
     }
 
@@ -281,7 +251,7 @@ def _said(left_out: Mapping[str, str], total: int) -> Arrays:
 
 
 def _picture(view: Observation) -> NDArray[np.uint8]:
-    """A thumbnail of a view, (64, 64) uint8."""
+    """A thumbnail of a view, (1, 64, 64) uint8."""
     from PIL import Image
 
-    return np.asarray(Image.fromarray(view.picture).resize((64, 64)))
+    return np.asarray(Image.fromarray(view.picture).resize((64, 64)))[None]

@@ -9,23 +9,20 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from nextview.recognition.model_card import FEATURE_NETWORK, find_card
 from nextview.teaching.thing_sources import ThingSource
-from nextview.teaching.thing_views import TeachingOptions
-from nextview.teaching.view_features import Arrays
+from nextview.teaching.thing_views import Arrays, TeachingOptions
 
 
-def stamp_of(source: ThingSource, how: TeachingOptions, features: bool) -> str:
+def stamp_of(source: ThingSource, how: TeachingOptions) -> str:
     """Stamp of the inputs of a thing, which is taught again if the stamp changes.
 
     The stamp contains the path, the name, size and time of its file or of each file in its folder,
-    the options, and the features. It ignores the time of the folder itself, which does not change
-    when its files are overwritten.
+    and the options. It ignores the time of the folder itself, which does not change when its files
+    are overwritten.
 
     Args:
         source: the thing.
         how: options of the teaching.
-        features: whether features of its views are computed even if its geometry is known.
 
     Returns:
         The stamp.
@@ -39,14 +36,11 @@ def stamp_of(source: ThingSource, how: TeachingOptions, features: bool) -> str:
             seen = f"{file}\0{error.errno}\0"
         content.update(seen.encode(errors="surrogateescape"))
 
-    network = find_card(FEATURE_NETWORK).sha256
     return repr(
         (
             str(source.path.resolve()),
             content.hexdigest(),
             replace(how, any_size=False, symmetry=()),
-            features,
-            network,
         )
     )
 

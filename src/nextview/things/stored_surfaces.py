@@ -23,8 +23,7 @@ class StoredSurfaces:
     Attributes:
         places: coordinates of all vertices, in steps of the box of their thing, (V, 3) uint16.
         faces: indices of vertices within the thing, (F, 3) uint16 or uint32.
-        counts: number of vertices and of faces of each thing, (T, 2) int64; zeros for unknown
-            geometry.
+        counts: number of vertices and of faces of each thing, (T, 2) int64.
         boxes: lowest corner and extents of the bounding box of each thing, in the frame of its scan
             file, (T, 2, 3) float64, metres.
     """
@@ -35,14 +34,12 @@ class StoredSurfaces:
     boxes: Float
 
     def __post_init__(self) -> None:
-        check_array("its places", self.places, np.uint16, (None, 3), empty=True)
-        check_array("its faces", self.faces, np.unsignedinteger, (None, 3), empty=True)
+        check_array("its places", self.places, np.uint16, (None, 3))
+        check_array("its faces", self.faces, np.unsignedinteger, (None, 3))
         check_array("its counts", self.counts, np.int64, (None, 2))
         check_array("its boxes", self.boxes, np.float64, (len(self.counts), 2, 3))
 
-        if (self.counts < 0).any() or (
-            (self.counts == 0).any(1) != (self.counts == 0).all(1)
-        ).any():
+        if (self.counts < 1).any():
             raise ModelError("its counts are not valid for surfaces")
         totals = (len(self.places), len(self.faces))
         if _sums(self.counts) != totals:
@@ -51,13 +48,13 @@ class StoredSurfaces:
         extents = self.boxes[:, 1]
         if (np.abs(self.boxes) > LARGEST_EXTENT).any() or (extents < 0).any():
             raise ModelError("its boxes have invalid sizes or positions")
-        if (extents[self.counts[:, 0] > 0].max(1) == 0).any():
+        if (extents.max(1) == 0).any():
             raise ModelError("its boxes contain things without extent")
 
         limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
         if (self.faces >= limits[:, None]).any():
             raise ModelError("its faces refer to missing vertices")
-        for thing in np.flatnonzero(self.counts[:, 0]).tolist():
+        for thing in range(len(self.counts)):
             self._check_surface(thing)
 
     def _check_surface(self, thing: int) -> None:
@@ -79,23 +76,21 @@ class StoredSurfaces:
         return self.places[vertex : vertex + vertices], self.faces[face : face + faces]
 
     @classmethod
-    def of(cls, surfaces: Sequence[Surface | None]) -> "StoredSurfaces":
+    def of(cls, surfaces: Sequence[Surface]) -> "StoredSurfaces":
         """Store surfaces.
 
         Args:
-            surfaces: surface of each thing; None for unknown geometry.
+            surfaces: surface of each thing.
 
         Returns:
             The surfaces, rounded to the steps of their boxes.
         """
-        places = [np.zeros((0, 3), np.uint16)]
-        faces = [np.zeros((0, 3), np.uint32)]
+        places = []
+        faces = []
         counts = np.zeros((len(surfaces), 2), np.int64)
         boxes = np.zeros((len(surfaces), 2, 3))
 
         for number, surface in enumerate(surfaces):
-            if surface is None:
-                continue
             vertices = surface.vertices.astype(np.float64)
             low = vertices.min(0)
             extents = vertices.max(0) - low
@@ -110,9 +105,8 @@ class StoredSurfaces:
             counts[number] = len(vertices), len(surface.faces)
             boxes[number] = low, extents
 
-        short = not len(surfaces) or counts[:, 0].max() <= SHORT
         together: NDArray[np.unsignedinteger] = np.concatenate(faces)
-        if short:
+        if counts[:, 0].max() <= SHORT:
             together = together.astype(np.uint16)
         return cls(np.concatenate(places), together, counts, boxes)
 
@@ -120,7 +114,7 @@ class StoredSurfaces:
         """Number of things."""
         return len(self.counts)
 
-    def surface(self, thing: int, name: str) -> Surface | None:
+    def surface(self, thing: int, name: str) -> Surface:
         """Restore the surface of a thing.
 
         Args:
@@ -128,12 +122,9 @@ class StoredSurfaces:
             name: name of the thing.
 
         Returns:
-            The surface; None for unknown geometry.
+            The surface.
         """
         places, faces = self._of(thing)
-        if not len(places):
-            return None
-
         low, extents = self.boxes[thing]
         return Surface(
             name,

@@ -63,10 +63,8 @@ def walk_card(walk: Walk) -> str:
         _beliefs(walk),
     ]
     at = walk.next_view
-    why = ""
     if at is not None:
-        why = geometry_card(walk, walk.sphere.directions[at], f"view {at}")
-    parts.append(why or rivals_card(walk))
+        parts.append(geometry_card(walk, walk.sphere.directions[at], f"view {at}"))
     parts += [_maps(view), _steps(walk)]
     return f'{CARD_STYLE}<div class="nv">{"".join(parts)}</div>'
 
@@ -95,11 +93,9 @@ def preview_card(observation: Observation, walk: Walk) -> str:
         walk: the walk.
 
     Returns:
-        HTML: the image, and the stored views of the leading things nearest to the camera.
+        HTML: the image, and the two leading hypotheses as the camera would show them.
     """
-    direction = direction_of(observation.pose)
-    nearest, _ = walk.sphere.nearest(direction)
-    rivals = geometry_card(walk, direction, "this camera") or rivals_card(walk, nearest)
+    rivals = geometry_card(walk, direction_of(observation.pose), "this camera")
     parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals}"
     return f'{CARD_STYLE}<div class="nv">{parts}</div>'
 
@@ -197,45 +193,6 @@ def differing(rivals: RivalPictures) -> NDArray[np.uint8]:
     either: Mask = np.asarray(rivals.pictures.any(0))
     drawn = np.where(either[..., None], rgb(FAINT), rgb(GROUND))
     return np.where(rivals.different[..., None], rgb(ACCENT), drawn).astype(np.uint8)
-
-
-def rivals_card(walk: Walk, view: int | None = None) -> str:
-    """Show the stored views of the two most likely taught things from a viewpoint.
-
-    Args:
-        walk: the walk.
-        view: index of the view; None for the next one.
-
-    Returns:
-        HTML; empty for models without a memory.
-    """
-    rivals = walk.rivals
-    at = walk.next_view if view is None else view
-    if rivals is None or at is None:
-        return ""
-
-    both = [
-        (name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)
-    ]
-    differ = 1 - rivals.alike
-    if isinstance(walk.sphere, ViewSphere):
-        grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[
-            np.argsort(walk.sphere.elevations)[::-1]
-        ]
-        both.append(
-            (
-                "how much they differ from each view",
-                _image(heat(grid), MAP_CELL * grid.shape[1]),
-            )
-        )
-
-    known = not np.isnan(differ[at])
-    said = (
-        f"they differ by {differ[at]:.2f}, {np.nanmax(differ):.2f} at most"
-        if known
-        else "not remembered from there"
-    )
-    return f"<p>The two likeliest, as view {at} would show them ({said}):</p>{_captioned(both)}"
 
 
 def _beliefs(walk: Walk) -> str:

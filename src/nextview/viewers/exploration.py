@@ -7,27 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLE_MESHES, sample_mesh
-from nextview.errors import MeshError, UsageError
-from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
+from nextview.errors import UsageError
+from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import (
-    azimuth_of,
-    level_pose,
-    look_at_origin,
-)
-from nextview.policies.discriminate import Discriminate, Rivals
-from nextview.recognition.belief import FixedLength, log_evidence_of
+from nextview.geometry.viewsphere import level_pose
+from nextview.recognition.belief import FixedLength
 from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View
-from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
 from nextview.types import Float, Float32
 from nextview.views.expected_views import RivalPictures
 
@@ -134,74 +125,6 @@ class Walk:
         """Values of the views, (V,), NaN if not considered; None before the first view."""
         return self.views[-1].values if self.views else None
 
-    @property
-    def rivals(self) -> Rivals | None:
-        """The two most likely taught things, and their differences in each view.
-
-        None before the first view, and for models that remember no views.
-        """
-        recogniser = self.session.models.recogniser
-        seen = [view for view in self.views if view.observation.seen]
-        if not isinstance(recogniser, TaughtRecogniser) or not seen:
-            return None
-        if not recogniser.memory.has_features:
-            return None
-
-        evidence = recogniser([view.observation for view in seen])
-        azimuths = azimuth_of(
-            np.stack([view.direction for view in [*seen, self.views[-1]]])
-        )
-        total = log_evidence_of(
-            evidence.logits,
-            evidence.azimuth_bins,
-            azimuths[:-1],
-        ).sum(0, keepdims=True)
-        joint = recogniser.calibration.joint(
-            total,
-            len(seen),
-            len(recogniser.classes),
-            azimuths[-1:],
-        )
-
-        things = Discriminate(
-            self.sphere,
-            recogniser.memory.views,
-            np.array(recogniser.calibration.hypotheses),
-        )
-        return things.rivals(joint[0], float(azimuths[-1]))
-
-    def remembered(
-        self,
-        rivals: Rivals,
-        view: int,
-    ) -> list[tuple[str, NDArray[np.uint8]]]:
-        """Return the names and stored images of the rivals from a candidate view.
-
-        Args:
-            rivals: the two most likely classes.
-            view: index of the view.
-
-        Returns:
-            Name and image, (64, 64) uint8, of both.
-        """
-        recogniser = self.session.models.recogniser
-        assert isinstance(recogniser, TaughtRecogniser)
-        seen_from = zip(
-            rivals.classes,
-            rivals.hypotheses,
-            rivals.azimuths[:, view],
-            strict=True,
-        )
-
-        ring = int(rivals.rings[view])
-        return [
-            (
-                recogniser.classes[c],
-                remembered_picture(recogniser, int(h), ring, int(a)),
-            )
-            for c, h, a in seen_from
-        ]
-
     def rival_pictures(self, direction: Float) -> RivalPictures | None:
         """Render the two leading hypotheses from a direction, (3,).
 
@@ -247,46 +170,6 @@ class Walk:
         for view in self.views:
             other.session.update(view.observation)
         return other
-
-
-@lru_cache(maxsize=256)
-def remembered_picture(
-    recogniser: TaughtRecogniser,
-    hypothesis: int,
-    ring: int,
-    azimuth: int,
-) -> NDArray[np.uint8]:
-    """Draw a taught thing in a resting pose.
-
-    It is rendered from the memory's surface, or from the mesh of the scan; if neither is available,
-    the stored image is returned.
-
-    Args:
-        recogniser: the memory.
-        hypothesis: the thing in its resting pose.
-        ring: index of the ring of views.
-        azimuth: index of the azimuth bin.
-
-    Returns:
-        Image, (64, 64) uint8.
-    """
-    memory = recogniser.memory
-    about = recogniser.card.memory
-    assert about is not None
-    thing = int(memory.thing[hypothesis])
-    surface = memory.surfaces.surface(thing, about.things[thing].name)
-    try:
-        if surface is None:
-            # resting poses are relative to the axes of the file
-            standing = load_mesh(about.things[thing].source, up="z")
-        else:
-            standing = make_mesh(surface.vertices, surface.faces, surface.name)
-    except MeshError:
-        return memory.pictures[thing]
-
-    mesh = rotated(standing, memory.rotations[hypothesis].astype(np.float64))
-    pose = look_at_origin(np.radians(RINGS[ring]), 2 * np.pi / AZIMUTHS * azimuth)
-    return SimulatedCamera(mesh, memory.pictures.shape[1]).observe(pose).picture
 
 
 class Exploration:

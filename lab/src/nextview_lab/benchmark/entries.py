@@ -150,12 +150,12 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     p = specs.predictions
     there = {*p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
-    there |= {"joint"} if p.calibration.hypotheses else set()
     lacking = [wanted for wanted in policy.needs if wanted not in there]
     if lacking:
         known = {
             "azimuth_bins": "what the recogniser says of the azimuth bins",
             "observations": "the depth of the views",
+            "outlook": "scans of taught things (nextview-lab benchmark things compares it)",
             "visibility": "depth frames of what stands around the object",
         }
         what = known.get(lacking[0], f"the map {lacking[0]!r}")
@@ -214,8 +214,8 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         )
     if plain == DISCRIMINATE:
         raise EntryError(
-            "the policy discriminate needs the memory of taught things that made these predictions:"
-            " name its models, --models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
+            "the policy discriminate is for taught things; nextview-lab benchmark things compares"
+            " it"
         )
 
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]

@@ -383,15 +383,10 @@ def _refuse_needs(
     things: KnownThings,
 ) -> None:
     """Reject a policy that needs the hypotheses of a memory if there is none; UsageError."""
-    if {"joint", "outlook"} & set(needs) and things.memory is None:
+    if "outlook" in needs and things.memory is None:
         raise UsageError(
             f"the policy {name} goes by the hypotheses of a memory of taught things, which"
             f" recogniser {things.recogniser.name} does not have; leave it out"
-        )
-    if "joint" in needs:
-        raise UsageError(
-            f"the policy {name} goes by features of views, and the memory holds none: its things"
-            " are recognised by their geometry"
         )
 
 

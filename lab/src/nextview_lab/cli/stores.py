@@ -248,18 +248,8 @@ def predict(
 def summed_up(p: Predictions) -> list[str]:
     """Describe the accuracy in each split, for single views and for all views together."""
     lines: list[str] = []
-    answers = p.logits.argmax(2)
-    of_all = p.logits.sum(1).argmax(1)
-    if p.calibration.hypotheses:  # taught things: sum the belief over azimuths
-        classes = len(p.classes)
-        answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
-        of_all = p.calibration.log_belief(
-            p.log_evidence.sum(1),
-            len(p.sphere),
-            classes,
-        ).argmax(1)
-    right = answers == p.labels[:, None]
-    fused = of_all == p.labels
+    right = p.logits.argmax(2) == p.labels[:, None]
+    fused = p.logits.sum(1).argmax(1) == p.labels
 
     for split in np.unique(p.splits):
         here = p.splits == split

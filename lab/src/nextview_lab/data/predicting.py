@@ -16,7 +16,6 @@ from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED_MODELS, ModelCard
 from nextview.recognition.network_input import from_store
-from nextview.session.recogniser import open_recogniser
 from nextview.types import Float32, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects
@@ -62,12 +61,18 @@ def predict(
     Raises:
         DatasetError: there are no such objects, the recogniser does not know a class, or an object
             kills its process.
-        PredictionsError: the maps of a network are of other views.
+        PredictionsError: the recogniser is a memory of taught things, or the maps of a network are
+            of other views.
         ResultsError: the file exists or cannot be written.
     """
     path = Path(path)
     out = Path(out)
     check_new(out, overwrite)
+    if recogniser.memory is not None:
+        raise PredictionsError(
+            f"{recogniser.card_path}: judges all views of a thing together; nextview-lab benchmark"
+            " things compares policies on taught things"
+        )
     store = ViewStore.open(path)
     unfit = sorted(set(maps) - set(fitting(maps, store)))
     if unfit:
@@ -182,7 +187,7 @@ def _open(
 ) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
     """Open store and networks in a process, with one thread each."""
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
-    return ViewStore.open(store), open_recogniser(recogniser, threads=1), networks
+    return ViewStore.open(store), NetworkRecogniser(recogniser, threads=1), networks
 
 
 def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> None:
@@ -198,7 +203,6 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
         slice(start, start + VIEWS_PER_CALL)
         for start in range(0, len(store.sphere), VIEWS_PER_CALL)
     ]
-    elevation = store.sphere.elevation
 
     found: dict[str, Any] = {}
     for name, network in maps.items():
@@ -210,7 +214,7 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
             found[f"map/{name}{kind.removeprefix(network.card.kind)}"] = values
 
     evidence = [
-        recogniser.from_inputs(inputs[recogniser.card.input][batch], elevation[batch])
+        recogniser.from_inputs(inputs[recogniser.card.input][batch])
         for batch in batches
     ]
     found["logits"] = np.concatenate([e.logits for e in evidence])

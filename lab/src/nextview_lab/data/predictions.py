@@ -50,7 +50,7 @@ class Predictions:
         models: name and SHA-256 of the "recogniser" and of each map network ("lem").
         valley_classes: for each map, the classes for which the valley is the better view.
         calibration: of summed logits of the recogniser.
-        azimuth_bins: see ``Evidence``, (N, V, hypotheses, bins); None if not known.
+        azimuth_bins: see ``Evidence``, (N, V, C, bins); None if not known.
         of_size: contribution of the size to the logits, (N, C); None if not known.
         store: absolute path of the view store; empty if not known.
         commands: all commands that created them, in order, starting from the meshes; () if not
@@ -78,7 +78,6 @@ class Predictions:
         n = len(self.names)
         v = len(self.sphere)
         c = len(self.classes)
-        h = len(self.calibration.hypotheses) or c
 
         if n == 0:
             raise PredictionsError("these predictions hold no objects")
@@ -92,7 +91,7 @@ class Predictions:
             "labels": (n,),
             "splits": (n,),
             "conflicting": (n,),
-            "azimuth_bins": (n, v, h, *bins),
+            "azimuth_bins": (n, v, c, *bins),
             "of_size": (n, c),
         }
 

@@ -4,7 +4,7 @@ import logging
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,14 @@ from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import load_mesh
-from nextview.geometry.observation import Camera
+from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.recognition.inference import Features
+from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, as_stored, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.teaching.view_features import embeddings
 from nextview.types import Float, Float32, Index
 from nextview_lab.data.rendering import Deform
 from nextview_lab.training.fitting_set import card_to_fit
@@ -37,6 +38,7 @@ DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
 its meshes.
 """
 QUANTILES_FITTED = 201  # number of quantiles
+VIEWS_PER_BATCH = 20
 
 _log = logging.getLogger("nextview")
 
@@ -181,7 +183,20 @@ def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
             seen.append(view)
         if len(seen) == wanted:
             break
-    return embeddings(seen) if seen else np.zeros((0, 0), np.float32)
+    return _embeddings(seen) if seen else np.zeros((0, 0), np.float32)
+
+
+@lru_cache(maxsize=1)
+def _features() -> Features:
+    return Features(threads=1)
+
+
+def _embeddings(views: list[Observation]) -> Float32:
+    """Return the embeddings of views of one camera, unit vectors, (B, F)."""
+    network = _features()
+    inputs = from_observations(network.card.input, views)
+    starts = range(0, len(inputs), VIEWS_PER_BATCH)
+    return np.concatenate([network(inputs[k : k + VIEWS_PER_BATCH]) for k in starts])
 
 
 def fit_novelty(
