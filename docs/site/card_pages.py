@@ -15,7 +15,7 @@ USE = {
         " belief."
     ),
     "features": (
-        "Turns a view into 256 numbers that alike views share; taught things are remembered by"
+        "Turns a view into 256 numbers that alike views share; how novel an object is follows from"
         " them."
     ),
     "lem": (

@@ -28,7 +28,6 @@ EXTRAS = {  # packages by the optional part of the installation that brings them
     "bags": ("lz4", "rosbags"),
     "cluster": ("dask", "distributed"),
     "explore": ("viser", "websockets"),
-    "large": ("faiss",),
     "record": ("rerun",),
     "teach": ("fast_simplification", "mapbox_earcut", "networkx"),
 }

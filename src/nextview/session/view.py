@@ -29,7 +29,7 @@ class View:
     Attributes:
         index: candidate viewpoint of the view, or the one nearest to the camera position.
         observation: image of the object.
-        alone: belief from this view alone, (classes,), by features if views are judged jointly by
+        alone: belief from this view alone, (classes,), by size if views are judged jointly by
             geometry; defined even if nothing is visible.
         belief: fused belief over all views so far, (classes,).
         maps: predicted local maps by name, each (rings, 3).
