@@ -526,7 +526,6 @@ def arrays_in(
     content: bytes,
     names: Sequence[str],
     where: str,
-    optional: Sequence[str] = (),
 ) -> dict[str, np.ndarray]:
     """Read the named arrays from the content of a safetensors file.
 
@@ -534,7 +533,6 @@ def arrays_in(
         content: bytes of the file.
         names: required arrays; other arrays are ignored.
         where: beginning of an error message ("a.safetensors: not a memory").
-        optional: arrays that are returned if present.
 
     Returns:
         The arrays by name. The caller checks their shapes and types.
@@ -556,7 +554,7 @@ def arrays_in(
     for name in names:
         if name not in arrays:
             raise ModelError(f"{where} (it holds no {name})")
-    return {name: arrays[name] for name in (*names, *optional) if name in arrays}
+    return {name: arrays[name] for name in names}
 
 
 def command() -> str:

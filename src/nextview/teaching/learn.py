@@ -172,7 +172,8 @@ class LearnOptions(TypedDict, total=False):
     """Options of ``learn``.
 
     Attributes:
-        unit: of the mesh files, "mm", "cm", "inch", "foot" or "m"; depth frames are in metres.
+        unit: of the mesh files, which need one: "mm", "cm", "inch", "foot" or "m"; depth frames are
+            in metres.
         up: up axis of the mesh files, "y" or "z"; by default z, and y for GLB.
         upright: whether the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at them, NAME or NAME:STRENGTH; "wrist" by default.

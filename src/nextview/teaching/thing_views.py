@@ -52,7 +52,7 @@ class TeachingOptions:
     """Meshes, camera and symmetries.
 
     Attributes:
-        unit: unit of length of the mesh files; depth frames are in metres.
+        unit: unit of length of the mesh files, which need one; depth frames are in metres.
         up: up axis of the mesh files; by default z, and y for GLB.
         upright: the things stand only as in their files; by default they may also lie.
         sensor: camera that will look at the things: kinect, stereo, tof, scanner, setup, wrist or

@@ -95,23 +95,14 @@ def read_memory(path: Path, sha256: str) -> Memory:
         The memory.
 
     Raises:
-        ModelError: the file is missing, has another hash, comes from an earlier version without
-            geometry, or contains an invalid value.
+        ModelError: the file is missing, has another hash, or contains an invalid value.
     """
     content = checked_bytes(path, sha256, "a memory")
     where = f"{path}: not a memory"
     arrays = arrays_in(content, _ARRAYS, where)
-    stored = arrays_in(content, (), where, _OF_SURFACES)
-    if not stored:
-        raise ModelError(
-            f"{path}: is of an earlier version; teach it again with nextview learn"
-        )
-    missing = sorted(set(_OF_SURFACES) - set(stored))
-    if missing:
-        raise ModelError(f"{where} (it holds no {missing[0]})")
-
+    surfaces = arrays_in(content, _OF_SURFACES, where)
     try:
-        return Memory(**arrays, surfaces=StoredSurfaces(**stored))
+        return Memory(**arrays, surfaces=StoredSurfaces(**surfaces))
     except ModelError as error:
         raise ModelError(f"{where} ({error})") from None
 
