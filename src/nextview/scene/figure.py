@@ -109,7 +109,7 @@ def draw_scene(
                 high,
             )
         )
-        _draw_frame(left, top.frame, number, objects, colours, (rows, columns))
+        draw_frame(left, top.frame, number, objects, colours, (rows, columns))
         start = (2 * FIGURE_MARGIN + FIGURE_HEIGHT * aspect) / width
         right = figure.add_axes(
             (start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high)
@@ -167,7 +167,7 @@ def _part(frame: Frame, masks: Sequence[Mask | None]) -> tuple[slice, slice]:
     return within(np.any(shown, axis=0), margin)
 
 
-def _draw_frame(
+def draw_frame(
     axes: Axes,
     frame: Frame,
     number: int,
@@ -175,7 +175,16 @@ def _draw_frame(
     colours: dict[int, str],
     part: tuple[slice, slice],
 ) -> None:
-    """Draw the frame with outlines, names, and axes of the poses."""
+    """Draw the frame with outlines, names, and axes of the poses.
+
+    Args:
+        axes: to draw on; ``FIGURE_HEIGHT`` inches high, for the places of the names.
+        frame: the frame.
+        number: of the frame in the scene.
+        objects: recognised objects.
+        colours: of each object, by its number.
+        part: rows and columns of the frame that are shown.
+    """
     axes.imshow(
         grey_picture(frame),
         cmap="gray",
