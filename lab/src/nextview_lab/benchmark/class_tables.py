@@ -392,7 +392,7 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
     """
     rows = []
     for risk, threshold in risks.items():
-        values = values_of(tables.measures, ALL, threshold)
+        values = values_of(tables.measures, threshold)
         for policy in dict.fromkeys(policy for policy, _, _ in values):
             # the upper limit of the accuracy is the lower limit of the error
             right, high, low = values[policy, "confident_accuracy", 0]
@@ -441,10 +441,8 @@ def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | Non
     Returns:
         The warning; None if there are enough.
     """
-    hopeless = too_few(accuracy_tests(tables))
-    if hopeless:
-        return hopeless[ALL]
-
+    if hopeless := too_few(accuracy_tests(tables)):
+        return hopeless
     tests = _robot_tests(tables, threshold)
     # NaN without comparisons
     half = float((tests["high"] - tests["low"]).median() / 2)
@@ -480,7 +478,7 @@ def after_views_table(tables: Tables) -> WrittenTable | None:
     columns = [Column(f"{k} view{'s' * (k > 1)}", ("accuracy",), k) for k in counts]
     for what, measure in (("travel", "travel"), ("of the gap", "share_of_gap")):
         columns += [Column(f"{what} at {k}", (measure,), k, 2) for k in counts]
-    board = Board(f"points over {tables.reference}: tests.csv", ALL, tuple(columns))
-    stars = significant(tables, ALL)
+    board = Board(f"points over {tables.reference}: tests.csv", tuple(columns))
+    stars = significant(tables)
     named = {column.heading: column for column in columns}
     return written(tables, board, named, stars) if counts else None

@@ -513,7 +513,7 @@ class RecogniseThingsEnv(ViewsEnv):
         Args:
             view: that is free.
         """
-        belief = self._episode.verified(self.views)[0].belief
+        belief = self._episode.verified(self.views).belief
         logs = np.log(np.maximum(belief, LEAST_PAID_BELIEF))[None]
         truth = np.array([self._episode.thing])
         value = float(value_of(logs, truth, self.rules.objective)[0])

@@ -93,7 +93,7 @@ def compared(results: ClassResults) -> list[str]:
     names = list(results.tables.sweep["policy"].unique())
     reference = results.settings["reference"]
     headline = headline_threshold(results.settings["thresholds"])
-    values = values_of(results.tables.measures, ALL, headline)
+    values = values_of(results.tables.measures, headline)
     robots = sorted(
         (n for n in names if not is_oracle(n)),
         key=lambda n: (n != reference, -values[n, "accuracy", 0][0]),
@@ -128,7 +128,7 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
         what: description of the share.
     """
     figure, axes = new_figure(4.6, 3.5)
-    values = values_of(tables.measures, ALL)
+    values = values_of(tables.measures)
     views = sorted({k for _, name, k in values if name == measure})
     policies = tables.policies()
     for row, policy in enumerate(policies):
@@ -163,7 +163,7 @@ def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> F
     """
     figure, axes = new_figure(4.6, 3.5)
     table = results.tables.measures.query(
-        "set == @ALL and measure == @measure and threshold == threshold"
+        f"set == {ALL!r} and measure == @measure and threshold == threshold"
     )
     ticks = sorted(table["threshold"].unique())
     names = [n for n in compared(results) if n in set(table["policy"])]
@@ -214,26 +214,19 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
 
     Args:
         tables: of the benchmark.
-        tests: of one measure, in one set or in two.
+        tests: of one measure.
         what: description of the measure.
     """
     policies = list(tests["policy"].unique())[::-1]
-    sets = list(tests["set"].unique())
     figure, axes = new_figure(4.6, 0.7 + 0.26 * max(3, len(policies)))
     row: Any  # a named tuple
     for row in tests.itertuples():
-        second = sets.index(row.set)
-        marker = "os"[second]
-        y = policies.index(row.policy) + (len(sets) - 1) * (0.14 - 0.28 * second)
+        y = policies.index(row.policy)
         colour = look_of(row.policy, tables)["color"]
         axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
         inside = colour if row.p_holm < SIGNIFICANT else "white"
         dot = {"color": colour, "markersize": 5, "markerfacecolor": inside}
-        axes.plot(100 * row.difference, y, marker, clip_on=False, **dot)
-    if len(sets) > 1:
-        for name, marker in zip(sets, "os", strict=True):
-            axes.plot([], [], marker, color=INK, markerfacecolor="white", label=name)
-        legend(axes)
+        axes.plot(100 * row.difference, y, "o", clip_on=False, **dot)
     axes.axvline(0, color=INK, linewidth=0.9)
     axes.set_yticks(np.arange(len(policies)), policies)
     axes.grid(axis="y", visible=False)
@@ -328,7 +321,7 @@ def reliability_diagram(
     Returns:
         The figure.
     """
-    values = values_of(results.tables.measures, ALL, threshold)
+    values = values_of(results.tables.measures, threshold)
     table = results.tables.reliability.query("threshold == @threshold").rename(
         columns={"episodes": "answers"}
     )

@@ -100,7 +100,7 @@ def headline_policy(results: ClassResults, threshold: float) -> str:
     Returns:
         Its name; the reference if there is no other.
     """
-    found = values_of(results.tables.measures, ALL, threshold)
+    found = values_of(results.tables.measures, threshold)
     reference = results.settings["reference"]
     names = [
         n

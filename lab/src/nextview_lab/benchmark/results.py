@@ -34,9 +34,8 @@ class ComparedTables(Tables):
     chosen: str
 
     def sentences(self) -> list[str]:
-        """Return the conclusions: the selection of the reference, and sets that are too small."""
-        few = [f"{name}: {sentence}" for name, sentence in too_few(self.tests).items()]
-        return [*filter(None, [self.chosen]), *few]
+        """Return the conclusions: the selection of the reference, and whether there are too few."""
+        return [*filter(None, [self.chosen, too_few(self.tests)])]
 
 
 def write_results(

@@ -405,7 +405,7 @@ def _board(
         )
         if len(tests):
             tables.insert(1, _differences_table(corrected([tests]), compared))
-            notes += too_few(tests).values()
+            notes += filter(None, [too_few(tests)])
             if reference is None:
                 notes.append(
                     f"The reference, {compared}, is the best blind method on these same episodes,"
@@ -434,7 +434,7 @@ def _main_table(
         ("unknown", UNKNOWN_SAID, views),
     ]
 
-    numbers = values_of(shares, ALL)
+    numbers = values_of(shares)
     rows = []
     for one in scored:
         name = one.submission.method

@@ -522,7 +522,7 @@ def summarise_tables(
         corrected([tests]),
         settings.reference,
         tuple(
-            Board(f"After {k} frame{'s' * (k > 1)}", ALL, _columns(k), about)
+            Board(f"After {k} frame{'s' * (k > 1)}", _columns(k), about)
             for k in settings.views
         ),
         "",

@@ -5,7 +5,6 @@ sensor with its own errors. Every view is simulated once, and every set of views
 exactly as in ``Session``, however many policies look at it.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -207,7 +206,7 @@ class ThingEpisode:
         self._seed = (setting.seed, thing, draw)
         self.stage = Stage.of(mesh, setting, self._seed)
         self._views: dict[int, tuple[Observation, Float]] = {}
-        self._verified: dict[frozenset[int], tuple[Answer, float]] = {}
+        self._verified: dict[frozenset[int], Answer] = {}
         self.start = self._first_view()
 
     def _first_view(self) -> int:
@@ -237,27 +236,26 @@ class ThingEpisode:
         """Return the views in which the thing is visible."""
         return [view for view in views if self.observation(view).seen]
 
-    def verified(self, views: Sequence[int]) -> tuple[Answer, float]:
-        """Return the verification of some views, and its CPU time in seconds."""
+    def verified(self, views: Sequence[int]) -> Answer:
+        """Return what the recogniser says of some views."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
-            observations = [self.observation(view) for view in sorted(used)]
-            begun = time.process_time()
-            found = self.things(observations)
-            self._verified[used] = found, time.process_time() - begun
+            self._verified[used] = self.things(
+                [self.observation(view) for view in sorted(used)]
+            )
         return self._verified[used]
 
     def named_right(self, views: Sequence[int]) -> bool:
         """Return True if the thing is named correctly after some views."""
-        return int(self.verified(views)[0].belief.argmax()) == self.thing
+        return int(self.verified(views).belief.argmax()) == self.thing
 
     def belief_in_truth(self, views: Sequence[int]) -> float:
         """Return the belief in the true thing after some views."""
-        return float(self.verified(views)[0].belief[self.thing])
+        return float(self.verified(views).belief[self.thing])
 
     def p_value(self, views: Sequence[int]) -> float | None:
         """Return the value of the test for unknown things; None if there is none."""
-        value = float(self.verified(views)[0].p_value)
+        value = float(self.verified(views).p_value)
         return None if np.isnan(value) else value
 
     def pose_error(self, views: Sequence[int]) -> float | None:
@@ -267,7 +265,7 @@ class ThingEpisode:
             The mean distance of surface points in the estimated pose to the nearest points of the
             true surface; None if the thing is not named correctly.
         """
-        found, _ = self.verified(views)
+        found = self.verified(views)
         rows = np.flatnonzero(found.things == self.thing)
         if int(found.belief.argmax()) != self.thing or not len(rows):
             return None
@@ -306,7 +304,7 @@ class ThingEpisode:
         return EpisodeState(
             current=np.array([views[-1]]),
             visited=visited,
-            belief=self.verified(views)[0].belief[None],
+            belief=self.verified(views).belief[None],
             evidence=Evidence(np.zeros((1, classes))),
             step=len(views),
             observations=[[self.observation(view) for view in views]],

@@ -38,7 +38,7 @@ from nextview_lab.benchmark.thing_policies import (
 SCAN_APART = 0.2  # radii, largest distance between a scan and the taught surface
 
 
-class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ThingRun(msgspec.Struct, frozen=True):
     """Results of one policy in one episode.
 
     Attributes:
@@ -48,7 +48,6 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         p_value: share of known things that are explained as badly after each view; None if it was
             not fitted.
         decision: CPU time of each choice, seconds.
-        verification: CPU time of each verification, seconds.
         pose_error: mean distance of the surface (ADD-S), millimetres, after each view; None if the
             thing is not named correctly.
     """
@@ -58,7 +57,6 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confidence: list[float]
     p_value: list[float | None]
     decision: list[float]
-    verification: list[float]
     pose_error: list[float | None]
 
 
@@ -99,11 +97,10 @@ def run(
     }
 
     while True:
-        found, seconds = episode.verified(views)
+        found = episode.verified(views)
         made["right"].append(episode.named_right(views))
         made["confidence"].append(float(found.belief.max()))
         made["p_value"].append(episode.p_value(views))
-        made["verification"].append(seconds)
         made["pose_error"].append(episode.pose_error(views))
         if len(views) == count:
             return ThingRun(views=views, **made)

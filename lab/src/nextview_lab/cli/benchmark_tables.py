@@ -103,8 +103,8 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> WrittenTable
 def print_compared(found: ComparedTables) -> None:
     """Print a table for each board, in 80 columns, and the conclusions of the tests."""
     terminal = Terminal()
+    stars = significant(found)
     for each in found.boards:
-        stars = significant(found, each.name)
         columns = {
             name: replace(column, measures=column.measures[:1])
             for name, column in each.narrow().items()
