@@ -1,15 +1,11 @@
 """Write a self-contained HTML report from a folder of benchmark results."""
 
-import base64
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image
 
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
@@ -21,26 +17,18 @@ from nextview_lab.benchmark.class_tables import ClassResults, class_set
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview_lab.benchmark.entries import is_oracle
-from nextview_lab.benchmark.page import numbers, origin, picture, render, write_figures
+from nextview_lab.benchmark.page import numbers, origin, picture, render
 from nextview_lab.benchmark.published import PUBLISHED_COLUMNS, published_threshold
-from nextview_lab.benchmark.true_maps import stored_rows
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.store import ViewStore
-from nextview_lab.errors import EntryError
 from nextview_lab.extras import extras
 
 with extras():
     import pandas as pd
-
-REPORT_PICTURE = 112  # side of a view's image, pixels
 
 
 def report(
     results: Path,
     out: Path | None = None,
     /,
-    store: Path | None = None,
-    figures: Path | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
@@ -48,45 +36,22 @@ def report(
     Args:
         results: folder of nextview-lab benchmark classes.
         out: page to write; by default RESULTS/report.html.
-        store: view store for images of the objects; by default that of the predictions, if it still
-            exists.
-        figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
-        overwrite: replace an earlier page and earlier figures.
+        overwrite: replace an earlier page.
 
     Raises:
         ResultsError: there are no results, or only fixed views; or the page cannot be written.
-        DatasetError: the given store cannot be read.
     """
     path = out or results / "report.html"
     check_new(path, overwrite)
-    if figures is not None:
-        check_new(figures, overwrite, folder=True)
-
     loaded = load(results)
     if loaded.tables.sweep.empty:
         raise ResultsError(
             f"{results}: holds fixed views only; a report needs a policy that chooses"
         )
 
-    views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
-        part.write_text(page(loaded, views, why_not), encoding="utf-8")
+        part.write_text(page(loaded), encoding="utf-8")
 
-    if figures is not None:
-        at = board.headline_threshold(loaded.settings["thresholds"])
-        tables = loaded.tables
-        shown = {
-            "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
-            "tests": tables.tests,
-        }
-        if after := board.after_views_table(tables):
-            shown["views"] = pd.DataFrame(after.rows, columns=list(after.headings))
-        write_figures(
-            figures,
-            _figures(loaded, headline_policy(loaded, at), at),
-            shown,
-            overwrite,
-        )
     return path
 
 
@@ -110,13 +75,11 @@ def headline_policy(results: ClassResults, threshold: float) -> str:
     return max(names, key=lambda n: found[n, "accuracy", 0][0], default=reference)
 
 
-def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
+def page(results: ClassResults) -> str:
     """Return the page of a benchmark.
 
     Args:
         results: of the benchmark.
-        store: with images of the objects; None for a page without images.
-        why_not: reason for missing images.
 
     Returns:
         HTML.
@@ -187,8 +150,8 @@ def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
             for name, figure in _figures(results, best, at).items()
         },
         confusions=confusions,
-        failures=_failures(results, best, at, store),
-        made=_made(results, store, why_not),
+        failures=_failures(results, best, at),
+        made=_made(results),
     )
 
 
@@ -273,92 +236,24 @@ def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
     ).head(most)
 
 
-def _failures(
-    results: ClassResults,
-    best: str,
-    at: float,
-    store: ViewStore | None,
-) -> list[dict[Any, Any]]:
+def _failures(results: ClassResults, best: str, at: float) -> list[dict[Any, Any]]:
     """Return the worst failures of a policy, each with its most confident episode."""
     p = results.predictions
     episodes = results.episodes(best, at)
     names = np.asarray(episodes["object"].astype(str))
     found = []
-
     for failure in worst_failures(episodes).to_dict("records"):
         name = failure["object"]
-        episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[
-            0
-        ]
+        mine = (names == name) & (episodes["run"] == failure["run"])
+        episode = episodes[mine].iloc[0]
         views = [int(v) for v in episode["views"]]
-        images = (
-            _images(store, name, views)
-            if store is not None and name in store.names
-            else {}
-        )
-        shown = {"answer": episode["answer"], "views": views, "images": images}
-        found.append(
-            failure | shown | {"conflicting": bool(p.conflicting[p.names.index(name)])}
-        )
-
+        conflicting = bool(p.conflicting[p.names.index(name)])
+        shown = {"answer": episode["answer"], "views": views}
+        found.append(failure | shown | {"conflicting": conflicting})
     return found
 
 
-def pictures_of(
-    predictions: Predictions,
-    store: Path | None = None,
-) -> tuple[ViewStore | None, str]:
-    """Open the view store with images of the objects.
-
-    Args:
-        predictions: of the objects.
-        store: path of a store; None for the one named in the predictions.
-
-    Returns:
-        The store and "", or None and the reason why there is none.
-
-    Raises:
-        ResultsError: the given store has other objects or viewpoints.
-    """
-    if store is not None:
-        given = ViewStore.open(store)
-        if given.sphere != predictions.sphere or not set(given.names) & set(
-            predictions.names
-        ):
-            raise ResultsError(
-                f"{store}: holds no views of these objects from these viewpoints"
-            )
-        return given, ""
-    try:
-        # raises an error for another store
-        stored_rows(predictions, "measures/depth_entropy")
-    except EntryError as error:
-        return None, f"No pictures: {error}; give their view store with --store."
-    return ViewStore.open(predictions.store), ""
-
-
-def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Return images of views as data URIs."""
-    row = store.names.index(name)
-    images: NDArray = store.image(row)
-
-    found = {}
-    for view in views:
-        file = BytesIO()
-        small = Image.fromarray(images[view]).resize(
-            (REPORT_PICTURE, REPORT_PICTURE),
-            Image.Resampling.LANCZOS,
-        )
-        small.save(file, "WEBP", quality=70)
-        found[f"{name} from view {view}"] = (
-            "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
-        )
-    return found
-
-
-def _made(
-    results: ClassResults, store: ViewStore | None, why_not: str
-) -> dict[str, str]:
+def _made(results: ClassResults) -> dict[str, str]:
     s = results.settings
     return {
         **origin(results.predictions, s),
@@ -371,5 +266,4 @@ def _made(
             "signs of the differences of objects flipped; Holm's correction is over all policies"
             " and thresholds of a measure"
         ),
-        "pictures": store.path.name if store is not None else why_not,
     }

@@ -188,7 +188,7 @@ COMMANDS = {
         "write one HTML page of a benchmark of classes",
         "{found}",
         computes=False,
-        example="report results --figures figures",
+        example="report results",
     ),
     "explore": Command(
         f"{CLI}.explore:explore",
