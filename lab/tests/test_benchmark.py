@@ -72,7 +72,6 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
             "accuracy": cell.right.mean(),
             "clean_accuracy": cell.right[cell.clean].mean(),
             "class_accuracy": by_class.right.mean().mean(),
-            "class_accuracy_std": by_class.right.mean().std(ddof=0),
             "n_views": cell.n_views.mean(),
             "travel_all": cell.travel.mean(),
             "travel_moved": moved.travel.mean(),

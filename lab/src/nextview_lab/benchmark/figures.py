@@ -18,11 +18,7 @@ from nextview.figures.style import (
     percent_axis,
 )
 from nextview.recognition.map_names import LCM, LEM
-from nextview_lab.benchmark.class_tables import (
-    ONE_STEP,
-    ClassResults,
-    headline_threshold,
-)
+from nextview_lab.benchmark.class_tables import ClassResults, headline_threshold
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.evaluation import Evaluation
@@ -67,11 +63,8 @@ OWN = (
     "#ff7043",
     "#5c6bc0",
 )
-FORESEES = (
-    "ceiling",
-    ONE_STEP,
-    f"{ONE_STEP}-all",
-)  # policies that depend on the true outcome of a view: drawn dotted
+# policies that depend on the true outcome of a view: drawn dotted
+FORESEES = ("ceiling", "oracle-gain", "oracle-gain-all")
 LOWEST_AXIS = 0.9  # largest lower limit of an axis of shares
 MOST_CURVES = 8  # largest number of curves of realisable policies
 
@@ -81,7 +74,7 @@ def ceiling(results: ClassResults) -> list[str]:
 
     Empty if neither was run.
     """
-    ran = set(results.tables.sweep["policy"])
+    ran = results.tables.choosing()
     return [name for name in FORESEES if name in ran][:1]
 
 
@@ -90,7 +83,7 @@ def compared(results: ClassResults) -> list[str]:
 
     They are the reference, the most accurate others, the published oracle and the upper bound.
     """
-    names = list(results.tables.sweep["policy"].unique())
+    names = results.tables.choosing()
     reference = results.settings["reference"]
     headline = headline_threshold(results.settings["thresholds"])
     values = values_of(results.tables.measures, headline)
@@ -180,33 +173,6 @@ def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> F
     return figure
 
 
-def budget_curve(results: ClassResults, budget: str) -> Figure:
-    """Draw accuracy against mean views or mean travel, over all thresholds.
-
-    Args:
-        results: of the benchmark.
-        budget: "n_views" or "travel_all".
-
-    Returns:
-        The figure.
-    """
-    figure, axes = new_figure(4.6, 3.5)
-    for name in compared(results):
-        rows = results.tables.sweep[results.tables.sweep["policy"] == name]
-        axes.plot(
-            rows[budget], rows["accuracy"], label=name, **look_of(name, results.tables)
-        )
-    axes.set(
-        xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[
-            budget
-        ],
-        ylabel="accuracy",
-    )
-    percent_axis(axes.yaxis)
-    legend(axes)
-    return figure
-
-
 def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
     """Draw the differences of all policies from the reference.
 
@@ -280,57 +246,6 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
     axes.set_title(title, fontsize=10, loc="left")
 
     return figure
-
-
-def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Figure:
-    """Draw the confusion matrix of episodes.
-
-    Args:
-        episodes: with the columns "label" and "answer".
-        classes: names of the classes.
-        title: of the figure.
-
-    Returns:
-        The figure.
-    """
-    label, answer = (
-        pd.Categorical(episodes[c], categories=list(classes))
-        for c in ("label", "answer")
-    )
-    return confusion_matrix(
-        pd.crosstab(label, answer, dropna=False).to_numpy(),
-        classes,
-        title,
-    )
-
-
-def reliability_diagram(
-    results: ClassResults,
-    policies: Sequence[str],
-    threshold: float,
-) -> Figure:
-    """Draw the reliability of the confidence at which the episodes stopped.
-
-    Bins with fewer than 20 episodes are left out.
-
-    Args:
-        results: of the benchmark.
-        policies: names of the policies.
-        threshold: of the belief.
-
-    Returns:
-        The figure.
-    """
-    values = values_of(results.tables.measures, threshold)
-    table = results.tables.reliability.query("threshold == @threshold").rename(
-        columns={"episodes": "answers"}
-    )
-    curves = {}
-    for name in policies:
-        error = values[name, "calibration_error", 0][0]
-        own = table[table["policy"] == name]
-        curves[f"{name}  {error:.3f}"] = own, look_of(name, results.tables)
-    return _reliability(curves, "when it stopped", "policy  calibration error")
 
 
 def _reliability(

@@ -5,20 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
 from nextview.policies.registry import DEFAULT_POLICY
-from nextview.recognition.map_names import LEM
 from nextview_lab.benchmark import class_tables as board
 from nextview_lab.benchmark import figures as draw
-from nextview_lab.benchmark.class_tables import ClassResults, class_set
+from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.page import numbers, origin, picture, render
-from nextview_lab.benchmark.published import PUBLISHED_COLUMNS, published_threshold
 from nextview_lab.extras import extras
 
 with extras():
@@ -44,7 +41,7 @@ def report(
     path = out or results / "report.html"
     check_new(path, overwrite)
     loaded = load(results)
-    if loaded.tables.sweep.empty:
+    if not loaded.tables.choosing():
         raise ResultsError(
             f"{results}: holds fixed views only; a report needs a policy that chooses"
         )
@@ -68,9 +65,7 @@ def headline_policy(results: ClassResults, threshold: float) -> str:
     found = values_of(results.tables.measures, threshold)
     reference = results.settings["reference"]
     names = [
-        n
-        for n in results.tables.sweep["policy"].unique()
-        if not is_oracle(n) and n != reference
+        n for n in results.tables.choosing() if not is_oracle(n) and n != reference
     ]
     return max(names, key=lambda n: found[n, "accuracy", 0][0], default=reference)
 
@@ -89,19 +84,17 @@ def page(results: ClassResults) -> str:
     p = results.predictions
     at = board.headline_threshold(s["thresholds"])
     reference = s["reference"]
-    whole = t.measures[t.measures["views"] == 0]
-    keys = ("policy", "threshold", "measure")
-    found = numbers(whole[whole["set"] == ALL], *keys)
-    labels = sorted(p.classes[k] for k in np.unique(p.labels))
-    of_class = {
-        label: numbers(whole[whole["set"] == class_set(label)], *keys)
-        for label in labels
-    }
-    policies = list(t.sweep["policy"].unique())
+    whole = t.measures[(t.measures["views"] == 0) & (t.measures["set"] == ALL)]
+    found = numbers(whole, "policy", "threshold", "measure")
+    policies = t.choosing()
     best = headline_policy(results, at)
-    tests = board.accuracy_tests(t, at).set_index("policy").to_dict("index")
+    tests = board.accuracy_tests(t, at)
+    by_policy = tests.set_index("policy").to_dict("index")
     wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, *draw.ceiling(results)))
-    shown = [name for name in wanted if name in policies]
+    curves = ("class_accuracy", "accuracy")
+    figures = {measure: draw.threshold_curve(results, measure) for measure in curves}
+    if len(tests):
+        figures["differences"] = draw.differences(t, tests, "accuracy")
 
     def spoken(measure: str) -> str:
         known = [
@@ -112,18 +105,9 @@ def page(results: ClassResults) -> str:
         ]
         return f"At threshold {at:g}: {', '.join(values)}."
 
-    thresholds = [
-        (name, value) for name, value, measure in found if measure == "accuracy"
-    ]
-    fixed_at = {name: None for name, value in thresholds if value is None}
-    confusions = {
-        name: picture(draw.confusion(results.episodes(name, at), p.classes, name))
-        for name in dict.fromkeys((reference, best))
-        if name in policies
-    }
     return render(
         "report.html",
-        title=_title(tests.get(best), best, reference, at),
+        title=_title(by_policy.get(best), best, reference, at),
         settings=s,
         p=p,
         at=at,
@@ -131,25 +115,14 @@ def page(results: ClassResults) -> str:
         reference=reference,
         significant=SIGNIFICANT,
         found=found,
-        of_class=of_class,
-        labels=labels,
         policies=policies,
-        shown=shown,
-        one_view=t.sweep.query("policy == @reference or policy == @best").iloc[0][
-            "accuracy"
-        ],
-        tests=tests,
+        shown=[name for name in wanted if name in policies],
+        tests=by_policy,
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few_objects(t, at, len(p)),
         risks=board.promised_risks(t, s["risks"]),
-        by_class_at=_thresholds(results, at),
-        fixed_at=fixed_at,
         spoken=spoken,
-        figures={
-            name: picture(figure)
-            for name, figure in _figures(results, best, at).items()
-        },
-        confusions=confusions,
+        figures={name: picture(figure) for name, figure in figures.items()},
         failures=_failures(results, best, at),
         made=_made(results),
     )
@@ -165,45 +138,6 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
         )
     more = "more" if test["difference"] > 0 else "less"
     return f"{best} is {100 * abs(test['difference']):.1f} points {more} accurate than {reference}"
-
-
-def _figures(results: ClassResults, best: str, at: float) -> dict[str, Figure]:
-    sweep = results.tables.sweep
-    reference = results.settings["reference"]
-    tests = board.accuracy_tests(results.tables, at)
-    figures = {}
-    if len(tests):
-        figures["differences"] = draw.differences(results.tables, tests, "accuracy")
-    figures |= {
-        measure: draw.threshold_curve(results, measure)
-        for measure in ("class_accuracy", "accuracy")
-    }
-
-    varying = [
-        budget
-        for budget in ("n_views", "travel_all")
-        if sweep[budget].max() > sweep[budget].min()
-    ]
-    figures |= {budget: draw.budget_curve(results, budget) for budget in varying}
-
-    ran = [
-        n
-        for n in dict.fromkeys((reference, best, *draw.ceiling(results)))
-        if n in set(sweep["policy"])
-    ]
-    return figures | {"reliability": draw.reliability_diagram(results, ran, at)}
-
-
-def _thresholds(results: ClassResults, at: float) -> dict[str, float]:
-    """Return policies by class at their published thresholds (tables 8 to 11)."""
-    ran = set(results.tables.sweep["policy"])
-    thresholds = results.settings["thresholds"]
-    wanted = {
-        name: published_threshold(name) or 0.99
-        for name in (LEM, *PUBLISHED_COLUMNS)
-        if name in ran
-    }
-    return {name: t if t in thresholds else at for name, t in wanted.items()}
 
 
 def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:

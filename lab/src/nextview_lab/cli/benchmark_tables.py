@@ -46,7 +46,7 @@ def print_leaderboard(results: ClassResults) -> None:
     reference = results.settings["reference"]
     terminal = Terminal()
 
-    if not tables.sweep.empty:
+    if tables.choosing():
         at = board.headline_threshold(results.settings["thresholds"])
         print_tables([_policies(board.leaderboard(tables, at), at, reference)])
         terminal.print(
