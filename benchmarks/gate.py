@@ -17,7 +17,6 @@ three with things in a bowl, on a box, and leaning |
 | moves | 8 tables of five things, three frames; then one is moved or removed, two frames |
 | places | a thing behind a box (half, two thirds) or cut by the border of the picture |
 | real | real frames of taught things, and of things that nobody taught |
-| counts | statements, modules and named numbers of the package, by its folders |
 
 A known thing counts as soon as 500 of its pixels were in a frame. A name is right if the thing has
 that name and the middle of its posed scan is within 3 cm; in real frames if its posed scan meets
@@ -30,7 +29,6 @@ FILE keeps each part as soon as it is finished; parts that it holds are not meas
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import sys
@@ -71,7 +69,7 @@ from nextview_lab.data.real_frames import (
     write_frames,
 )
 
-Part = Literal["tables", "single", "parts", "moves", "places", "real", "counts"]
+Part = Literal["tables", "single", "parts", "moves", "places", "real"]
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
 Shapes = dict[str, tuple[Float, Float]]  # points on each scan and normals there
@@ -356,43 +354,6 @@ def write_tables(bench: Bench, folder: Path) -> None:
     write_frames(folder, INTRINSICS, shots)
 
 
-def counts(bench: Bench) -> Iterator[Row]:
-    """What the package consists of, by its folders."""
-    package = Path(nextview.__file__).parent
-    for path in sorted(package.rglob("*.py")):
-        tree = ast.parse(path.read_text())
-        inside = path.relative_to(package).parts
-        yield {
-            "group": inside[0] if len(inside) > 1 else "(top)",
-            "case": "/".join(inside),
-            "statements": sum(isinstance(node, ast.stmt) for node in ast.walk(tree)),
-            "modules": 1,
-            "numbers": named_numbers(tree),
-        }
-
-
-def named_numbers(tree: ast.Module) -> int:
-    """Constants of a module or a class, and defaults of arguments, that hold a number."""
-    values: list[ast.expr | None] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef):
-            values += [
-                one.value
-                for one in node.body
-                if isinstance(one, ast.Assign | ast.AnnAssign)
-            ]
-        elif isinstance(node, ast.arguments):
-            values += [*node.defaults, *node.kw_defaults]
-    return sum(
-        any(
-            isinstance(one, ast.Constant) and type(one.value) in (int, float)
-            for one in ast.walk(value)
-        )
-        for value in values
-        if value is not None
-    )
-
-
 PARTS: dict[Part, Callable[[Bench], Iterator[Row]]] = {
     "tables": tables,
     "single": single,
@@ -400,7 +361,6 @@ PARTS: dict[Part, Callable[[Bench], Iterator[Row]]] = {
     "moves": moves,
     "places": places,
     "real": real,
-    "counts": counts,
 }
 
 

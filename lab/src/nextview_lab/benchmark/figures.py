@@ -202,96 +202,8 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
     return figure
 
 
-def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Figure:
+def confusion_matrix(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
     """Draw the percentage of answers for each true class (figure 12).
-
-    Args:
-        counts: by true class (rows) and answer (columns), (C, C).
-        classes: names of the classes.
-        title: of the figure.
-
-    Returns:
-        The figure.
-    """
-    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    figure, axes = new_figure(4.6, 4.4)
-    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-
-    few = len(classes) <= 15
-    ticks = np.arange(len(classes))
-    names = [words(name) for name in classes]
-    for i, j in np.argwhere(share >= 0.01) if few else ():
-        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
-        axes.text(
-            j,
-            i,
-            f"{100 * share[i, j]:.0f}",
-            color="white" if share[i, j] > 0.55 else INK,
-            **text,
-        )
-
-    size = 8.5 if few else 5
-    axes.set_xticks(
-        ticks,
-        names,
-        rotation=50,
-        ha="right",
-        rotation_mode="anchor",
-        fontsize=size,
-    )
-    axes.set_yticks(ticks, names, fontsize=size)
-    axes.grid(visible=False)
-    axes.tick_params(length=0)
-    axes.set(xlabel="answer", ylabel="true class")
-    axes.set_title(title, fontsize=10, loc="left")
-
-    return figure
-
-
-def _reliability(
-    curves: dict[str, tuple[pd.DataFrame, dict]],
-    when: str,
-    title: str,
-) -> Figure:
-    """Draw accuracy against confidence; the size of a dot is its number of answers."""
-    figure, axes = new_figure(4.6, 3.9)
-    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
-    axes.set(
-        xlim=(0, 1.03),
-        ylim=(0, 1.03),
-        xlabel=f"confidence {when}",
-        ylabel="share that was right",
-    )
-    axes.set_aspect("equal")
-
-    for label, (table, look) in curves.items():
-        rows = table[table["answers"] >= 20]
-        axes.plot(
-            rows["confidence"],
-            rows["accuracy"],
-            linewidth=1.1,
-            label=label,
-            **look,
-        )
-        size = 8 + 220 * rows["answers"] / rows["answers"].sum()
-        colour = look["color"]
-
-        axes.scatter(
-            rows["confidence"],
-            rows["accuracy"],
-            size,
-            colour,
-            alpha=0.55,
-            linewidths=0,
-            clip_on=False,
-        )
-
-    legend(axes, title)
-    return figure
-
-
-def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
-    """Draw the confusion matrix after a number of views.
 
     Args:
         e: the evaluation.
@@ -306,85 +218,26 @@ def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> 
         columns="answer",
         values="answers",
     )
+    counts = table.loc[list(classes), list(classes)].to_numpy()
+    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    figure, axes = new_figure(4.6, 4.4)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+
+    few = len(classes) <= 15
+    ticks = np.arange(len(classes))
+    names = [words(name) for name in classes]
+    for i, j in np.argwhere(share >= 0.01) if few else ():
+        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
+        text["color"] = "white" if share[i, j] > 0.55 else INK
+        axes.text(j, i, f"{100 * share[i, j]:.0f}", **text)
+
+    size = 8.5 if few else 5
+    turned: dict[str, Any] = {"rotation": 50, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(ticks, names, fontsize=size, **turned)
+    axes.set_yticks(ticks, names, fontsize=size)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.set(xlabel="answer", ylabel="true class")
     title = "one view" if n_views == 1 else f"all {n_views} views fused"
-    return confusion_matrix(
-        table.loc[list(classes), list(classes)].to_numpy(),
-        classes,
-        title,
-    )
-
-
-def fusion_curve(e: Evaluation) -> Figure:
-    """Draw accuracy, with intervals, and confidence against the number of fused views."""
-    figure, axes = new_figure(4.6, 3.5)
-    table = e.fusion
-
-    axes.fill_between(
-        table["n_views"],
-        table["low"],
-        table["high"],
-        color=BLUE,
-        alpha=0.15,
-        linewidth=0,
-    )
-    axes.plot(
-        table["n_views"],
-        table["accuracy"],
-        color=BLUE,
-        label="over objects, 95 % interval",
-    )
-    axes.plot(
-        table["n_views"],
-        table["class_accuracy"],
-        color=INK,
-        linestyle="--",
-        linewidth=1.1,
-        label="over classes",
-    )
-    axes.plot(
-        table["n_views"],
-        table["confidence"],
-        color=ACCENT,
-        linestyle=":",
-        label="mean confidence",
-    )
-
-    published = e.accuracy.query(
-        "n_views == 1 and label == '' and measure == 'accuracy'"
-    )["published"].iloc[0]
-    if np.isfinite(published):
-        axes.plot(
-            1,
-            published,
-            "D",
-            color=ACCENT,
-            markersize=5,
-            clip_on=False,
-            label="published, one view",
-        )
-
-    axes.set_xscale("log")
-    ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= len(table)]
-    axes.set_xticks(ticks, [str(k) for k in ticks])
-    axes.minorticks_off()
-    axes.set(xlabel="random views fused", ylabel="share")
-    percent_axis(axes.yaxis)
-    legend(axes)
+    axes.set_title(title, fontsize=10, loc="left")
     return figure
-
-
-def evaluated_reliability(e: Evaluation) -> Figure:
-    """Draw the reliability after one view and more, in random order.
-
-    Bins with fewer than 20 answers are left out.
-    """
-    errors = e.fusion.set_index("n_views")["calibration_error"]
-    curves = {}
-    n: Any
-    for (n, rows), colour in zip(
-        e.reliability.groupby("n_views"),
-        ("#7cc4ec", LIGHT_BLUE, BLUE, INK),
-        strict=False,
-    ):
-        curves[f"{n} view{'s' * (n > 1)}  {errors[n]:.3f}"] = rows, {"color": colour}
-    return _reliability(curves, "in the answer", "calibration error")

@@ -93,14 +93,11 @@ def recogniser_scores(logits: Floats, labels: Index) -> dict[str, dict[str, floa
     return {"single_view": accuracy(logits.argmax(2), spread), "all_views_fused": fused}
 
 
-def reliability(
-    confidence: Float,
-    right: Mask,
-    bins: int = 15,
-) -> tuple[Float, Float, Index]:
-    """Return the confidence and the accuracy in bins of equal width.
+def calibration_error(confidence: Float, right: Mask, bins: int = 15) -> float:
+    """Return the expected calibration error.
 
-    Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
+    It is the mean gap between confidence and accuracy over bins of equal width (Guo et al., On
+    calibration of modern neural networks, 2017, section 2).
 
     Args:
         confidence: of each answer, (N,), 0 to 1.
@@ -108,32 +105,11 @@ def reliability(
         bins: number of bins.
 
     Returns:
-        Mean confidence, accuracy and number of answers of each bin, (bins,) each.
-    """
-    at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
-    count = np.bincount(at, minlength=bins)
-    some = np.maximum(count, 1)
-    return (
-        np.bincount(at, confidence, bins) / some,
-        np.bincount(at, right, bins) / some,
-        count,
-    )
-
-
-def calibration_error(confidence: Float, right: Mask) -> float:
-    """Return the expected calibration error.
-
-    It is the mean gap between confidence and accuracy over the bins of ``reliability``.
-
-    Args:
-        confidence: of each answer, (N,), 0 to 1.
-        right: whether each answer is right, (N,) bool.
-
-    Returns:
         The error, 0 to 1.
     """
-    sure, accuracy, count = reliability(confidence, right)
-    return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
+    at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
+    gaps = np.bincount(at, confidence, bins) - np.bincount(at, right, bins)
+    return float(np.abs(gaps).sum() / max(1, len(at)))
 
 
 # scores of a map, and their digits on a card
