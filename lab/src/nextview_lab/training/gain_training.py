@@ -39,10 +39,10 @@ from nextview_lab.training.export import export_onnx
 from nextview_lab.training.fitting_set import hold_out, load_sensed
 from nextview_lab.training.recipes import GainRecipe
 from nextview_lab.training.rollout import (
-    ReplayTable,
     Value,
     candidate_values,
     fit_travel_weight,
+    for_replay,
     judge_all,
     rollout,
 )
@@ -131,7 +131,7 @@ class Score:
 
 
 def walk(
-    table: ReplayTable,
+    data: Predictions,
     policies: list[Policy],
     recipe: GainRecipe,
     rng: np.random.Generator,
@@ -139,7 +139,7 @@ def walk(
     """Collect the states when each policy is followed once over every object.
 
     Args:
-        table: the objects.
+        data: of the objects.
         policies: the policies.
         recipe: of the training.
         rng: source of all random numbers.
@@ -149,11 +149,11 @@ def walk(
         ones, (S, V) float32, with cells as in ``policies.learned_tables``; free choices, (S, V)
         bool; and the objects, (S,) int64.
     """
-    sphere = table.data.sphere
+    sphere = data.sphere
     parts = []
     for policy in policies:
         for moment in rollout(
-            table,
+            data,
             policy,
             recipe.max_views - 1,
             rng,
@@ -161,7 +161,7 @@ def walk(
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             value = np.take_along_axis(
-                candidate_values(table, moment, recipe.objective),
+                candidate_values(data, moment, recipe.objective),
                 view,
                 1,
             )
@@ -183,11 +183,11 @@ def walk(
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
-def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
+def train(data: Predictions, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks of one fold.
 
     Args:
-        table: the objects of the fold.
+        data: of the objects of the fold.
         recipe: of the training.
         fold: number of the fold, which together with the seed determines all random numbers.
 
@@ -195,7 +195,6 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         After every epoch the policy, at travel weight 0 and over all views.
     """
     rng = np.random.default_rng([recipe.seed, fold])
-    data = table.data
     sphere = data.sphere
     n = len(data)
     c = len(data.classes)
@@ -234,7 +233,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     ]
 
     for _ in range(recipe.epochs):
-        *states, objects = walk(table, policies, recipe, rng)
+        *states, objects = walk(data, policies, recipe, rng)
         for batch in np.array_split(rng.permutation(len(objects)), batches):
             seen, value, free = (torch.from_numpy(values[batch]) for values in states)
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
@@ -265,7 +264,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 
 def best_epoch(
     folds: Sequence[Iterable[Gain]],
-    tables: Sequence[ReplayTable],
+    tables: Sequence[Predictions],
     recipe: GainRecipe,
 ) -> Iterator[Best]:
     """Run the training of all folds and keep the best epoch.
@@ -483,8 +482,8 @@ class _Data:
         about: card of a policy trained on it, without its table.
     """
 
-    learned: list[ReplayTable]
-    validated: list[ReplayTable]
+    learned: list[Predictions]
+    validated: list[Predictions]
     objects: int
     validated_on: str
     about: PolicyCard
@@ -543,8 +542,8 @@ def _load(
         learning = [everything[~np.isin(table.names, other.names)]]
         validated_on = f"{len(other)} others"
     rng = np.random.default_rng([recipe.seed, 1])
-    learned = [ReplayTable.select(table, part, rng, variants) for part in learning]
-    validated = [ReplayTable.select(other, part, rng, variants) for part in validating]
+    learned = [for_replay(table, part, rng, variants) for part in learning]
+    validated = [for_replay(other, part, rng, variants) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split"
     if sensed:
@@ -560,7 +559,7 @@ def _load(
         f" {validated_on}",
         tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
         tuple(
-            (part.data.calibration.temperature, part.data.calibration.correlation)
+            (part.calibration.temperature, part.calibration.correlation)
             for part in learned
         ),
         asdict(recipe),
