@@ -27,8 +27,6 @@ Seconds are of CPU, for a frame.
 FILE keeps each part as soon as it is finished; parts that it holds are not measured again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

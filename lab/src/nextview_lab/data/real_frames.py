@@ -18,8 +18,6 @@ each pixel, 0 for none |
 | NAME-meta.mat, meta/NAME.mat | YCB-Video, GraspNet: poses of the things in the image of labels |
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

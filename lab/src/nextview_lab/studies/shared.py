@@ -1,7 +1,5 @@
 """What studies share: scans, and progress."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator, Sequence

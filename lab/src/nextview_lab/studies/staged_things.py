@@ -14,8 +14,6 @@ that a thing on a spoon or in a bowl touches what is seen. All lengths are in me
 level, a table of uneven planks has its top near a height of 0, and things are near the z axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -3,8 +3,6 @@
 python -m nextview_lab.thesis.measure views.zarr ModelNet10 --measures all [--split test]
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path

@@ -20,8 +20,6 @@ sign flips against random choice in the window, over objects, corrected by Holm'
 measures, policies and numbers of views together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

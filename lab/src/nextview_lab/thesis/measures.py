@@ -2,8 +2,6 @@
 values are good.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Literal

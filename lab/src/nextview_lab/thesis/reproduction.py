@@ -6,8 +6,6 @@ Every number and every verdict on the page is worked out here from the predictio
 in.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple

@@ -2,8 +2,6 @@
 pixel shows, and how the surface bends.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
