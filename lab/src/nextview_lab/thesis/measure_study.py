@@ -5,7 +5,7 @@ recogniser says.
         --validation validation.npz [--objects 300] [--runs 10] [--policies random-all gain]
 
 What the models say of the views is predicted, and what the measures say is measured before
-(nextview-lab predict, nextview-lab measure, nextview_lab.thesis.measure). Writes into the folder
+(nextview-lab predict, nextview-lab measure). Writes into the folder
 the table (measures.md) and measures.csv (every number in a row of its own).
 
 For each measure: the rank correlation, over the views of an object, of its value with the
