@@ -8,7 +8,7 @@ exactly as in ``Session``, however many policies look at it.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -204,10 +204,30 @@ class ThingEpisode:
         self.thing = thing
         self._mesh = mesh
         self._seed = (setting.seed, thing, draw)
-        self.stage = Stage.of(mesh, setting, self._seed)
+        self._draw_scene(setting)
         self._views: dict[int, tuple[Observation, Float]] = {}
         self._verified: dict[frozenset[int], Answer] = {}
         self.start = self._first_view()
+
+    def _draw_scene(self, setting: Setting) -> None:
+        """Rotate the thing, and draw its sensor and its surroundings."""
+        mesh = self._mesh
+        rng = np.random.default_rng(self._seed)
+        turn = rotation_z(rng.uniform(0, 2 * np.pi))
+        self._standing = rotated(mesh, turn)
+        radius = self._standing.metres
+        assert radius is not None  # the unit of its file is known
+        away = max(NEAREST_SURFACE + radius, min(USUAL_DISTANCE, RADII_AWAY * radius))
+        drawn = sensor_named(setting.sensor).draw(rng)
+        self._sensor = replace(drawn, radius=radius, distance=away, boxes=0.0)
+        # from the frame of the file to the true object frame, metres
+        self._in_truth = np.eye(4)
+        self._in_truth[:3, :3] = turn
+        self._in_truth[:3, 3] = -(turn @ mesh.centre + self._standing.centre)
+        self._around: Mesh | None = None
+        if setting.occlusion != "none":
+            share = VISIBLE_SHARES[setting.occlusion]
+            self._around = hiding_boxes(self._standing, share, (*self._seed, 2))
 
     def _first_view(self) -> int:
         """Return a view in which the thing is visible."""
@@ -224,11 +244,16 @@ class ThingEpisode:
     def _sensed(self, view: int) -> tuple[Observation, Float]:
         """Return the observation from a viewpoint, and the file's true pose in its camera."""
         if view not in self._views:
-            camera = self.stage.camera(view)
+            # with the setup errors of the episode and the noise of one view
+            rng = np.random.default_rng((*self._seed, 7))
+            camera = SensedCamera(
+                self._standing, self._sensor, rng, around=self._around
+            )
+            rng.spawn(view)
             observation = camera.observe(EPISODE_SPHERE.poses[view])
             in_camera = np.full((4, 4), np.nan)
             if camera.true_pose is not None:
-                in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
+                in_camera = np.linalg.inv(camera.true_pose) @ self._in_truth
             self._views[view] = observation, in_camera
         return self._views[view]
 
@@ -316,64 +341,6 @@ class ThingEpisode:
         return self.things.outlook(
             [self.observation(view) for view in self.seen(views)]
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """Simulated scene with a thing on its table.
-
-    Attributes:
-        standing: its mesh, rotated.
-        around: the boxes around it; None for none.
-        sensor: the simulated sensor.
-        seed: of the sensor errors.
-        in_truth: from the frame of the file to the true object frame, (4, 4), metres.
-    """
-
-    standing: Mesh
-    around: Mesh | None
-    sensor: Any
-    seed: tuple[int, ...]
-    in_truth: Float
-
-    @classmethod
-    def of(
-        cls,
-        mesh: Mesh,
-        setting: Setting,
-        seed: tuple[int, ...],
-    ) -> "Stage":
-        """Rotate a thing, and draw its sensor and its surroundings.
-
-        Args:
-            mesh: the thing, with a known unit, so that its lengths are metres.
-            setting: sensor, distance and occlusion.
-            seed: of all random numbers of the episode.
-        """
-        rng = np.random.default_rng(seed)
-        turn = rotation_z(rng.uniform(0, 2 * np.pi))
-        standing = rotated(mesh, turn)
-        radius = standing.metres
-        assert radius is not None  # the unit of its file is known
-        away = max(NEAREST_SURFACE + radius, min(USUAL_DISTANCE, RADII_AWAY * radius))
-        drawn = sensor_named(setting.sensor).draw(rng)
-        sensor = replace(drawn, radius=radius, distance=away, boxes=0.0)
-        in_truth = np.eye(4)
-        in_truth[:3, :3] = turn
-        in_truth[:3, 3] = -(turn @ mesh.centre + standing.centre)
-        around = None
-        if setting.occlusion != "none":
-            share = VISIBLE_SHARES[setting.occlusion]
-            around = hiding_boxes(standing, share, (*seed, 2))
-
-        return cls(standing, around, sensor, (*seed, 7), in_truth)
-
-    def camera(self, view: int) -> SensedCamera:
-        """Return the camera, with the setup errors of the episode and the noise of one view."""
-        rng = np.random.default_rng(self.seed)
-        camera = SensedCamera(self.standing, self.sensor, rng, around=self.around)
-        rng.spawn(view)
-        return camera
 
 
 def hiding_boxes(
