@@ -146,10 +146,8 @@ def shipped(folder, policy) -> Gain:
     ("scope", "inputs"), [("global", INPUTS), ("local", ("view", "place"))]
 )
 def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
-    state, policy = (
-        some_state(episodes=300),
-        some_gain(inputs=inputs, scope=scope, travel_weight=0.1),
-    )
+    state = some_state(episodes=300)
+    policy = some_gain(inputs=inputs, scope=scope, travel_weight=0.1)
     other = shipped(tmp_path, policy)
     assert (other.inputs, other.scope, other.travel_weight) == (inputs, scope, 0.1)
     seen = features(SPHERE, state, inputs)

@@ -193,10 +193,8 @@ def test_nothing_depends_on_where_object_and_camera_are_together(name):
         else Rotation.from_euler("xyz", [40, 110, 200])
     )
     move = np.eye(4)
-    move[:3, :3], move[:3, 3] = (
-        turn.as_matrix(),
-        (0, 0, 0) if upright else (0.3, -0.2, 0.1),
-    )
+    move[:3, :3] = turn.as_matrix()
+    move[:3, 3] = (0, 0, 0) if upright else (0.3, -0.2, 0.1)
     moved = Mesh(
         mesh.vertices @ move[:3, :3].T + move[:3, 3],
         mesh.faces,
