@@ -14,11 +14,10 @@ import msgspec
 import numpy as np
 
 from nextview.checks import number, whole
-from nextview.errors import DatasetError, PolicyError, UsageError, option
+from nextview.errors import DatasetError, PolicyError, UsageError
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
 from nextview.simulation.sensor import sensor_named
-from nextview.things.surface import Surface
 from nextview_lab.benchmark.jobs import Job, Settings
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
@@ -246,26 +245,16 @@ def scan_of(
     surface = things.surface(thing)
     if surface is None:
         return mesh
-    if _apart(mesh, surface) <= SCAN_APART:
-        return mesh
-
-    for other in UNITS:
-        if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
-            raise DatasetError(
-                f"{file}: is not in {unit}: another size was taught; give"
-                f" {option('unit', other)}"
-            )
-    raise DatasetError(
-        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
-        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught"
-    )
-
-
-def _apart(mesh: Mesh, surface: Surface) -> float:
-    """Return the distance between the corners of two bounding boxes, radii of the surface."""
+    # corners of two bounding boxes
     ours = mesh.vertices * mesh.radius + mesh.centre
     boxes = [np.stack([one.min(0), one.max(0)]) for one in (ours, surface.vertices)]
-    return float(np.abs(boxes[0] - boxes[1]).max() / surface.radius)
+    if np.abs(boxes[0] - boxes[1]).max() <= SCAN_APART * surface.radius:
+        return mesh
+    raise DatasetError(
+        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
+        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught."
+        f" Is it in {unit}?"
+    )
 
 
 def replayed(

@@ -376,7 +376,6 @@ class TrainedGain:
     Attributes:
         card: path of its card.
         objects: number of training objects.
-        validated_on: description of the validation objects.
         value: mean objective after 2, 3, ... views at travel weight 0, (views - 1,).
         travel_weight: the chosen weight of travel.
         states: number of states in which the exported file was compared with the networks.
@@ -385,7 +384,6 @@ class TrainedGain:
 
     card: Path
     objects: int
-    validated_on: str
     value: Float
     travel_weight: float
     states: int
@@ -395,7 +393,6 @@ class TrainedGain:
 def train_gain(
     predictions: Path,
     out: Path,
-    validation: Path | None = None,
     folds: int = 20,
     travel_weight: float | None = None,
     local: bool = False,
@@ -412,10 +409,8 @@ def train_gain(
         predictions: predictions of training objects that the recogniser has not seen (nextview-lab
             predict --held-out).
         out: card to write (NAME.json); the networks are written next to it (NAME.onnx).
-        validation: predictions of other such objects, which select the epoch and the travel weight.
-            By default PREDICTIONS select them by cross-validation.
-        folds: without VALIDATION: number of folds; one policy is trained without each fold and
-            validated on it, and the result is the mean of all.
+        folds: number of folds; one policy is trained without each fold and validated on it, and the
+            result is the mean of all.
         travel_weight: weight of a grid cell of travel; by default the lowest at which the policy
             travels no farther than a random walk in the local window.
         local: choose only views of the local window.
@@ -434,7 +429,7 @@ def train_gain(
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
-    data = _load(predictions, validation, sensed, recipe, folds)
+    data = _load(predictions, sensed, recipe, folds)
     best: list[Best] = []
 
     def epochs() -> Iterator[int]:
@@ -466,7 +461,6 @@ def train_gain(
     return TrainedGain(
         out,
         data.objects,
-        data.validated_on,
         value.mean,
         travel_weight,
         len(states),
@@ -485,65 +479,29 @@ class _Data:
     learned: list[Predictions]
     validated: list[Predictions]
     objects: int
-    validated_on: str
     about: PolicyCard
     rng: np.random.Generator
 
 
-def _sources(
-    predictions: Path,
-    validation: Path | None,
-    sensed: Sequence[Path],
-    recipe: GainRecipe,
-) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
-    """Open and check training and validation data."""
-    table = Predictions.load(predictions).deduplicate()
-    other = table if validation is None else Predictions.load(validation).deduplicate()
-    if (other.classes, other.sphere) != (table.classes, table.sphere):
-        raise PredictionsError(
-            f"{validation}: is of other classes or viewpoints than {predictions}"
-        )
-
-    if sensed and validation is not None:
-        raise UsageError(
-            "predictions through sensors choose with those that are learned from: no --validation"
-        )
-
-    variants = load_sensed(sensed, table)
-    sources = (
-        [(predictions, table)]
-        if validation is None
-        else [(predictions, table), (validation, other)]
-    )
-    sources += zip(sensed, variants, strict=True)
-
-    for path, p in sources:
-        _check(path, p, recipe)
-    return table, other, variants, sources
-
-
 def _load(
     predictions: Path,
-    validation: Path | None,
     sensed: Sequence[Path],
     recipe: GainRecipe,
     folds: int,
 ) -> _Data:
-    table, other, variants, sources = _sources(predictions, validation, sensed, recipe)
+    table = Predictions.load(predictions).deduplicate()
+    variants = load_sensed(sensed, table)
+    sources = [(predictions, table), *zip(sensed, variants, strict=True)]
+    for path, p in sources:
+        _check(path, p, recipe)
     everything = np.arange(len(table))
-    if validation is None:
-        # few objects have one fold each
-        folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
-        validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
-        learning = [np.setdiff1d(everything, part) for part in validating]
-        validated_on = f"the same, each judged by networks of {folds - 1} other folds"
-    else:
-        validating = [np.arange(len(other))]
-        learning = [everything[~np.isin(table.names, other.names)]]
-        validated_on = f"{len(other)} others"
+    # few objects have one fold each
+    folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
+    validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
+    learning = [np.setdiff1d(everything, part) for part in validating]
     rng = np.random.default_rng([recipe.seed, 1])
     learned = [for_replay(table, part, rng, variants) for part in learning]
-    validated = [for_replay(other, part, rng, variants) for part in validating]
+    validated = [for_replay(table, part, rng, variants) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split"
     if sensed:
@@ -555,8 +513,8 @@ def _load(
         table.sphere.azimuths,
         table.classes,
         {},
-        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on"
-        f" {validated_on}",
+        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on the same, each"
+        f" judged by networks of {folds - 1} other folds",
         tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
         tuple(
             (part.calibration.temperature, part.calibration.correlation)
@@ -569,7 +527,7 @@ def _load(
             )
         ),
     )
-    return _Data(learned, validated, objects, validated_on, about, rng)
+    return _Data(learned, validated, objects, about, rng)
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
