@@ -60,7 +60,6 @@ from benchmarks.gate_frames import (
 from nextview.sensing import Frame
 from nextview_lab.benchmark.real import pixels_met
 from nextview_lab.data.real_frames import (
-    RealFrame,
     Shot,
     Told,
     real_frames,
@@ -308,7 +307,12 @@ def moves(bench: Bench) -> Iterator[Row]:
 def real(bench: Bench) -> Iterator[Row]:
     """Real frames, each alone and without a pose."""
     system, shapes = bench.taught()
-    for group, seen in real_cases(bench):
+    some = []
+    for folder, (group, camera, most) in REAL.items():
+        frames = real_frames(bench.data / folder, camera)
+        every = frames[:: max(1, len(frames) // most)]
+        some += [(group, seen) for seen in every[: most : bench.every]]
+    for group, seen in some:
         scene = nextview.Scene(system, up=None)
         cost = updated(scene, seen.read())[1]
         judged = []
@@ -327,14 +331,6 @@ def real(bench: Bench) -> Iterator[Row]:
             if right:
                 del left[one.name]
         yield {"group": group, "case": seen.name, **row_of(known, judged), **cost}
-
-
-def real_cases(bench: Bench) -> Iterator[tuple[str, RealFrame]]:
-    """Real frames, each with its group."""
-    for folder, (group, camera, most) in REAL.items():
-        frames = real_frames(bench.data / folder, camera)
-        for seen in frames[:: max(1, len(frames) // most)][: most : bench.every]:
-            yield group, seen
 
 
 def write_tables(bench: Bench, folder: Path) -> None:

@@ -124,7 +124,19 @@ def page(results: ClassResults) -> str:
         spoken=spoken,
         figures={name: picture(figure) for name, figure in figures.items()},
         failures=_failures(results, best, at),
-        made=_made(results),
+        made={
+            **origin(p, s),
+            "valley classes": ", ".join(s["valley_classes"]) or "none",
+            "first views": (
+                f"{s['runs']} of each object, the same for every policy and threshold; seed"
+                f" {s['seed']}"
+            ),
+            "bootstrap": f"{s['samples']} samples of objects",
+            "tests": (
+                "signs of the differences of objects flipped; Holm's correction is over all"
+                " policies and thresholds of a measure"
+            ),
+        },
     )
 
 
@@ -185,19 +197,3 @@ def _failures(results: ClassResults, best: str, at: float) -> list[dict[Any, Any
         shown = {"answer": episode["answer"], "views": views}
         found.append(failure | shown | {"conflicting": conflicting})
     return found
-
-
-def _made(results: ClassResults) -> dict[str, str]:
-    s = results.settings
-    return {
-        **origin(results.predictions, s),
-        "valley classes": ", ".join(s["valley_classes"]) or "none",
-        "first views": (
-            f"{s['runs']} of each object, the same for every policy and threshold; seed {s['seed']}"
-        ),
-        "bootstrap": f"{s['samples']} samples of objects",
-        "tests": (
-            "signs of the differences of objects flipped; Holm's correction is over all policies"
-            " and thresholds of a measure"
-        ),
-    }

@@ -4,7 +4,7 @@ Workers import this module, so it imports neither pandas nor matplotlib.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -219,7 +219,14 @@ def work(job: ThingJob) -> None:
     runs: dict[str, list[ThingRun]] = {} if before is None else before.runs
     # The upper bound comes first, as it verifies views that the others use.
     for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
-        runs[name] = replayed(episode, name, chosen[name], job)
+        rng = np.random.default_rng(
+            (how.seed, job.thing, job.draw, crc32(name.encode()))
+        )
+        times = how.repeats if name == "random" else 1
+        runs[name] = [
+            run(episode, chosen[name](episode), how.views[-1], rng)
+            for _ in range(times)
+        ]
     job.write(EpisodeRuns(things.names[job.thing], job.draw, runs))
 
 
@@ -255,25 +262,3 @@ def scan_of(
         f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught."
         f" Is it in {unit}?"
     )
-
-
-def replayed(
-    episode: ThingEpisode,
-    name: str,
-    make: Callable[[ThingEpisode], Policy],
-    job: ThingJob,
-) -> list[ThingRun]:
-    """Return the runs of one policy in one episode.
-
-    Args:
-        episode: the thing.
-        name: of the policy.
-        make: creates the policy for an episode.
-        job: first views and rules of all episodes.
-    """
-    rng = np.random.default_rng(
-        (job.settings.seed, job.thing, job.draw, crc32(name.encode()))
-    )
-    times = job.settings.repeats if name == "random" else 1
-    views = job.settings.views[-1]
-    return [run(episode, make(episode), views, rng) for _ in range(times)]

@@ -16,7 +16,6 @@ from nextview.session.system import UNKNOWN_ALPHA
 from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
-from nextview.types import Index
 from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
@@ -130,7 +129,8 @@ def summarise_things(
     episodes = episodes[episodes["policy"].isin(policies)]
     things = list(dict.fromkeys(one.thing for one in runs))
     episodes = episodes.assign(object=episodes["thing"].map(things.index))
-    family = _families(things, how)
+    bodies = [name.partition("_")[0] if how.families else name for name in things]
+    family = np.asarray(np.unique(np.array(bodies), return_inverse=True)[1])
     weights = resample_families(family, how.samples, np.random.default_rng(0))
     kept = episodes[episodes["views"].isin([0, *how.views])]
     counted = Counted.of(kept, AFTER, ENDS, family)
@@ -188,12 +188,6 @@ def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
         *poses,
         Column("choice, ms of CPU: median, 95 %", spent, 0, 0, "choice, ms of CPU"),
     )
-
-
-def _families(names: Sequence[str], how: ThingSettings) -> Index:
-    """Return the family index of each thing, (T,) int64."""
-    bodies = [name.partition("_")[0] if how.families else name for name in names]
-    return np.asarray(np.unique(np.array(bodies), return_inverse=True)[1])
 
 
 def _times(episodes: "pd.DataFrame") -> "pd.DataFrame":

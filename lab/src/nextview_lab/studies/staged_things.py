@@ -306,11 +306,6 @@ class Actor:
         """Join a scene."""
         add_scan(spec, "thing", pieces_of(self.folder, self.name), self.scan, pose)
 
-    def in_some_stable_pose(self, rng: np.random.Generator) -> Float:
-        """A rotation, (3, 3), in which it rests on any side of its hull that it can rest on."""
-        ups, _ = stable_ups(self.scan)
-        return with_up(ups[rng.integers(len(ups))], rng)
-
 
 def alone(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls on a table."""
@@ -346,7 +341,11 @@ def stack(actor: Actor, rng: np.random.Generator) -> Staging:
     under = Actor(actor.folder, name, 0).scan
     add_scan(spec, "under", pieces_of(actor.folder, name), under)
     flat = with_up(stable_ups(under)[0][0], rng)
-    turn = turned(rng) if actor.tries < 3 else actor.in_some_stable_pose(rng)
+    if actor.tries < 3:
+        turn = turned(rng)
+    else:  # on any side of its hull that it can rest on
+        ups = stable_ups(actor.scan)[0]
+        turn = with_up(ups[rng.integers(len(ups))], rng)
     above = 0.008 + np.ptp(under.vertices @ flat[2])
     starts = {
         "under": placed(under, flat, np.zeros(2), 0.003),
