@@ -34,26 +34,9 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.surface import Surface
-from nextview.types import Float, Index
+from nextview.types import Float
 from nextview.views.expected_views import Outlook
 from nextview_lab.data.metrics import add_s
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """What a recogniser says of some views.
-
-    Attributes:
-        belief: in each thing, (T,) float64.
-        things: thing of each pose, the likeliest first, (M,) int64; empty without poses.
-        poses: from the frames of the scan files to the object frame, (M, 4, 4) float64, metres.
-        p_value: value of the test for unknown things, () float64; NaN if it is not known.
-    """
-
-    belief: Float
-    things: Index
-    poses: Float
-    p_value: Float
 
 
 class KnownThings:
@@ -84,8 +67,8 @@ class KnownThings:
         library = self.memory.library
         return library.caster.surfaces[library.names.index(self.names[thing])]
 
-    def __call__(self, observations: Sequence[Observation]) -> Answer:
-        """What it says of views of one thing: together if it can, else by the sum of all.
+    def __call__(self, observations: Sequence[Observation]) -> JointBelief:
+        """What it says of views of one thing; the belief is in the order of the names.
 
         Args:
             observations: views that show the thing, in one object frame.
@@ -94,13 +77,8 @@ class KnownThings:
             ModelError: its answer is invalid.
         """
         joint = self._together(observations)
-        poses = [each for each in joint.poses if each.thing in self.names]
-        return Answer(
-            belief=np.asarray(joint.belief, np.float64)[self._order],
-            things=np.array([self.names.index(each.thing) for each in poses], np.int64),
-            poses=np.array([each.pose for each in poses]).reshape(-1, 4, 4),
-            p_value=np.array(np.nan if joint.p_value is None else joint.p_value),
-        )
+        belief = np.asarray(joint.belief, np.float64)[self._order]
+        return replace(joint, belief=belief)
 
     def _together(self, observations: Sequence[Observation]) -> JointBelief:
         """What it says of views of one thing: together if it can, else by the sum of all."""
@@ -206,7 +184,7 @@ class ThingEpisode:
         self._seed = (setting.seed, thing, draw)
         self._draw_scene(setting)
         self._views: dict[int, tuple[Observation, Float]] = {}
-        self._verified: dict[frozenset[int], Answer] = {}
+        self._verified: dict[frozenset[int], JointBelief] = {}
         self.start = self._first_view()
 
     def _draw_scene(self, setting: Setting) -> None:
@@ -261,7 +239,7 @@ class ThingEpisode:
         """Return the views in which the thing is visible."""
         return [view for view in views if self.observation(view).seen]
 
-    def verified(self, views: Sequence[int]) -> Answer:
+    def verified(self, views: Sequence[int]) -> JointBelief:
         """Return what the recogniser says of some views."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
@@ -280,8 +258,8 @@ class ThingEpisode:
 
     def p_value(self, views: Sequence[int]) -> float | None:
         """Return the value of the test for unknown things; None if there is none."""
-        value = float(self.verified(views).p_value)
-        return None if np.isnan(value) else value
+        value = self.verified(views).p_value
+        return None if value is None else float(value)
 
     def pose_error(self, views: Sequence[int]) -> float | None:
         """Return the pose error (ADD-S) in the last view, millimetres.
@@ -290,9 +268,9 @@ class ThingEpisode:
             The mean distance of surface points in the estimated pose to the nearest points of the
             true surface; None if the thing is not named correctly.
         """
-        found = self.verified(views)
-        rows = np.flatnonzero(found.things == self.thing)
-        if int(found.belief.argmax()) != self.thing or not len(rows):
+        name = self.things.names[self.thing]
+        poses = [each.pose for each in self.verified(views).poses if each.thing == name]
+        if not poses or not self.named_right(views):
             return None
 
         seen = self.seen(views)
@@ -302,11 +280,9 @@ class ThingEpisode:
         assert radius is not None
         camera = scene.pose.copy()
         camera[:3, 3] *= radius
-        pose = found.poses[rows[0]]
-
         points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._sensed(seen[-1])[1]
-        return 1000 * add_s(points, np.linalg.inv(camera) @ pose, true)
+        return 1000 * add_s(points, np.linalg.inv(camera) @ poses[0], true)
 
     @cached_property
     def _surface(self) -> Surface:
