@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from nextview.figures.style import (
     ACCENT,
@@ -18,8 +17,7 @@ from nextview.figures.style import (
     percent_axis,
 )
 from nextview.recognition.map_names import LCM, LEM
-from nextview_lab.benchmark.class_tables import ClassResults, headline_threshold
-from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
+from nextview_lab.benchmark.comparison import SIGNIFICANT, Tables, values_of
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import words
@@ -69,33 +67,6 @@ LOWEST_AXIS = 0.9  # largest lower limit of an axis of shares
 MOST_CURVES = 8  # largest number of curves of realisable policies
 
 
-def ceiling(results: ClassResults) -> list[str]:
-    """Return the one-step oracle, in the window or over all views.
-
-    Empty if neither was run.
-    """
-    ran = results.tables.choosing()
-    return [name for name in FORESEES if name in ran][:1]
-
-
-def compared(results: ClassResults) -> list[str]:
-    """Return the policies shown as curves.
-
-    They are the reference, the most accurate others, the published oracle and the upper bound.
-    """
-    names = results.tables.choosing()
-    reference = results.settings["reference"]
-    headline = headline_threshold(results.settings["thresholds"])
-    values = values_of(results.tables.measures, headline)
-    robots = sorted(
-        (n for n in names if not is_oracle(n)),
-        key=lambda n: (n != reference, -values[n, "accuracy", 0][0]),
-    )[:MOST_CURVES]
-    return [n for n in names if n in robots] + [
-        n for n in ("oracle-valley", *ceiling(results)) if n in names
-    ]
-
-
 def look_of(policy: str, tables: Tables) -> dict[str, Any]:
     """Return the colour and the line style of a policy, the same in all figures.
 
@@ -128,46 +99,13 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
         shares = np.array([values[policy, measure, k] for k in views])
         # offset, so that the bars do not overlap
         x = np.array(views) + (row - len(policies) / 2) * 0.05
-        _curve(axes, x, shares, policy, look_of(policy, tables))
+        look = look_of(policy, tables)
+        axes.plot(x, shares[:, 0], marker="o", markersize=3.5, label=policy, **look)
+        bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
+        axes.vlines(x, shares[:, 1], shares[:, 2], **bars)
     axes.set_xticks(views)
     axes.set(xlabel="views", ylabel=what)
     axes.set_ylim(min(axes.get_ylim()[0], LOWEST_AXIS), 1 + (1 - LOWEST_AXIS) / 10)
-    percent_axis(axes.yaxis)
-    legend(axes)
-    return figure
-
-
-def _curve(axes: Any, x: NDArray, shares: NDArray, label: str, look: dict) -> None:
-    """Draw a line through shares, (K, 3): value, low and high, with bars at its points."""
-    axes.plot(x, shares[:, 0], marker="o", markersize=3.5, label=label, **look)
-    bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
-    axes.vlines(x, shares[:, 1], shares[:, 2], **bars)
-
-
-def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> Figure:
-    """Draw accuracy against threshold, with 95 % intervals (figures 15 and 18).
-
-    Args:
-        results: of the benchmark.
-        measure: name of the accuracy.
-
-    Returns:
-        The figure.
-    """
-    figure, axes = new_figure(4.6, 3.5)
-    table = results.tables.measures.query(
-        f"set == {ALL!r} and measure == @measure and threshold == threshold"
-    )
-    ticks = sorted(table["threshold"].unique())
-    names = [n for n in compared(results) if n in set(table["policy"])]
-    for k, name in enumerate(names):
-        rows = table[table["policy"] == name].sort_values("threshold")
-        shares = rows[["value", "low", "high"]].to_numpy(np.float64)
-        # offset, so that the bars do not overlap
-        x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04
-        _curve(axes, x, shares, name, look_of(name, results.tables))
-    axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
-    axes.set(xlabel="confidence threshold", ylabel=words(measure))
     percent_axis(axes.yaxis)
     legend(axes)
     return figure

@@ -28,7 +28,7 @@ def report(
     /,
     overwrite: bool = False,
 ) -> Path:
-    """Write one self-contained HTML page: tables, curves, and the worst failures.
+    """Write one self-contained HTML page: tables, differences, and the worst failures.
 
     Args:
         results: folder of nextview-lab benchmark classes.
@@ -90,21 +90,11 @@ def page(results: ClassResults) -> str:
     best = headline_policy(results, at)
     tests = board.accuracy_tests(t, at)
     by_policy = tests.set_index("policy").to_dict("index")
-    wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, *draw.ceiling(results)))
-    curves = ("class_accuracy", "accuracy")
-    figures = {measure: draw.threshold_curve(results, measure) for measure in curves}
+    wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, "oracle-gain"))
+    figures = {}
     if len(tests):
-        figures["differences"] = draw.differences(t, tests, "accuracy")
-
-    def spoken(measure: str) -> str:
-        known = [
-            (name, found.get((name, at, measure))) for name in draw.compared(results)
-        ]
-        values = [
-            f"{name} {number.value:.3f}" for name, number in known if number is not None
-        ]
-        return f"At threshold {at:g}: {', '.join(values)}."
-
+        drawn = draw.differences(t, tests, "accuracy")
+        figures["differences"] = picture(drawn)
     return render(
         "report.html",
         title=_title(by_policy.get(best), best, reference, at),
@@ -121,8 +111,7 @@ def page(results: ClassResults) -> str:
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few_objects(t, at, len(p)),
         risks=board.promised_risks(t, s["risks"]),
-        spoken=spoken,
-        figures={name: picture(figure) for name, figure in figures.items()},
+        figures=figures,
         failures=_failures(results, best, at),
         made={
             **origin(p, s),
