@@ -64,7 +64,6 @@ OWN = (
 # policies that depend on the true outcome of a view: drawn dotted
 FORESEES = ("ceiling", "oracle-gain", "oracle-gain-all")
 LOWEST_AXIS = 0.9  # largest lower limit of an axis of shares
-MOST_CURVES = 8  # largest number of curves of realisable policies
 
 
 def look_of(policy: str, tables: Tables) -> dict[str, Any]:

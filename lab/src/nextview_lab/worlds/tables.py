@@ -193,7 +193,6 @@ class TableCamera:
         table: SimulatedTable,
         sensor: Sensor,
         rng: np.random.Generator,
-        room: Sequence[Triangles] = (),
     ) -> None:
         """Set up a camera over a table.
 
@@ -201,15 +200,12 @@ class TableCamera:
             table: with the objects.
             sensor: noise model, and the errors of its setup.
             rng: for the errors.
-            room: surroundings of the table, in its frame, metres: walls, furniture.
         """
         self.sensor = sensor
-        self._room = tuple(room)
         self._rng = rng
         angles = [*rng.normal(0, sensor.tilt, 2), 0]
         self.lean = np.eye(4)
         self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
-        self._count = 0
         self.change(table)
         self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(
             -1,
@@ -223,7 +219,7 @@ class TableCamera:
         things: list[Triangles] = [
             (thing.placed, thing.faces) for thing in table.things
         ]
-        self._caster = RayCaster([*things, *table_and_floor(), *self._room])
+        self._caster = RayCaster([*things, *table_and_floor()])
 
     @property
     def truth(self) -> dict[str, Float]:
