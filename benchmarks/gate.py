@@ -28,8 +28,6 @@ Seconds are of CPU, for a frame.
 FILE keeps each part as soon as it is finished; parts that it holds are not measured again.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -9,8 +9,6 @@ result as soon as it is there. ``numbers.md`` is written from these three. A num
 changes counts as not measured.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json

@@ -148,7 +148,6 @@ SMALL = {  # options that make a command quick
         "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
     ),
     "python examples/bin_picking.py": "--parts 1",
-    "python -m nextview_lab.thesis.measure": "--workers 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--objects \d+": "--objects 2",

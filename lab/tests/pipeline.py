@@ -43,11 +43,9 @@ def train_predictions(
 ) -> Predictions:
     """Predictions of objects of the training split of which nothing but this is known."""
     n, v, _ = logits.shape
-    entropy, splits, conflicting = (
-        np.zeros((n, v), np.float32),
-        np.array(["train"] * n),
-        np.zeros(n, bool),
-    )
+    entropy = np.zeros((n, v), np.float32)
+    splits = np.array(["train"] * n)
+    conflicting = np.zeros(n, bool)
     given = (
         logits,
         {},

@@ -39,20 +39,16 @@ def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system
     camera = CapturedCamera(
         read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json")
     )
-    found, looked = (
-        system.recognise(camera, start=4),
-        system.recognise(sample_mesh("chair"), start=4),
-    )
+    found = system.recognise(camera, start=4)
+    looked = system.recognise(sample_mesh("chair"), start=4)
     assert max(view.degrees_off for view in found.views) < 1e-5
     assert [view.index for view in found.views] == [view.index for view in looked.views]
     assert [camera.capture.frames.index(taken.frame) for taken in camera.taken] == [
         v.index for v in looked.views
     ]
     assert found.answer == looked.answer == "chair"
-    centre, height = (
-        camera.object.object_frame.centre,
-        -RADIUS * sample_mesh("chair").vertices[:, 2].min(),
-    )
+    centre = camera.object.object_frame.centre
+    height = -RADIUS * sample_mesh("chair").vertices[:, 2].min()
     np.testing.assert_allclose(centre, [0, 0, height], atol=1e-9)
     for view in found.views:
         np.testing.assert_allclose(

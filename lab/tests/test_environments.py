@@ -30,10 +30,8 @@ def learnable(n: int = 12) -> Predictions:
     azimuth_bins = (
         np.random.default_rng(9).normal(size=(n, 40, 3, 8)).astype(np.float32)
     )
-    calibration, splits = (
-        Calibration(1.5, 0.3, bin_correlation=0.2),
-        np.array(["train"] * n),
-    )
+    calibration = Calibration(1.5, 0.3, bin_correlation=0.2)
+    splits = np.array(["train"] * n)
     return replace(
         some_predictions(n),
         splits=splits,

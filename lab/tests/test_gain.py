@@ -26,7 +26,7 @@ from nextview_lab.training.gain_training import (
     write_gain,
 )
 from nextview_lab.training.recipes import GainRecipe
-from nextview_lab.training.rollout import ReplayTable, fit_travel_weight, judge, rollout
+from nextview_lab.training.rollout import fit_travel_weight, judge, rollout
 
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 CLASSES = 4
@@ -146,10 +146,8 @@ def shipped(folder, policy) -> Gain:
     ("scope", "inputs"), [("global", INPUTS), ("local", ("view", "place"))]
 )
 def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
-    state, policy = (
-        some_state(episodes=300),
-        some_gain(inputs=inputs, scope=scope, travel_weight=0.1),
-    )
+    state = some_state(episodes=300)
+    policy = some_gain(inputs=inputs, scope=scope, travel_weight=0.1)
     other = shipped(tmp_path, policy)
     assert (other.inputs, other.scope, other.travel_weight) == (inputs, scope, 0.1)
     seen = features(SPHERE, state, inputs)
@@ -193,8 +191,8 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     """Every class is told on one ring alone, and each view hints at the class: go to the ring of
     the class believed.
     """
-    learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240))
-    fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1))
+    learned = telling(SMALL, [[0], [1], [2]], 240)
+    fresh = telling(SMALL, [[0], [1], [2]], 90, seed=1)
     recipe = replace(
         QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20
     )
@@ -203,8 +201,8 @@ def test_training_finds_the_views_that_tell_the_class_believed():
         SMALL.ring[m.state.current]
         for m in rollout(fresh, policy, 2, np.random.default_rng(5))
     )
-    not_told_yet = first != fresh.data.labels
-    assert np.mean((second == fresh.data.labels)[not_told_yet]) > 0.9
+    not_told_yet = first != fresh.labels
+    assert np.mean((second == fresh.labels)[not_told_yet]) > 0.9
     blind = judge(fresh, RandomAll(SMALL), 3, "log-belief", np.random.default_rng(0))
     assert (value.mean > blind.mean + 0.05).all()
 

@@ -43,17 +43,8 @@ def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
         return []
 
     monkeypatch.setattr(stage, "train_recogniser", train)
-    main(
-        [
-            "train",
-            "recogniser",
-            "s",
-            "none",
-            *(["--preset", preset] if preset else []),
-            "--epochs",
-            "1",
-        ]
-    )
+    chosen = f"--preset {preset}" if preset else ""
+    main(f"train recogniser s none {chosen} --epochs 1".split())
     assert called == [replace(recipe, epochs=1)]
 
 

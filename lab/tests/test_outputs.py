@@ -114,7 +114,7 @@ NOWHERE = {
     "check": ("check none --figure {}.png",),
     "submit": ("submit none {}.json",),
     "leaderboard": ("leaderboard none none {}",),
-    "report": ("report none {}.html", "report none good.html --figures {}"),
+    "report": ("report none {}.html",),
 }
 """The outputs of each command, all of whose inputs are missing."""
 WRITE_NOTHING = {"completion", "explore", "list"}

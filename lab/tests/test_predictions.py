@@ -37,25 +37,13 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
     )
     saved.save(tmp_path / "p.npz")
     loaded = Predictions.load(tmp_path / "p.npz")
-    for name in (
-        "logits",
-        "of_size",
-        "depth_entropy",
-        "labels",
-        "splits",
-        "conflicting",
-    ):
+    arrays = "logits", "of_size", "depth_entropy", "labels", "splits", "conflicting"
+    for name in arrays:
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
         assert getattr(loaded, name).dtype == getattr(saved, name).dtype
     np.testing.assert_array_equal(loaded.maps["lem"], saved.maps["lem"])
-    for name in (
-        "names",
-        "classes",
-        "sphere",
-        "models",
-        "valley_classes",
-        "calibration",
-    ):
+    others = "names", "classes", "sphere", "models", "valley_classes", "calibration"
+    for name in others:
         assert getattr(loaded, name) == getattr(saved, name)
     assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
 
@@ -167,25 +155,14 @@ def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_t
 def test_the_same_mesh_under_two_labels_is_marked_across_splits(
     furniture, models, tmp_path
 ):
-    for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
+    chair, monitor = "chair/test/chair_4", "monitor/test/monitor_4"
+    for place in (chair, "table/train/twin", monitor):
         path = tmp_path / f"meshes/{place}.off"
         path.parent.mkdir(parents=True)
-        shutil.copy(
-            furniture
-            / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off",
-            path,
-        )
+        shutil.copy(furniture / f"{monitor if place == monitor else chair}.off", path)
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
-    list(
-        predict(
-            tmp_path / "views.zarr",
-            tmp_path / "p.npz",
-            cards(models)[0],
-            {},
-            "test",
-            workers=0,
-        )
-    )
+    stored = tmp_path / "views.zarr", tmp_path / "p.npz"
+    list(predict(*stored, cards(models)[0], {}, "test", workers=0))
     found = Predictions.load(tmp_path / "p.npz")
     assert dict(zip(found.names, found.conflicting, strict=True)) == {
         "chair_4": True,

@@ -126,15 +126,8 @@ def test_a_box_is_stored_as_it_is_seen(tmp_path):
     path = tmp_path / "meshes/box/box.off"
     path.parent.mkdir(parents=True)
     trimesh.creation.box(2 * half * 12.5).export(path)  # in any unit
-    list(
-        render(
-            tmp_path / "meshes",
-            tmp_path / "views.zarr",
-            ViewSphere.named("40"),
-            224,
-            workers=0,
-        )
-    )
+    sphere = ViewSphere.named("40")
+    list(render(tmp_path / "meshes", tmp_path / "views.zarr", sphere, 224, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
     half /= np.linalg.norm(half)
     image, depth, points = store.image(0), store.depth(0), store.points(0)
@@ -170,20 +163,11 @@ def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_other
         mesh.unlink()
     path = tmp_path / "views.zarr"
     place = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    command = [
-        sys.executable,
-        "-m",
-        "nextview_lab",
-        "render",
-        meshes,
-        path,
-        "--viewpoints",
-        "12",
-        "--size",
-        "16",
-    ]
+    line = (
+        f"-m nextview_lab render {meshes} {path} --viewpoints 12 --size 16 --workers 2"
+    )
     ran = subprocess.run(
-        [*command, "--workers", "2"],
+        [sys.executable, *line.split()],
         env=os.environ | {"PYTHONPATH": place},
         capture_output=True,
         text=True,

@@ -31,10 +31,8 @@ def specs():
 def evidence_of(predictions: Predictions, objects: np.ndarray):
     def observe(episodes, views):
         rows = objects[episodes]
-        logits, maps = (
-            predictions.logits[rows, views],
-            {"lem": predictions.maps["lem"][rows, views]},
-        )
+        logits = predictions.logits[rows, views]
+        maps = {"lem": predictions.maps["lem"][rows, views]}
         return Evidence(logits, maps, seen=logits.any(1))
 
     return observe
@@ -55,10 +53,8 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
     if empty:
         p = replace(p, logits=np.where(np.arange(40)[:, None] % 2, p.logits, 0))
         specs = replace(specs, predictions=p)
-    policy, stopping = (
-        make_policy(name, p.sphere, specs.valley_classes("lem")),
-        Stopping(threshold, 5, threshold_decay),
-    )
+    policy = make_policy(name, p.sphere, specs.valley_classes("lem"))
+    stopping = Stopping(threshold, 5, threshold_decay)
     observe, rng = evidence_of(p, specs.objects), np.random.default_rng(0)
     episodes = run_episodes(
         observe, p.sphere, policy, specs.starts, stopping, rng
@@ -164,10 +160,8 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
     for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
-        policy, paths = (
-            make_policy(name, p.sphere, specs.valley_classes("lem")),
-            replay(name, specs, 5, 0),
-        )
+        policy = make_policy(name, p.sphere, specs.valley_classes("lem"))
+        paths = replay(name, specs, 5, 0)
         stopping = Stopping.of(p.calibration, threshold, max_views=5)
         ends = truncate(paths, stopping)
         for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):

@@ -48,10 +48,8 @@ def found(views: Path) -> dict[str, str]:
 def test_damage_is_named_by_every_read_and_by_check(store, name, how):
     ViewStore.open(store).note(unit="cm")
     damage(chunk(store, name, 1), how)
-    wrong, views = (
-        "is missing" if how == "lost" else "cannot be read",
-        ViewStore.open(store),
-    )
+    wrong = "is missing" if how == "lost" else "cannot be read"
+    views = ViewStore.open(store)
     reads = {
         "image": lambda: views.image(1),
         "depth": lambda: views.depth(1),

@@ -9,7 +9,7 @@ from lab_programs import main
 
 from nextview.errors import ResultsError, UsageError
 from nextview_lab.benchmark import tables as stage
-from nextview_lab.benchmark.results import compared_markdown, latex
+from nextview_lab.benchmark.results import compared_markdown
 from nextview_lab.benchmark.tables import (
     TableRun,
     TableRuns,
@@ -35,7 +35,7 @@ def test_things_on_a_table_are_named_and_everything_is_written(looked):
     out, found = looked
     recall = found.measures.query("measure == 'recall'")
     assert recall["value"].item() > 0.4
-    for name in ("measures.csv", "tests.csv", "tables.md", "table.tex", "accuracy.png"):
+    for name in ("measures.csv", "tests.csv", "tables.md", "accuracy.png"):
         assert (out / name).stat().st_size > 50
     assert "### After 1 frame" in (out / "tables.md").read_text()
 
@@ -99,4 +99,3 @@ def test_shares_and_p_values_are_those_of_a_hand_count():
     sums = [abs(np.dot(signs, lead)) for signs in product((1, -1), repeat=6)]
     assert test.p == pytest.approx(np.mean(np.array(sums) >= abs(lead.sum())))
     assert "Too few to tell" in compared_markdown(found)
-    assert latex(found).count("target & ") == 2

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from lab_programs import main
 from pipeline import of_depth
 from scipy.spatial.transform import Rotation
 from skimage.draw import disk
@@ -19,8 +20,8 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview_lab.data.measures import find_measure, measure
 from nextview_lab.data.rendering import render
 from nextview_lab.data.store import ViewStore, check
+from nextview_lab.data.surfaces import mesh_views, view_of
 from nextview_lab.errors import MeasureError
-from nextview_lab.thesis.measure import main as measure_with_meshes
 from nextview_lab.thesis.measures import (
     MEASURES,
     base_avoidance,
@@ -30,7 +31,6 @@ from nextview_lab.thesis.measures import (
     view_area,
     visible_normals,
 )
-from nextview_lab.thesis.surfaces import view_of
 
 TWELVE = ViewSphere.named("12")
 DEPTH = [name for name, found in MEASURES.items() if found.needs == "depth"]
@@ -193,10 +193,8 @@ def test_nothing_depends_on_where_object_and_camera_are_together(name):
         else Rotation.from_euler("xyz", [40, 110, 200])
     )
     move = np.eye(4)
-    move[:3, :3], move[:3, 3] = (
-        turn.as_matrix(),
-        (0, 0, 0) if upright else (0.3, -0.2, 0.1),
-    )
+    move[:3, :3] = turn.as_matrix()
+    move[:3, 3] = (0, 0, 0) if upright else (0.3, -0.2, 0.1)
     moved = Mesh(
         mesh.vertices @ move[:3, :3].T + move[:3, 3],
         mesh.faces,
@@ -258,7 +256,8 @@ def rendered(tmp_path):
 def test_all_measures_of_a_store_and_its_meshes(rendered):
     with pytest.raises(MeasureError):
         next(measure(rendered, ["all"], workers=0))
-    measure_with_meshes(rendered, rendered.parent / "meshes", workers=0)
+    meshes = str(rendered.parent / "meshes")
+    main(["measure", str(rendered), "--meshes", meshes, "--workers", "0"])
     store = ViewStore.open(rendered)
     assert set(store.measures) == set(MEASURES)
     row = store.names.index("box")
@@ -275,11 +274,12 @@ def test_measures_take_the_meshes_that_were_rendered_and_no_others(rendered):
     meshes = rendered.parent / "meshes"
     file = meshes / "box/box.off"
     file.write_text(file.read_text() + "\n")
+    views = mesh_views(ViewStore.open(rendered), meshes)
     with pytest.raises(DatasetError):
-        measure_with_meshes(rendered, meshes, ("visible_area_ratio",), workers=0)
+        list(measure(rendered, ("visible_area_ratio",), workers=0, views=views))
     file.unlink()
     with pytest.raises(DatasetError):
-        measure_with_meshes(rendered, meshes, ("visible_area_ratio",), workers=0)
+        mesh_views(ViewStore.open(rendered), meshes)
 
 
 def test_they_are_fifteen_and_one_and_the_package_installs_them_by_name():

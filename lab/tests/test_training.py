@@ -50,10 +50,8 @@ SMALL_MAP = MapRecipe(
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together():
-    labels, measured = (
-        np.repeat([0, 1], [12, 8]),
-        np.random.default_rng(0).random((20, 5)),
-    )
+    labels = np.repeat([0, 1], [12, 8])
+    measured = np.random.default_rng(0).random((20, 5))
     measured[15] = measured[3]  # one mesh, two labels
     folds = hold_out(labels, measured, 3, seed=1)
     assert sorted(np.concatenate(folds)) == list(range(20))
@@ -208,10 +206,8 @@ def trained(shared, views):
 
 
 def test_trained_models_have_cards_and_run(trained, views):
-    card, run = (
-        read_card(trained / "models/tiny.json"),
-        read_run(trained / "runs/recogniser"),
-    )
+    card = read_card(trained / "models/tiny.json")
+    run = read_run(trained / "runs/recogniser")
     assert card.classes == ("chair", "monitor", "table")
     # training leaves the test split alone
     assert [part.split()[0] for part in card.scores] == ["validation"]

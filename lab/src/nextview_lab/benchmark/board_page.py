@@ -61,13 +61,11 @@ class Board:
 
     Attributes:
         title: of the table.
-        name: of the set of objects.
         columns: after the column of policy names.
         about: a line below the title.
     """
 
     title: str
-    name: str
     columns: tuple[Column, ...]
     about: str = ""
 
@@ -90,7 +88,7 @@ def written(
         columns: of the table, by heading.
         marked: policy, measure and views of the numbers marked with a star.
     """
-    values = values_of(tables.measures, board.name)
+    values = values_of(tables.measures)
     stars = set(marked)
 
     def shown(policy: str, measure: str, column: Column) -> str:

@@ -1,216 +1,39 @@
 """Things in the images of a BOP dataset: their poses in BOP's file of results."""
 
-import csv
-import hashlib
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from msgspec import Struct
 
-from nextview.captured.bop_scene import (
-    EVERY_SCENE_CAMERAS,
-    BopFiles,
-    bop_files,
-    camera_to_world,
-    read_bop_cameras,
-)
-from nextview.captured.frames import MILLIMETRES, CapturedFrame
+from nextview.captured.bop_scene import EVERY_SCENE_CAMERAS, BopFiles, bop_files
+from nextview.captured.frames import MILLIMETRES
 from nextview.checks import one_line
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.files import check_new, new_file, only_one, read_record, unfinished
-from nextview.recognition.model_card import find_models
-from nextview.sensing.frame import Frame
+from nextview.files import read_record
 from nextview.session.system import load
-from nextview.things.memory import open_memory
 from nextview_lab.benchmark.frame_answers import (
-    FoundObject,
-    FrameAnswer,
     FrameAnswers,
+    check_table,
     evenly,
+    looked_at,
+    write_table,
 )
-from nextview_lab.data.real_frames import bop_frame
+from nextview_lab.data.real_frames import RealFrame, bop_frames
 
-MODELS_FOLDER = "models"
 TARGETS_FILES = ("test_targets_bop19.json", "test_targets_bop24.json")
-_cameras = cache(read_bop_cameras)
+BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 MODEL_NAME = re.compile(r"obj_0*(\d+)")
+
+Image = tuple[int, int]  # numbers of its scene and of itself
 
 
 class _Target(Struct):
     scene_id: int
     im_id: int
-
-
-@dataclass(frozen=True, order=True)
-class BopImage:
-    """An image that is looked at.
-
-    Attributes:
-        scene: number of its scene.
-        image: its number there.
-    """
-
-    scene: int
-    image: int
-
-    @property
-    def name(self) -> str:
-        """As its files are: ``000001/000000``."""
-        return f"{self.scene:06d}/{self.image:06d}"
-
-
-@dataclass(frozen=True)
-class BopDataset:
-    """A dataset whose images are as yet unread.
-
-    Attributes:
-        folder: the whole of it.
-        models: mesh file of each model, by its number.
-        images: that are looked at, in order, each once.
-        scenes: files of the cameras of those that they are of, by their numbers.
-    """
-
-    folder: Path
-    models: dict[int, Path]
-    images: tuple[BopImage, ...]
-    scenes: dict[int, BopFiles]
-
-    def frame(self, image: BopImage, in_world: bool = False) -> CapturedFrame:
-        """A depth image, as yet unread.
-
-        Args:
-            image: one of ``images``.
-            in_world: whether its pose is that of the camera in the scene's world; else the camera
-                is the world.
-
-        Raises:
-            DatasetError: its camera is not known.
-        """
-        files = self.scenes[image.scene]
-        camera = _cameras(files).get(image.image)
-        if camera is None:
-            raise DatasetError(
-                f"{files.camera_file}: has no camera of the image {image.image}"
-            )
-        pose = None
-        if in_world:
-            where = f"image {image.image} of {files.camera_file}"
-            if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
-                raise DatasetError(
-                    f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); leave out"
-                    " --camera-poses"
-                )
-            pose = camera_to_world(camera.cam_R_w2c, camera.cam_t_w2c, where)
-        return replace(bop_frame(files, camera, image.image, pose), name=image.name)
-
-
-def read_bop_dataset(
-    folder: Path,
-    split: str = "test",
-    targets: Path | None = None,
-    camera: str | None = None,
-) -> BopDataset:
-    """Read what a dataset has, without its images.
-
-    Args:
-        folder: the whole dataset.
-        split: folder of the scenes in it.
-        targets: file that lists the images; by default one of ``TARGETS_FILES``.
-        camera: the one whose files are read, where each has its own; by default the only one with
-            depth images.
-
-    Raises:
-        DatasetError: a file is missing or damaged, or lists nothing.
-        UsageError: the split is no name of a folder.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise DatasetError(f"{folder}: there is no such folder")
-    models = _models(folder)
-    images = _images(folder, targets)
-    scenes = _scenes(folder, split, {image.scene for image in images}, camera)
-    return BopDataset(folder, models, images, scenes)
-
-
-def model_number(name: str) -> int | None:
-    """The number of a model by its name, as 12 of ``obj_000012``; None if it is no such name.
-
-    Args:
-        name: of a thing, or of a mesh file without its suffix.
-    """
-    found = MODEL_NAME.fullmatch(name)
-    return None if found is None else int(found[1])
-
-
-def _models(folder: Path) -> dict[int, Path]:
-    """The mesh files of a dataset by their numbers."""
-    found = {
-        number: path
-        for path in sorted((folder / MODELS_FOLDER).glob("*.ply"))
-        if (number := model_number(path.stem)) is not None
-    }
-    if not found:
-        raise DatasetError(
-            f"{folder}: has no models (models/obj_000001.ply); is it the folder of a whole BOP"
-            " dataset, with its models unpacked?"
-        )
-    return found
-
-
-def _images(folder: Path, targets: Path | None) -> tuple[BopImage, ...]:
-    """The images that are looked at, each once."""
-    files = [folder / name for name in TARGETS_FILES] if targets is None else [targets]
-    path = next((file for file in files if file.exists()), files[0])
-    listed = read_record(
-        path, list[_Target], "the targets of a BOP dataset", DatasetError
-    )
-    if not listed:
-        raise DatasetError(f"{path}: lists no image")
-    return tuple(dict.fromkeys(BopImage(one.scene_id, one.im_id) for one in listed))
-
-
-def _scenes(
-    folder: Path,
-    split: str,
-    numbers: set[int],
-    camera: str | None,
-) -> dict[int, BopFiles]:
-    """The scenes of some numbers in a split."""
-    if Path(split).name != split:
-        raise UsageError(f"--split is the name of a folder of {folder}, not {split!r}")
-    if not (folder / split).is_dir():
-        there = sorted(
-            path.parents[1].name for path in folder.glob(f"*/*/{EVERY_SCENE_CAMERAS}")
-        )
-        named = ", ".join(dict.fromkeys(there))
-        hint = f"--split names one of {named}" if there else "are its images unpacked?"
-        raise DatasetError(f"{folder / split}: there is no such folder; {hint}")
-    scenes = {}
-    for number in sorted(numbers):
-        scene = folder / split / f"{number:06d}"
-        if not scene.is_dir():
-            raise DatasetError(
-                f"{scene}: the targets name this scene, and there is no such folder"
-            )
-        files = bop_files(scene, camera)
-        if len(files) > 1:
-            named = ", ".join(one.camera for one in files)
-            raise DatasetError(
-                f"{scene}: has depth images of several cameras: --camera names one of {named}"
-            )
-        scenes[number] = files[0]
-    return scenes
-
-
-BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
-UPWARDS = (0.0, 0.0, 1.0)  # in the world of camera poses
-MOST_NAMED = 5  # of many in a sentence
 
 
 @dataclass(frozen=True)
@@ -229,8 +52,6 @@ class BopOptions:
             photoneo of scene_camera_photoneo.json; by default the only one with depth images.
         frames: number of images to look at, evenly spread over those of the targets, for a first
             try; by default all.
-        camera_poses: use the poses of the cameras in scene_camera.json, in whose world z points
-            up; by default the normal of the support plane does.
     """
 
     models: str = "ycb"
@@ -239,7 +60,6 @@ class BopOptions:
     targets: Path | None = None
     camera: str | None = None
     frames: int | None = None
-    camera_poses: bool = False
 
 
 @dataclass(frozen=True)
@@ -247,7 +67,6 @@ class BopRun:
     """What was found in a dataset.
 
     Attributes:
-        out: the file of results.
         images: how many were looked at.
         left_out: why images could not be, by their names.
         poses: how many lines were written.
@@ -256,7 +75,6 @@ class BopRun:
         not_known: models that the memory does not know, by their numbers.
     """
 
-    out: Path
     images: int
     left_out: dict[str, NextviewError]
     poses: int
@@ -295,150 +113,135 @@ def look_for_models(
         ResultsError: ``out`` exists, or cannot be written.
         UsageError: an option makes no sense, or the memory knows none of the models.
     """
-    out = Path(out)
-    check_new(out, overwrite)
-    if out.suffix.lower() != ".csv":
-        raise UsageError(f"{out}: the name ends in .csv")
-    read = read_bop_dataset(dataset, how.split, how.targets, how.camera)
-    images = evenly(read.images, how.frames)
-    given = _numbers_given(how.ids, read)
-    numbers = _numbers_of_things(how.models, given, read)
+    check_table(out, overwrite)
+    models = _models(dataset)
+    images = _images(dataset, how)
     system = load(how.models)
+    numbers = _numbers(how, dataset, models, system.classes)
 
-    up = np.array(UPWARDS) if how.camera_poses else None
-    with only_one(out), unfinished(out, _key(read, how)) as parts:
-        answers = FrameAnswers(parts, system, up)
-        reads = {image.name: partial(_frame, read, image, how) for image in images}
-        track(answers.look_at(reads), len(images), "images")
-        found = {
-            image: answer
-            for image in images
-            if (answer := answers[image.name]) is not None
-        }
+    frames = images.values()
+    with looked_at(out, how.models, system, frames, how.camera, track) as answers:
+        lines, others = _lines(images, answers, numbers)
+        found = [one for one in map(answers.of, frames) if one is not None]
         if not found:
             raise DatasetError(f"{dataset}: no image can be looked at{answers.why()}")
-        lines = {
-            image: [one for one in answer.objects if one.named and one.name in numbers]
-            for image, answer in found.items()
-        }
-        with new_file(out, overwrite) as new:
-            _write(new, found, lines, numbers)
-
-    others = [
-        one.name
-        for answer in found.values()
-        for one in answer.objects
-        if one.named and one.name not in numbers
-    ]
+        write_table(out, overwrite, BOP_COLUMNS, lines)
     return BopRun(
-        out,
         len(found),
         answers.left_out,
-        sum(map(len, lines.values())),
-        float(np.mean([one.seconds for one in found.values()])),
+        len(lines),
+        float(np.mean([one.seconds for one in found])),
         {name: others.count(name) for name in sorted(set(others))},
-        tuple(sorted(set(read.models) - set(numbers.values()))),
+        tuple(sorted(models - set(numbers.values()))),
     )
 
 
-def _frame(dataset: BopDataset, image: BopImage, how: BopOptions) -> Frame:
-    """Read an image."""
-    return dataset.frame(image, how.camera_poses).read(masked=False)
+def _models(dataset: Path) -> set[int]:
+    """The numbers of the models of a dataset."""
+    files = dataset.glob("models/*.ply")
+    names = (MODEL_NAME.fullmatch(file.stem) for file in files)
+    models = {int(name[1]) for name in names if name is not None}
+    if not models:
+        raise DatasetError(
+            f"{dataset}: has no models (models/obj_000001.ply); is it the folder of a whole BOP"
+            " dataset, with its models unpacked?"
+        )
+    return models
 
 
-def _numbers_given(ids: Sequence[str], dataset: BopDataset) -> dict[str, int]:
-    """The numbers of models that a person gave, by the names of things."""
-    numbers = {}
-    for text in ids:
-        name, equals, digits = text.rpartition("=")
-        if not (name and equals and digits.isdecimal()):
-            raise UsageError(
-                f"--ids takes NAME=NUMBER, such as mug=14, not {one_line(repr(text))}"
-            )
+def _images(dataset: Path, how: BopOptions) -> dict[Image, RealFrame]:
+    """The images that are looked at, as yet unread."""
+    files = [dataset / name for name in TARGETS_FILES]
+    path = how.targets or next((file for file in files if file.exists()), files[0])
+    what = "the targets of a BOP dataset"
+    listed = read_record(path, list[_Target], what, DatasetError)
+    asked = dict.fromkeys((one.scene_id, one.im_id) for one in listed)
+    if not asked:
+        raise DatasetError(f"{path}: lists no image")
 
-        number = int(digits)
-        if number not in dataset.models:
-            there = ", ".join(map(str, sorted(dataset.models)))
-            raise UsageError(
-                f"--ids {one_line(text)}: {dataset.folder} has no model {number}; it has {there}"
-            )
-        numbers[name] = number
-    return numbers
+    some = evenly(list(asked), how.frames)
+    there: dict[Image, RealFrame] = {}
+    for number in dict.fromkeys(scene for scene, _ in some):
+        frames = bop_frames(_camera_of(dataset, number, how))
+        there |= {(number, int(frame.name)): frame for frame in frames}
+    for scene, image in some:
+        if (scene, image) not in there:
+            raise DatasetError(f"{path}: scene {scene} has no camera of image {image}")
+    return {image: there[image] for image in some}
 
 
-def _numbers_of_things(
-    memory: str,
-    given: dict[str, int],
-    dataset: BopDataset,
+def _camera_of(dataset: Path, number: int, how: BopOptions) -> BopFiles:
+    """The files of a scene, or of one of its cameras."""
+    scene = dataset / how.split / f"{number:06d}"
+    if not scene.is_dir():
+        every = dataset.glob(f"*/*/{EVERY_SCENE_CAMERAS}")
+        there = sorted({path.parents[1].name for path in every})
+        hint = (
+            f"--split names one of {', '.join(there)}" if there else "unpack its images"
+        )
+        raise DatasetError(f"{scene}: there is no such folder; {hint}")
+    files = bop_files(scene, how.camera)
+    if len(files) > 1:
+        named = ", ".join(one.camera for one in files)
+        raise DatasetError(
+            f"{scene}: has depth images of several cameras: --camera names one of {named}"
+        )
+    return files[0]
+
+
+def _numbers(
+    how: BopOptions,
+    dataset: Path,
+    models: set[int],
+    things: Sequence[str],
 ) -> dict[str, int]:
     """The number of each thing that is a model of the dataset, by its name."""
-    card, _ = open_memory(find_models(memory).recogniser)
-    assert card.memory is not None
-    things = [thing.name for thing in card.memory.things]
-    for name in given:
+    named = {name: MODEL_NAME.fullmatch(name) for name in things}
+    numbers = {name: int(found[1]) for name, found in named.items() if found}
+    numbers = {name: number for name, number in numbers.items() if number in models}
+    for text in how.ids:
+        name, _, number = text.rpartition("=")
         if name not in things:
-            raise UsageError(f"--ids: {memory} knows nothing called {one_line(name)}")
-
-    named = {
-        name: number for name in things if (number := model_number(name)) is not None
-    }
-    numbers = {
-        name: number
-        for name, number in (named | given).items()
-        if number in dataset.models
-    }
-
+            raise UsageError(
+                f"--ids: {how.models} knows nothing called {one_line(name)}"
+            )
+        if not number.isdecimal() or int(number) not in models:
+            there = ", ".join(map(str, sorted(models)))
+            raise UsageError(
+                f"--ids {one_line(text)}: {dataset} has no model {one_line(number)}; it has {there}"
+            )
+        numbers[name] = int(number)
     if not numbers:
         raise UsageError(
-            f"{memory}: none of its things ({_few(things)}) is called as a model of"
-            f" {dataset.folder} ({next(iter(dataset.models.values())).stem}); say which"
-            " things they are with --ids NAME=NUMBER"
+            f"{how.models}: none of its things is called as a model of {dataset}, such as"
+            " obj_000001; say which things they are with --ids NAME=NUMBER"
         )
     return numbers
 
 
-def _few(names: Sequence[str]) -> str:
-    more = ", ..." if len(names) > MOST_NAMED else ""
-    return ", ".join(one_line(name) for name in names[:MOST_NAMED]) + more
+def _lines(
+    images: dict[Image, RealFrame],
+    answers: FrameAnswers,
+    numbers: dict[str, int],
+) -> tuple[list[list[object]], list[str]]:
+    """The lines of the file of results, and the names that are of no model.
 
-
-def _key(dataset: BopDataset, how: BopOptions) -> str:
-    """What the part of each image depends on."""
-    card, _ = open_memory(find_models(how.models).recogniser)
-    depends = [
-        str(dataset.folder.resolve()),
-        how.split,
-        how.camera,
-        card.sha256,
-        sorted(how.ids),
-        how.camera_poses,
-    ]
-    return hashlib.sha256(msgspec.json.encode(depends)).hexdigest()
-
-
-def _write(
-    path: Path,
-    found: Mapping[BopImage, FrameAnswer],
-    lines: Mapping[BopImage, Sequence[FoundObject]],
-    numbers: Mapping[str, int],
-) -> None:
-    """Write the file of results: all lines of an image have one time, as bop_toolkit checks."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(BOP_COLUMNS)
-
-        for image, answer in found.items():
-            for one in lines[image]:
-                rotation = one.matrix[:3, :3].ravel()
+    All lines of an image have one time, as bop_toolkit checks.
+    """
+    lines: list[list[object]] = []
+    others = []
+    for (scene, image), frame in images.items():
+        answer = answers.of(frame)
+        for one in () if answer is None else answer.objects:
+            if one.named and one.name not in numbers:
+                others.append(one.name)
+            elif one.named and answer is not None:
+                turn = one.matrix[:3, :3].ravel()
                 shift = one.matrix[:3, 3] / MILLIMETRES
-                writer.writerow(
-                    [
-                        image.scene,
-                        image.image,
-                        numbers[one.name],
-                        f"{one.belief:.6f}",
-                        " ".join(f"{value:.9f}" for value in rotation),
-                        " ".join(f"{value:.6f}" for value in shift),
-                        f"{answer.seconds:.6f}",
-                    ]
+                pose = (
+                    " ".join(f"{value:.9f}" for value in turn),
+                    " ".join(f"{value:.6f}" for value in shift),
                 )
+                known = [scene, image, numbers[one.name], f"{one.belief:.6f}"]
+                lines.append([*known, *pose, f"{answer.seconds:.6f}"])
+    return lines, others

@@ -50,9 +50,6 @@ ENDS = {
     "confident_accuracy": ("confident_right", "confident"),
 }
 AFTER = {"accuracy": ("right", ONE), "travel": ("travel", ONE)}
-# thresholds of the curves: from stopping at the first view to taking almost all views
-SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
-ONE_STEP = "oracle-gain"  # the policy whose lead over the reference defines the gap
 
 
 @dataclass(frozen=True)
@@ -67,20 +64,16 @@ class ClassTables(Tables):
     reached the threshold, and ``confident_accuracy``, the accuracy of these; and
     ``calibration_error``. The prefix ``class_`` marks means over classes.
 
-    Measures after a number of views are ``accuracy``; ``travel``, grid cells; and ``share_of_gap``,
-    the lead of a policy over the reference as a share of the lead of ``oracle-gain``. Published
-    values have a column of their own, "published".
+    Measures after a number of views are ``accuracy`` and ``travel``, grid cells. Published values
+    have a column of their own, "published".
 
     Holm's correction is applied to all tests of a measure at the thresholds, and to all tests
     after fixed numbers of views, without policies that know the truth.
-
-    Attributes:
-        sweep: the points of the curves of accuracy against views and travel.
-        reliability: confidence and accuracy by bin.
     """
 
-    sweep: pd.DataFrame
-    reliability: pd.DataFrame
+    def choosing(self) -> list[str]:
+        """Return the policies that stop at thresholds; fixed views have none."""
+        return list(self.measures.dropna(subset="threshold")["policy"].unique())
 
 
 @dataclass(frozen=True)
@@ -153,8 +146,6 @@ def summarise(
         pd.concat([table for table in measures if len(table)], ignore_index=True),
         pd.concat(tests, ignore_index=True),
         reference,
-        _sweep(grid),
-        _reliability(grid, cells),
     )
 
 
@@ -198,7 +189,7 @@ def _measures(
     found = [
         counted.measures(ALL, weights),
         means.assign(measure="class_" + means["measure"]),
-        _spread(grid, cells),
+        _calibration(grid, cells),
     ]
 
     by_class = counted.only(OF_CLASSES)
@@ -223,53 +214,14 @@ def _measures(
     return table.assign(published=np.array(beside, np.float64))
 
 
-def _spread(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
-    """Return the calibration error, and the spread of the accuracies of the classes."""
-    labels = grid.specs.predictions.labels
-    rows = []
-    for policy, threshold, ends in cells:
-        right = grid.right(ends.answer)
-        between = [right[:, labels == label].mean() for label in np.unique(labels)]
-
-        values = {
-            "calibration_error": metrics.calibration_error(
-                ends.confidence,
-                right.ravel(),
-            ),
-            "class_accuracy_std": np.std(between),
-        }
-        rows += [
-            (policy, threshold, 0, measure, value, np.nan, np.nan)
-            for measure, value in values.items()
-        ]
-    return measures_of(ALL, rows)
-
-
-def _sweep(grid: Grid) -> pd.DataFrame:
-    """Return the points of the curves."""
-    points = []
-    for name, paths in grid.paths.items():
-        for threshold in () if paths.fixed else SWEEP:
-            ends = grid.ends(name, threshold)
-            right = ends.answer == grid.specs.labels
-            means = map(np.mean, (right, ends.n_views, ends.travel, ends.arc))
-            points.append((name, threshold, *means))
-    columns = ["policy", "threshold", "accuracy", "n_views", "travel_all", "arc_all"]
-    return pd.DataFrame(points, columns=columns).astype({"threshold": "float64"})
-
-
-def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
-    """Return confidence and accuracy in bins of the confidence."""
+def _calibration(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
+    """Return the calibration error."""
     rows = []
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer).ravel()
-        sure, accuracy, count = metrics.reliability(ends.confidence, right)
-        rows += [
-            (policy, threshold, i, sure[i], accuracy[i], count[i])
-            for i in np.flatnonzero(count)
-        ]
-    columns = ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"]
-    return pd.DataFrame(rows, columns=columns).astype({"threshold": "float64"})
+        error = metrics.calibration_error(ends.confidence, right)
+        rows.append((policy, threshold, 0, "calibration_error", error, np.nan, np.nan))
+    return measures_of(ALL, rows)
 
 
 def after_views(
@@ -300,24 +252,10 @@ def after_views(
     ]
     families = np.arange(len(grid.specs.predictions))
     counted = Counted.of(_after(grid, names, n_views), AFTER, {}, families)
-    measures = [counted.measures(ALL, weights), _gap(counted, reference)]
     tests = counted.tests(
         ALL, weights, reference, lambda key: key.measure == "accuracy"
     )
-    return pd.concat(measures, ignore_index=True), corrected([tests], knows_truth)
-
-
-def _gap(counted: Counted, reference: str) -> pd.DataFrame:
-    """Return the share of the lead of one-step lookahead over the reference."""
-    right = counted.only(["accuracy"])
-    mean = dict(zip(right.keys, right.top.mean(0).tolist(), strict=True))
-    rows = []
-    for key, own in mean.items():
-        floor = mean.get(key._replace(policy=reference), np.nan)
-        lead = mean.get(key._replace(policy=ONE_STEP), floor) - floor
-        share = (own - floor) / lead if lead > 0 else np.nan
-        rows.append((*key._replace(measure="share_of_gap"), share, np.nan, np.nan))
-    return measures_of(ALL, rows)
+    return counted.measures(ALL, weights), corrected([tests], knows_truth)
 
 
 def _after(grid: Grid, policies: Sequence[str], counts: Sequence[int]) -> pd.DataFrame:
@@ -392,7 +330,7 @@ def promised_risks(tables: ClassTables, risks: Mapping[str, float]) -> list[Any]
     """
     rows = []
     for risk, threshold in risks.items():
-        values = values_of(tables.measures, ALL, threshold)
+        values = values_of(tables.measures, threshold)
         for policy in dict.fromkeys(policy for policy, _, _ in values):
             # the upper limit of the accuracy is the lower limit of the error
             right, high, low = values[policy, "confident_accuracy", 0]
@@ -441,10 +379,8 @@ def too_few_objects(tables: Tables, threshold: float, objects: int) -> str | Non
     Returns:
         The warning; None if there are enough.
     """
-    hopeless = too_few(accuracy_tests(tables))
-    if hopeless:
-        return hopeless[ALL]
-
+    if hopeless := too_few(accuracy_tests(tables)):
+        return hopeless
     tests = _robot_tests(tables, threshold)
     # NaN without comparisons
     half = float((tests["high"] - tests["low"]).median() / 2)
@@ -478,9 +414,8 @@ def after_views_table(tables: Tables) -> WrittenTable | None:
     after = tables.measures.query("set == @ALL and views > 0")
     counts = [int(k) for k in after["views"].unique()]
     columns = [Column(f"{k} view{'s' * (k > 1)}", ("accuracy",), k) for k in counts]
-    for what, measure in (("travel", "travel"), ("of the gap", "share_of_gap")):
-        columns += [Column(f"{what} at {k}", (measure,), k, 2) for k in counts]
-    board = Board(f"points over {tables.reference}: tests.csv", ALL, tuple(columns))
-    stars = significant(tables, ALL)
+    columns += [Column(f"travel at {k}", ("travel",), k, 2) for k in counts]
+    board = Board(f"points over {tables.reference}: tests.csv", tuple(columns))
+    stars = significant(tables)
     named = {column.heading: column for column in columns}
     return written(tables, board, named, stars) if counts else None

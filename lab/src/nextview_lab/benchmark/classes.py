@@ -205,8 +205,7 @@ def load(folder: Path) -> ClassResults:
     try:
         settings = json.loads((folder / RECORD).read_text())
         frames = {
-            name: pd.read_csv(folder / f"{name}.csv")
-            for name in ("measures", "tests", "sweep", "reliability")
+            name: pd.read_csv(folder / f"{name}.csv") for name in ("measures", "tests")
         }
         tables = ClassTables(reference=settings["reference"], **frames)
         pq.read_schema(folder / "episodes.parquet")

@@ -233,48 +233,41 @@ def corrected(
     return table.assign(p_holm=st.holm(table["p"].to_numpy(np.float64)))
 
 
-def too_few(tests: "pd.DataFrame") -> dict[str, str]:
-    """Return warnings for sets in which no difference could be significant.
+def too_few(tests: "pd.DataFrame") -> str:
+    """Return a warning if no difference could be significant; "" if one could.
 
     Args:
-        tests: that are corrected together.
-
-    Returns:
-        A sentence for each set with too few families of objects, by name.
+        tests: that are corrected together, of one set of objects.
     """
     tested = tests[tests["p"].notna()]
-    found = {}
-    for name, rows in tested.groupby("set", sort=False):
-        families = int(rows["families"].iloc[0])
-        # two-sided sign flips of n families have p-values of 2^(1 - n) and more
-        wanted = families
-        while (
-            wanted < st.EXACT_FAMILIES
-            and len(tested) * 2.0 ** (1 - wanted) >= SIGNIFICANT
-        ):
-            wanted += 1
-        if wanted > families:
-            found[str(name)] = (
-                f"Too few to tell: no p-value of {families} is below"
-                f" {2.0 ** (1 - families):.2g}, and {len(tested)} tests are corrected together, so"
-                f" that no difference can be significant; it takes {wanted} or more."
-            )
-    return found
+    if tested.empty:
+        return ""
+    families = int(tested["families"].iloc[0])
+    # two-sided sign flips of n families have p-values of 2^(1 - n) and more
+    wanted = families
+    while (
+        wanted < st.EXACT_FAMILIES and len(tested) * 2.0 ** (1 - wanted) >= SIGNIFICANT
+    ):
+        wanted += 1
+    if wanted == families:
+        return ""
+    return (
+        f"Too few to tell: no p-value of {families} is below {2.0 ** (1 - families):.2g}, and"
+        f" {len(tested)} tests are corrected together, so that no difference can be significant; it"
+        f" takes {wanted} or more."
+    )
 
 
 def values_of(
-    measures: "pd.DataFrame",
-    name: str,
-    threshold: float | None = None,
+    measures: "pd.DataFrame", threshold: float | None = None
 ) -> dict[tuple[str, str, int], Any]:
-    """Return value, low and high by policy, measure and number of views.
+    """Return value, low and high over all objects, by policy, measure and number of views.
 
     Args:
         measures: of the benchmark, see ``Tables``.
-        name: of the set of objects.
         threshold: of the belief; None for measures without a threshold.
     """
-    some = measures[measures["set"] == name]
+    some = measures[measures["set"] == ALL]
     at = some["threshold"]
     some = some[at.isna() if threshold is None else at == threshold]
     keys = zip(some["policy"], some["measure"], some["views"], strict=True)
@@ -282,13 +275,11 @@ def values_of(
     return dict(zip(keys, map(tuple, numbers), strict=True))
 
 
-def significant(tables: Tables, name: str) -> set[tuple[str, str, int]]:
-    """Return policy, measure and number of views of the significant differences in a set.
+def significant(tables: Tables) -> set[tuple[str, str, int]]:
+    """Return policy, measure and number of views of the significant differences.
 
     Args:
         tables: of the benchmark.
-        name: of the set of objects.
     """
-    tests = tables.tests
-    some = tests[(tests["set"] == name) & (tests["p_holm"] < SIGNIFICANT)]
+    some = tables.tests[tables.tests["p_holm"] < SIGNIFICANT]
     return set(zip(some["policy"], some["measure"], some["views"], strict=True))

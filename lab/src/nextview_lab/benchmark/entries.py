@@ -17,7 +17,7 @@ from nextview.policies.base import (
     best_view,
 )
 from nextview.policies.baselines import orbit, ranked
-from nextview.policies.maps import MapPeak, peaks_first, sphere_peaks
+from nextview.policies.maps import MapPeak, peaks_first
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import (
     VISIBLE,
@@ -91,10 +91,9 @@ FIXED_ENTRIES = (
 "best" and "worst" refer to the confidence in the true class; "orbit" moves around the ring of the
 first view, then around the next ring.
 """
-TRUE_MEASURE = re.compile(r"true-([\w.:]+)-all(-peak)?")
+TRUE_MEASURE = re.compile(r"true-([\w.:]+)-all")
 """Oracles that use the true value of any measure in the view store, over all views: "true-NAME-all"
-chooses the highest unvisited view, "true-NAME-all-peak" prefers the peaks of its map. "true-NAME-K"
-are fixed views: the K highest."""
+chooses the highest unvisited view. "true-NAME-K" are fixed views: the K highest."""
 
 
 def is_oracle(policy: str) -> bool:
@@ -181,7 +180,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         )
     if measured := TRUE_MEASURE.fullmatch(name):
         values = true_measure(p, measured[1])[specs.objects].astype(np.float64)
-        return OracleMeasure(p.sphere, values, measured[2] == "-peak")
+        return OracleMeasure(p.sphere, values)
 
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
@@ -341,22 +340,19 @@ class OracleValley:
 
 @dataclass(frozen=True)
 class OracleMeasure:
-    """The unvisited view with the highest true value, or true peak, of a measure.
+    """The unvisited view with the highest true value of a measure.
 
     With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a random
-    first view; with the fused descriptor that of Ding et al.; with peaks of the depth entropy that
-    of Parisotto et al.
+    first view; with the fused descriptor that of Ding et al.
 
     Attributes:
         sphere: of the views.
         values: of each view in each episode, (E, V).
-        peaks: whether only peaks of the values are considered.
         needs: required inputs, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
     values: Floats
-    peaks: bool = False
     needs: tuple[str, ...] = ()
 
     def view_values(self, state: EpisodeState) -> Float:
@@ -364,7 +360,7 @@ class OracleMeasure:
         return np.asarray(self.values[state.episodes], np.float64)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Choose the highest value, or the highest peak, of the true measure.
+        """Choose the highest value of the true measure.
 
         Args:
             state: the state of B episodes with V candidate views.
@@ -373,12 +369,7 @@ class OracleMeasure:
         Returns:
             The next view of each episode, (B,) int64.
         """
-        values = self.view_values(state)
-        if self.peaks:
-            values = sphere_peaks(
-                values.reshape(-1, self.sphere.rings, self.sphere.azimuths)
-            ).reshape(values.shape)
-        return best_view(self.sphere, state, values)
+        return best_view(self.sphere, state, self.view_values(state))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from nextview.checks import number, one_line, one_of, whole
+from nextview.checks import number, one_of, whole
 from nextview.errors import DatasetError, SessionError, UsageError
 from nextview.geometry.mesh import UNITS
 from nextview.geometry.viewsphere import ViewSphere
@@ -130,29 +130,6 @@ class AfterAction(Stopping):
         return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
 
 
-def whole_number(value: Any, below: int, what: str) -> int:
-    """Check a number chosen by an agent or a user.
-
-    Args:
-        value: the number.
-        below: upper limit, exclusive; the lower limit is 0.
-        what: name of the number in the error message.
-
-    Raises:
-        UsageError: it is no such number.
-    """
-    array = np.asarray(value)
-    if (
-        array.size != 1
-        or array.dtype.kind not in "iu"
-        or not 0 <= int(array.item()) < below
-    ):
-        raise UsageError(
-            f"{what}: a whole number from 0 to {below - 1}, not {one_line(repr(value))}"
-        )
-    return int(array.item())
-
-
 @dataclass
 class Asked:
     """The policy of an agent: takes the view that it asks for, or the free one nearest to it.
@@ -236,7 +213,9 @@ class ViewsEnv(gymnasium.Env[Any, Any]):
         """Take a view; see Gymnasium."""
         if self.reached is None:
             raise SessionError("no episode is under way; call reset")
-        chosen = whole_number(action, len(self.sphere), "action")
+        if isinstance(action, np.ndarray) and action.size == 1:
+            action = action.item()
+        chosen = whole(action, "an action", 0, len(self.sphere) - 1)
         away = self.sphere.travel[self.reached[chosen]].copy()
         away[self.views] = np.inf
         view = int(away.argmin())
@@ -262,7 +241,7 @@ class ViewsEnv(gymnasium.Env[Any, Any]):
         """
         found = {name: self.np_random.integers(most) for name, most in below.items()}
         given = found | options
-        return [whole_number(given[name], most, name) for name, most in below.items()]
+        return [whole(given[name], name, 0, most - 1) for name, most in below.items()]
 
 
 class RecogniseEnv(ViewsEnv):
@@ -513,7 +492,7 @@ class RecogniseThingsEnv(ViewsEnv):
         Args:
             view: that is free.
         """
-        belief = self._episode.verified(self.views)[0].belief
+        belief = self._episode.verified(self.views).belief
         logs = np.log(np.maximum(belief, LEAST_PAID_BELIEF))[None]
         truth = np.array([self._episode.thing])
         value = float(value_of(logs, truth, self.rules.objective)[0])

@@ -25,9 +25,6 @@ from nextview_lab.extras import extras
 with extras():
     import pandas as pd
 
-# numbers of views after which confidence is compared with accuracy, in addition to all views
-RELIABILITY_LOOKS = (1, 2, 5)
-
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -43,7 +40,6 @@ class Evaluation:
         fusion: accuracy, mean confidence and calibration error after fusing a number of random
             views.
         confusion: answers by n_views, label and answer; an answer is given per view, or per object.
-        reliability: confidence and accuracy by n_views and bin.
         maps: scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean
             of the true maps of these objects: over all, or for the true class at the view.
         left_out: reason for each map that is not evaluated, or not on all objects.
@@ -52,7 +48,6 @@ class Evaluation:
     accuracy: pd.DataFrame
     fusion: pd.DataFrame
     confusion: pd.DataFrame
-    reliability: pd.DataFrame
     maps: pd.DataFrame
     left_out: dict[str, str]
 
@@ -104,7 +99,6 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
         accuracy,
         fusion,
         _confusion(p, judged),
-        _reliability(right, confidence),
         maps,
         left_out,
     )
@@ -296,24 +290,6 @@ def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
             for (i, j), count in np.ndenumerate(counts)
         ]
     return pd.DataFrame(rows, columns=["n_views", "label", "answer", "answers"])
-
-
-def _reliability(right: Mask, confidence: Float32) -> pd.DataFrame:
-    rows = []
-    v = len(right)
-    for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
-        # all views together do not depend on the order
-        turns = slice(None) if n_views < v else slice(1)
-        belief = confidence[n_views - 1, :, turns].ravel().astype(np.float64)
-        answers = right[n_views - 1, :, turns]
-        sure, share, count = metrics.reliability(belief, answers.ravel())
-        rows += [
-            (n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)
-        ]
-    return pd.DataFrame(
-        rows,
-        columns=["n_views", "bin", "confidence", "accuracy", "answers"],
-    )
 
 
 def judged_objects(p: Predictions, name: str) -> Index:

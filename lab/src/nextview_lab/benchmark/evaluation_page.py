@@ -140,21 +140,15 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
             for k in (1, 2, 5, 10, v)
             if k in curve.index
         ),
-        bins=", ".join(
-            f"{curve.calibration_error[k]:.3f} after {k}"
-            for k in e.reliability["n_views"].unique()
-        ),
         maps={
             kind: numbers(rows, "by", "label", "measure")
             for kind, rows in e.maps.groupby("map", sort=False)
         },
         baselines=[by for by in e.maps["by"].unique() if by != "network"],
         figures={
-            "fusion": picture(draw.fusion_curve(e)),
-            "reliability": picture(draw.evaluated_reliability(e)),
-            "confusion_one_view": picture(draw.evaluated_confusion(e, 1, p.classes)),
+            "confusion_one_view": picture(draw.confusion_matrix(e, 1, p.classes)),
             "confusion_all_views": picture(
-                draw.evaluated_confusion(e, len(p.sphere), p.classes)
+                draw.confusion_matrix(e, len(p.sphere), p.classes)
             ),
         },
         left_out=e.left_out,

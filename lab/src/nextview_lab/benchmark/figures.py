@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from nextview.figures.style import (
     ACCENT,
@@ -18,12 +17,7 @@ from nextview.figures.style import (
     percent_axis,
 )
 from nextview.recognition.map_names import LCM, LEM
-from nextview_lab.benchmark.class_tables import (
-    ONE_STEP,
-    ClassResults,
-    headline_threshold,
-)
-from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
+from nextview_lab.benchmark.comparison import SIGNIFICANT, Tables, values_of
 from nextview_lab.benchmark.entries import is_oracle
 from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import words
@@ -67,40 +61,9 @@ OWN = (
     "#ff7043",
     "#5c6bc0",
 )
-FORESEES = (
-    "ceiling",
-    ONE_STEP,
-    f"{ONE_STEP}-all",
-)  # policies that depend on the true outcome of a view: drawn dotted
+# policies that depend on the true outcome of a view: drawn dotted
+FORESEES = ("ceiling", "oracle-gain", "oracle-gain-all")
 LOWEST_AXIS = 0.9  # largest lower limit of an axis of shares
-MOST_CURVES = 8  # largest number of curves of realisable policies
-
-
-def ceiling(results: ClassResults) -> list[str]:
-    """Return the one-step oracle, in the window or over all views.
-
-    Empty if neither was run.
-    """
-    ran = set(results.tables.sweep["policy"])
-    return [name for name in FORESEES if name in ran][:1]
-
-
-def compared(results: ClassResults) -> list[str]:
-    """Return the policies shown as curves.
-
-    They are the reference, the most accurate others, the published oracle and the upper bound.
-    """
-    names = list(results.tables.sweep["policy"].unique())
-    reference = results.settings["reference"]
-    headline = headline_threshold(results.settings["thresholds"])
-    values = values_of(results.tables.measures, ALL, headline)
-    robots = sorted(
-        (n for n in names if not is_oracle(n)),
-        key=lambda n: (n != reference, -values[n, "accuracy", 0][0]),
-    )[:MOST_CURVES]
-    return [n for n in names if n in robots] + [
-        n for n in ("oracle-valley", *ceiling(results)) if n in names
-    ]
 
 
 def look_of(policy: str, tables: Tables) -> dict[str, Any]:
@@ -128,80 +91,20 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
         what: description of the share.
     """
     figure, axes = new_figure(4.6, 3.5)
-    values = values_of(tables.measures, ALL)
+    values = values_of(tables.measures)
     views = sorted({k for _, name, k in values if name == measure})
     policies = tables.policies()
     for row, policy in enumerate(policies):
         shares = np.array([values[policy, measure, k] for k in views])
         # offset, so that the bars do not overlap
         x = np.array(views) + (row - len(policies) / 2) * 0.05
-        _curve(axes, x, shares, policy, look_of(policy, tables))
+        look = look_of(policy, tables)
+        axes.plot(x, shares[:, 0], marker="o", markersize=3.5, label=policy, **look)
+        bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
+        axes.vlines(x, shares[:, 1], shares[:, 2], **bars)
     axes.set_xticks(views)
     axes.set(xlabel="views", ylabel=what)
     axes.set_ylim(min(axes.get_ylim()[0], LOWEST_AXIS), 1 + (1 - LOWEST_AXIS) / 10)
-    percent_axis(axes.yaxis)
-    legend(axes)
-    return figure
-
-
-def _curve(axes: Any, x: NDArray, shares: NDArray, label: str, look: dict) -> None:
-    """Draw a line through shares, (K, 3): value, low and high, with bars at its points."""
-    axes.plot(x, shares[:, 0], marker="o", markersize=3.5, label=label, **look)
-    bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
-    axes.vlines(x, shares[:, 1], shares[:, 2], **bars)
-
-
-def threshold_curve(results: ClassResults, measure: str = "class_accuracy") -> Figure:
-    """Draw accuracy against threshold, with 95 % intervals (figures 15 and 18).
-
-    Args:
-        results: of the benchmark.
-        measure: name of the accuracy.
-
-    Returns:
-        The figure.
-    """
-    figure, axes = new_figure(4.6, 3.5)
-    table = results.tables.measures.query(
-        "set == @ALL and measure == @measure and threshold == threshold"
-    )
-    ticks = sorted(table["threshold"].unique())
-    names = [n for n in compared(results) if n in set(table["policy"])]
-    for k, name in enumerate(names):
-        rows = table[table["policy"] == name].sort_values("threshold")
-        shares = rows[["value", "low", "high"]].to_numpy(np.float64)
-        # offset, so that the bars do not overlap
-        x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04
-        _curve(axes, x, shares, name, look_of(name, results.tables))
-    axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
-    axes.set(xlabel="confidence threshold", ylabel=words(measure))
-    percent_axis(axes.yaxis)
-    legend(axes)
-    return figure
-
-
-def budget_curve(results: ClassResults, budget: str) -> Figure:
-    """Draw accuracy against mean views or mean travel, over all thresholds.
-
-    Args:
-        results: of the benchmark.
-        budget: "n_views" or "travel_all".
-
-    Returns:
-        The figure.
-    """
-    figure, axes = new_figure(4.6, 3.5)
-    for name in compared(results):
-        rows = results.tables.sweep[results.tables.sweep["policy"] == name]
-        axes.plot(
-            rows[budget], rows["accuracy"], label=name, **look_of(name, results.tables)
-        )
-    axes.set(
-        xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[
-            budget
-        ],
-        ylabel="accuracy",
-    )
     percent_axis(axes.yaxis)
     legend(axes)
     return figure
@@ -214,26 +117,19 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
 
     Args:
         tables: of the benchmark.
-        tests: of one measure, in one set or in two.
+        tests: of one measure.
         what: description of the measure.
     """
     policies = list(tests["policy"].unique())[::-1]
-    sets = list(tests["set"].unique())
     figure, axes = new_figure(4.6, 0.7 + 0.26 * max(3, len(policies)))
     row: Any  # a named tuple
     for row in tests.itertuples():
-        second = sets.index(row.set)
-        marker = "os"[second]
-        y = policies.index(row.policy) + (len(sets) - 1) * (0.14 - 0.28 * second)
+        y = policies.index(row.policy)
         colour = look_of(row.policy, tables)["color"]
         axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
         inside = colour if row.p_holm < SIGNIFICANT else "white"
         dot = {"color": colour, "markersize": 5, "markerfacecolor": inside}
-        axes.plot(100 * row.difference, y, marker, clip_on=False, **dot)
-    if len(sets) > 1:
-        for name, marker in zip(sets, "os", strict=True):
-            axes.plot([], [], marker, color=INK, markerfacecolor="white", label=name)
-        legend(axes)
+        axes.plot(100 * row.difference, y, "o", clip_on=False, **dot)
     axes.axvline(0, color=INK, linewidth=0.9)
     axes.set_yticks(np.arange(len(policies)), policies)
     axes.grid(axis="y", visible=False)
@@ -243,147 +139,8 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
     return figure
 
 
-def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Figure:
+def confusion_matrix(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
     """Draw the percentage of answers for each true class (figure 12).
-
-    Args:
-        counts: by true class (rows) and answer (columns), (C, C).
-        classes: names of the classes.
-        title: of the figure.
-
-    Returns:
-        The figure.
-    """
-    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    figure, axes = new_figure(4.6, 4.4)
-    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-
-    few = len(classes) <= 15
-    ticks = np.arange(len(classes))
-    names = [words(name) for name in classes]
-    for i, j in np.argwhere(share >= 0.01) if few else ():
-        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
-        axes.text(
-            j,
-            i,
-            f"{100 * share[i, j]:.0f}",
-            color="white" if share[i, j] > 0.55 else INK,
-            **text,
-        )
-
-    size = 8.5 if few else 5
-    axes.set_xticks(
-        ticks,
-        names,
-        rotation=50,
-        ha="right",
-        rotation_mode="anchor",
-        fontsize=size,
-    )
-    axes.set_yticks(ticks, names, fontsize=size)
-    axes.grid(visible=False)
-    axes.tick_params(length=0)
-    axes.set(xlabel="answer", ylabel="true class")
-    axes.set_title(title, fontsize=10, loc="left")
-
-    return figure
-
-
-def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Figure:
-    """Draw the confusion matrix of episodes.
-
-    Args:
-        episodes: with the columns "label" and "answer".
-        classes: names of the classes.
-        title: of the figure.
-
-    Returns:
-        The figure.
-    """
-    label, answer = (
-        pd.Categorical(episodes[c], categories=list(classes))
-        for c in ("label", "answer")
-    )
-    return confusion_matrix(
-        pd.crosstab(label, answer, dropna=False).to_numpy(),
-        classes,
-        title,
-    )
-
-
-def reliability_diagram(
-    results: ClassResults,
-    policies: Sequence[str],
-    threshold: float,
-) -> Figure:
-    """Draw the reliability of the confidence at which the episodes stopped.
-
-    Bins with fewer than 20 episodes are left out.
-
-    Args:
-        results: of the benchmark.
-        policies: names of the policies.
-        threshold: of the belief.
-
-    Returns:
-        The figure.
-    """
-    values = values_of(results.tables.measures, ALL, threshold)
-    table = results.tables.reliability.query("threshold == @threshold").rename(
-        columns={"episodes": "answers"}
-    )
-    curves = {}
-    for name in policies:
-        error = values[name, "calibration_error", 0][0]
-        own = table[table["policy"] == name]
-        curves[f"{name}  {error:.3f}"] = own, look_of(name, results.tables)
-    return _reliability(curves, "when it stopped", "policy  calibration error")
-
-
-def _reliability(
-    curves: dict[str, tuple[pd.DataFrame, dict]],
-    when: str,
-    title: str,
-) -> Figure:
-    """Draw accuracy against confidence; the size of a dot is its number of answers."""
-    figure, axes = new_figure(4.6, 3.9)
-    axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
-    axes.set(
-        xlim=(0, 1.03),
-        ylim=(0, 1.03),
-        xlabel=f"confidence {when}",
-        ylabel="share that was right",
-    )
-    axes.set_aspect("equal")
-
-    for label, (table, look) in curves.items():
-        rows = table[table["answers"] >= 20]
-        axes.plot(
-            rows["confidence"],
-            rows["accuracy"],
-            linewidth=1.1,
-            label=label,
-            **look,
-        )
-        size = 8 + 220 * rows["answers"] / rows["answers"].sum()
-        colour = look["color"]
-
-        axes.scatter(
-            rows["confidence"],
-            rows["accuracy"],
-            size,
-            colour,
-            alpha=0.55,
-            linewidths=0,
-            clip_on=False,
-        )
-
-    legend(axes, title)
-    return figure
-
-
-def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
-    """Draw the confusion matrix after a number of views.
 
     Args:
         e: the evaluation.
@@ -398,85 +155,26 @@ def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> 
         columns="answer",
         values="answers",
     )
+    counts = table.loc[list(classes), list(classes)].to_numpy()
+    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    figure, axes = new_figure(4.6, 4.4)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+
+    few = len(classes) <= 15
+    ticks = np.arange(len(classes))
+    names = [words(name) for name in classes]
+    for i, j in np.argwhere(share >= 0.01) if few else ():
+        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
+        text["color"] = "white" if share[i, j] > 0.55 else INK
+        axes.text(j, i, f"{100 * share[i, j]:.0f}", **text)
+
+    size = 8.5 if few else 5
+    turned: dict[str, Any] = {"rotation": 50, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(ticks, names, fontsize=size, **turned)
+    axes.set_yticks(ticks, names, fontsize=size)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.set(xlabel="answer", ylabel="true class")
     title = "one view" if n_views == 1 else f"all {n_views} views fused"
-    return confusion_matrix(
-        table.loc[list(classes), list(classes)].to_numpy(),
-        classes,
-        title,
-    )
-
-
-def fusion_curve(e: Evaluation) -> Figure:
-    """Draw accuracy, with intervals, and confidence against the number of fused views."""
-    figure, axes = new_figure(4.6, 3.5)
-    table = e.fusion
-
-    axes.fill_between(
-        table["n_views"],
-        table["low"],
-        table["high"],
-        color=BLUE,
-        alpha=0.15,
-        linewidth=0,
-    )
-    axes.plot(
-        table["n_views"],
-        table["accuracy"],
-        color=BLUE,
-        label="over objects, 95 % interval",
-    )
-    axes.plot(
-        table["n_views"],
-        table["class_accuracy"],
-        color=INK,
-        linestyle="--",
-        linewidth=1.1,
-        label="over classes",
-    )
-    axes.plot(
-        table["n_views"],
-        table["confidence"],
-        color=ACCENT,
-        linestyle=":",
-        label="mean confidence",
-    )
-
-    published = e.accuracy.query(
-        "n_views == 1 and label == '' and measure == 'accuracy'"
-    )["published"].iloc[0]
-    if np.isfinite(published):
-        axes.plot(
-            1,
-            published,
-            "D",
-            color=ACCENT,
-            markersize=5,
-            clip_on=False,
-            label="published, one view",
-        )
-
-    axes.set_xscale("log")
-    ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= len(table)]
-    axes.set_xticks(ticks, [str(k) for k in ticks])
-    axes.minorticks_off()
-    axes.set(xlabel="random views fused", ylabel="share")
-    percent_axis(axes.yaxis)
-    legend(axes)
+    axes.set_title(title, fontsize=10, loc="left")
     return figure
-
-
-def evaluated_reliability(e: Evaluation) -> Figure:
-    """Draw the reliability after one view and more, in random order.
-
-    Bins with fewer than 20 answers are left out.
-    """
-    errors = e.fusion.set_index("n_views")["calibration_error"]
-    curves = {}
-    n: Any
-    for (n, rows), colour in zip(
-        e.reliability.groupby("n_views"),
-        ("#7cc4ec", LIGHT_BLUE, BLUE, INK),
-        strict=False,
-    ):
-        curves[f"{n} view{'s' * (n > 1)}  {errors[n]:.3f}"] = rows, {"color": colour}
-    return _reliability(curves, "in the answer", "calibration error")

@@ -1,8 +1,10 @@
 """What is found in frames, each in a scene of its own; an interrupted run goes on."""
 
+import csv
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,12 +12,22 @@ import numpy as np
 from msgspec import Struct
 
 from nextview.captured.check import evenly_spread
+from nextview.data.progress import TrackProgress
 from nextview.errors import DatasetError, NextviewError, ObservationError, UsageError
-from nextview.files import read_record, write_record
+from nextview.files import (
+    check_new,
+    new_file,
+    only_one,
+    read_record,
+    unfinished,
+    write_record,
+)
+from nextview.recognition.model_card import find_models
 from nextview.scene.scene import Scene
-from nextview.sensing.frame import Frame
 from nextview.session.system import System
+from nextview.things.memory import open_memory
 from nextview.types import Float
+from nextview_lab.data.real_frames import RealFrame
 
 Item = TypeVar("Item")
 
@@ -80,58 +92,55 @@ class FrameAnswers:
         left_out: why frames could not be looked at, by their names.
     """
 
-    def __init__(self, folder: Path, system: System, up: Float | None) -> None:
+    def __init__(self, folder: Path, system: System) -> None:
         """Nothing is looked at yet.
 
         Args:
             folder: that keeps what is found.
             system: that knows the things.
-            up: direction against gravity in the world, (3,); None for the normal of the support
-                plane.
         """
         self.left_out: dict[str, NextviewError] = {}
         self._folder = folder
         self._system = system
-        self._up = up
 
-    def look_at(self, frames: Mapping[str, Callable[[], Frame]]) -> Iterator[int]:
+    def look_at(self, frames: Iterable[RealFrame]) -> Iterator[int]:
         """Look at each frame that is not done; yields how many are.
 
         Args:
-            frames: functions that read them, by their names.
+            frames: as yet unread.
         """
-        for done, (name, read) in enumerate(frames.items(), 1):
-            if not self._file(name).exists():
+        for done, frame in enumerate(frames, 1):
+            if not self._file(frame).exists():
                 try:
-                    write_record(self._file(name), self._looked(read))
+                    write_record(self._file(frame), self._looked(frame))
                 except (DatasetError, ObservationError) as error:
-                    self.left_out[name] = error
+                    self.left_out[_named(frame)] = error
             yield done
 
-    def refused(self, name: str) -> bool:
+    def refused(self, frame: RealFrame) -> bool:
         """Whether a frame was read, and showed no plane, or nothing."""
-        return isinstance(self.left_out.get(name), ObservationError)
+        return isinstance(self.left_out.get(_named(frame)), ObservationError)
 
     def why(self) -> str:
         """Why the first frame that is left out is, as the end of a sentence."""
         return next((f": {error}" for error in self.left_out.values()), "")
 
-    def __getitem__(self, name: str) -> FrameAnswer | None:
+    def of(self, frame: RealFrame) -> FrameAnswer | None:
         """What was found in a frame; None if it could not be looked at."""
-        if not self._file(name).exists():
+        file = self._file(frame)
+        if not file.exists():
             return None
-        return read_record(
-            self._file(name), FrameAnswer, "what was found", DatasetError
-        )
+        return read_record(file, FrameAnswer, "what was found", DatasetError)
 
-    def _file(self, name: str) -> Path:
-        return self._folder / f"{hashlib.sha256(name.encode()).hexdigest()}.json"
+    def _file(self, frame: RealFrame) -> Path:
+        digest = hashlib.sha256(_named(frame).encode()).hexdigest()
+        return self._folder / f"{digest}.json"
 
-    def _looked(self, read: Callable[[], Frame]) -> FrameAnswer:
+    def _looked(self, real: RealFrame) -> FrameAnswer:
         """Look at a frame; an ObservationError if it shows no plane, or nothing."""
         begun = time.perf_counter(), time.process_time()
-        scene = Scene(self._system, self._up)
-        frame = read()
+        scene = Scene(self._system, None)
+        frame = real.read()
         scene.update(frame)
         to_camera = np.linalg.inv(frame.camera_to_world)
         objects = []
@@ -146,3 +155,75 @@ class FrameAnswers:
                 )
         ended = time.perf_counter(), time.process_time()
         return FrameAnswer(tuple(objects), ended[0] - begun[0], ended[1] - begun[1])
+
+
+def _named(frame: RealFrame) -> str:
+    """A frame as it is named where it is left out."""
+    return f"{frame.folder}: {frame.name}"
+
+
+@contextmanager
+def looked_at(
+    out: Path,
+    models: str,
+    system: System,
+    frames: Collection[RealFrame],
+    how: object,
+    track: TrackProgress,
+) -> Iterator[FrameAnswers]:
+    """Look at frames, for a table that is written in this context; a stopped run goes on.
+
+    Args:
+        out: the table.
+        models: name or folder of the memory.
+        system: that it is opened as.
+        frames: as yet unread.
+        how: else the answers depend on.
+        track: follows the frames.
+    """
+    card, _ = open_memory(find_models(models).recogniser)
+    depends = str((card.sha256, how, Path.cwd()))
+    key = hashlib.sha256(depends.encode()).hexdigest()
+    with only_one(out), unfinished(out, key) as parts:
+        answers = FrameAnswers(parts, system)
+        track(answers.look_at(frames), len(frames), "frames")
+        yield answers
+
+
+def check_table(out: Path, overwrite: bool) -> None:
+    """Check, before any work is done, that a table can be written.
+
+    Args:
+        out: the table.
+        overwrite: whether it may replace another.
+
+    Raises:
+        ResultsError: it exists, or cannot be written.
+        UsageError: its name does not end in .csv.
+    """
+    check_new(out, overwrite)
+    if out.suffix.lower() != ".csv":
+        raise UsageError(f"{out}: the name ends in .csv")
+
+
+def write_table(
+    out: Path,
+    overwrite: bool,
+    head: Iterable[str],
+    rows: Iterable[Iterable[object]],
+) -> None:
+    """Write a table of comma-separated values, completely or not at all.
+
+    Args:
+        out: the table.
+        overwrite: whether it may replace another.
+        head: names of the columns.
+        rows: of values.
+    """
+    with (
+        new_file(out, overwrite) as new,
+        new.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)

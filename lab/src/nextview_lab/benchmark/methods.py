@@ -295,14 +295,6 @@ class Method(Protocol):
         """Return the CPU time that the method has taken so far, seconds; NaN if not known."""
         ...
 
-    def finish(self) -> None:
-        """Say that no view follows; ResultsError where the method has said too much."""
-        ...
-
-    def close(self) -> None:
-        """End the method."""
-        ...
-
 
 class NextviewMethod:
     """nextview with a memory of taught things, and one of its policies.
@@ -371,12 +363,6 @@ class NextviewMethod:
     def cpu_seconds(self) -> float:
         """Return the CPU time of this process, seconds."""
         return time.process_time()
-
-    def finish(self) -> None:
-        """Do nothing: each answer is of its view."""
-
-    def close(self) -> None:
-        """Do nothing: this process goes on."""
 
     def _begun(self, look: FrozenLook) -> Session:
         """Return the session of a new episode, whose candidates are those of the episode."""

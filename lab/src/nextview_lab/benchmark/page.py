@@ -2,14 +2,12 @@
 
 import base64
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from nextview.figures.style import to_svg
-from nextview.files import new_folder
 from nextview.recognition.map_names import measure_of
 from nextview_lab.benchmark.board_page import NONE, points
 from nextview_lab.benchmark.entries import knows_truth
@@ -84,41 +82,6 @@ def render(template: str, **given: Any) -> str:
 def picture(figure: Figure) -> str:
     """Return a figure as a data URI."""
     return f"data:image/svg+xml;base64,{base64.b64encode(to_svg(figure).encode()).decode()}"
-
-
-def write_figures(
-    folder: Path,
-    figures: Mapping[str, Figure],
-    tables: Mapping[str, pd.DataFrame],
-    overwrite: bool = False,
-) -> None:
-    """Write figures as PDF and SVG, and tables as CSV and LaTeX; see ``files.new_folder``.
-
-    Args:
-        folder: to write.
-        figures: by file name.
-        tables: by file name.
-        overwrite: whether to replace existing files.
-    """
-    with new_folder(folder, overwrite) as part:
-        for name, figure in figures.items():
-            (part / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
-            figure.savefig(
-                part / f"{name}.pdf",
-                bbox_inches="tight",
-                metadata={"CreationDate": None},
-            )
-        for name, table in tables.items():
-            table.to_csv(part / f"{name}.csv", index=False)
-            (part / f"{name}.tex").write_text(
-                table.to_latex(
-                    index=False,
-                    escape=True,
-                    float_format="%.4g",
-                    na_rep="",
-                ),
-                encoding="utf-8",
-            )
 
 
 def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:

@@ -1,7 +1,5 @@
 """What is said of real frames, each alone, against what is known of the things in them."""
 
-import csv
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
@@ -9,18 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.files import check_new, new_file, only_one, unfinished
-from nextview.recognition.model_card import find_models
+from nextview.errors import DatasetError, NextviewError
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
-from nextview.things.memory import open_memory
 from nextview.types import Float, Mask
 from nextview_lab.benchmark.board_page import WrittenTable
 from nextview_lab.benchmark.frame_answers import (
     FrameAnswer,
-    FrameAnswers,
+    check_table,
     evenly,
+    looked_at,
+    write_table,
 )
 from nextview_lab.benchmark.statistics import wilson
 from nextview_lab.data.metrics import add_s
@@ -72,12 +69,10 @@ class RealRun:
     """What was said of real frames.
 
     Attributes:
-        out: table of all things.
-        rows: of the table.
+        rows: of the table of all things.
         left_out: why frames could not be looked at, by their names.
     """
 
-    out: Path
     rows: tuple[RealThing, ...]
     left_out: dict[str, NextviewError]
 
@@ -121,42 +116,29 @@ def recognise_real(
         ResultsError: ``out`` exists, or cannot be written.
         UsageError: an option makes no sense.
     """
-    out = Path(out)
-    check_new(out, overwrite)
-    if out.suffix.lower() != ".csv":
-        raise UsageError(f"{out}: the name ends in .csv")
-    card, _ = open_memory(find_models(models).recogniser)
+    check_table(out, overwrite)
     system = load(models)
-    there = {
-        f"{each}: {frame.name}": frame
+    there = [
+        frame
         for each in (folder, *more)
         for frame in evenly(
             real_frames(each, intrinsics, depth_scale, first_label), frames
         )
-    }
-    depends = str((card.sha256, intrinsics, depth_scale, Path.cwd()))
-    key = hashlib.sha256(depends.encode()).hexdigest()
-    with only_one(out), unfinished(out, key) as parts:
-        answers = FrameAnswers(parts, system, None)
-        reads = {name: frame.read for name, frame in there.items()}
-        track(answers.look_at(reads), len(there), "frames")
+    ]
+    how = intrinsics, depth_scale
+    with looked_at(out, models, system, there, how, track) as answers:
         clouds = surface_points(system)
         rows = [
             row
-            for name, frame in there.items()
-            if (answer := answers[name]) is not None or answers.refused(name)
+            for frame in there
+            if (answer := answers.of(frame)) is not None or answers.refused(frame)
             for row in compared(frame, answer, clouds)
         ]
         if not rows:
             raise DatasetError(f"{folder}: no frame can be looked at{answers.why()}")
-        with (
-            new_file(out, overwrite) as new,
-            new.open("w", newline="", encoding="utf-8") as file,
-        ):
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(field.name for field in fields(RealThing))
-            writer.writerows(map(astuple, rows))
-    return RealRun(out, tuple(rows), answers.left_out)
+        head = (field.name for field in fields(RealThing))
+        write_table(out, overwrite, head, map(astuple, rows))
+    return RealRun(tuple(rows), answers.left_out)
 
 
 def surface_points(system: System) -> dict[str, Float]:

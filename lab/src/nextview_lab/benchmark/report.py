@@ -1,92 +1,54 @@
 """Write a self-contained HTML report from a folder of benchmark results."""
 
-import base64
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from PIL import Image
 
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
 from nextview.policies.registry import DEFAULT_POLICY
-from nextview.recognition.map_names import LEM
 from nextview_lab.benchmark import class_tables as board
 from nextview_lab.benchmark import figures as draw
-from nextview_lab.benchmark.class_tables import ClassResults, class_set
+from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview_lab.benchmark.entries import is_oracle
-from nextview_lab.benchmark.page import numbers, origin, picture, render, write_figures
-from nextview_lab.benchmark.published import PUBLISHED_COLUMNS, published_threshold
-from nextview_lab.benchmark.true_maps import stored_rows
-from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.store import ViewStore
-from nextview_lab.errors import EntryError
+from nextview_lab.benchmark.page import numbers, origin, picture, render
 from nextview_lab.extras import extras
 
 with extras():
     import pandas as pd
-
-REPORT_PICTURE = 112  # side of a view's image, pixels
 
 
 def report(
     results: Path,
     out: Path | None = None,
     /,
-    store: Path | None = None,
-    figures: Path | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write one self-contained HTML page: tables, curves, and the worst failures.
+    """Write one self-contained HTML page: tables, differences, and the worst failures.
 
     Args:
         results: folder of nextview-lab benchmark classes.
         out: page to write; by default RESULTS/report.html.
-        store: view store for images of the objects; by default that of the predictions, if it still
-            exists.
-        figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
-        overwrite: replace an earlier page and earlier figures.
+        overwrite: replace an earlier page.
 
     Raises:
         ResultsError: there are no results, or only fixed views; or the page cannot be written.
-        DatasetError: the given store cannot be read.
     """
     path = out or results / "report.html"
     check_new(path, overwrite)
-    if figures is not None:
-        check_new(figures, overwrite, folder=True)
-
     loaded = load(results)
-    if loaded.tables.sweep.empty:
+    if not loaded.tables.choosing():
         raise ResultsError(
             f"{results}: holds fixed views only; a report needs a policy that chooses"
         )
 
-    views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
-        part.write_text(page(loaded, views, why_not), encoding="utf-8")
+        part.write_text(page(loaded), encoding="utf-8")
 
-    if figures is not None:
-        at = board.headline_threshold(loaded.settings["thresholds"])
-        tables = loaded.tables
-        shown = {
-            "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
-            "tests": tables.tests,
-        }
-        if after := board.after_views_table(tables):
-            shown["views"] = pd.DataFrame(after.rows, columns=list(after.headings))
-        write_figures(
-            figures,
-            _figures(loaded, headline_policy(loaded, at), at),
-            shown,
-            overwrite,
-        )
     return path
 
 
@@ -100,23 +62,19 @@ def headline_policy(results: ClassResults, threshold: float) -> str:
     Returns:
         Its name; the reference if there is no other.
     """
-    found = values_of(results.tables.measures, ALL, threshold)
+    found = values_of(results.tables.measures, threshold)
     reference = results.settings["reference"]
     names = [
-        n
-        for n in results.tables.sweep["policy"].unique()
-        if not is_oracle(n) and n != reference
+        n for n in results.tables.choosing() if not is_oracle(n) and n != reference
     ]
     return max(names, key=lambda n: found[n, "accuracy", 0][0], default=reference)
 
 
-def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
+def page(results: ClassResults) -> str:
     """Return the page of a benchmark.
 
     Args:
         results: of the benchmark.
-        store: with images of the objects; None for a page without images.
-        why_not: reason for missing images.
 
     Returns:
         HTML.
@@ -126,41 +84,20 @@ def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
     p = results.predictions
     at = board.headline_threshold(s["thresholds"])
     reference = s["reference"]
-    whole = t.measures[t.measures["views"] == 0]
-    keys = ("policy", "threshold", "measure")
-    found = numbers(whole[whole["set"] == ALL], *keys)
-    labels = sorted(p.classes[k] for k in np.unique(p.labels))
-    of_class = {
-        label: numbers(whole[whole["set"] == class_set(label)], *keys)
-        for label in labels
-    }
-    policies = list(t.sweep["policy"].unique())
+    whole = t.measures[(t.measures["views"] == 0) & (t.measures["set"] == ALL)]
+    found = numbers(whole, "policy", "threshold", "measure")
+    policies = t.choosing()
     best = headline_policy(results, at)
-    tests = board.accuracy_tests(t, at).set_index("policy").to_dict("index")
-    wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, *draw.ceiling(results)))
-    shown = [name for name in wanted if name in policies]
-
-    def spoken(measure: str) -> str:
-        known = [
-            (name, found.get((name, at, measure))) for name in draw.compared(results)
-        ]
-        values = [
-            f"{name} {number.value:.3f}" for name, number in known if number is not None
-        ]
-        return f"At threshold {at:g}: {', '.join(values)}."
-
-    thresholds = [
-        (name, value) for name, value, measure in found if measure == "accuracy"
-    ]
-    fixed_at = {name: None for name, value in thresholds if value is None}
-    confusions = {
-        name: picture(draw.confusion(results.episodes(name, at), p.classes, name))
-        for name in dict.fromkeys((reference, best))
-        if name in policies
-    }
+    tests = board.accuracy_tests(t, at)
+    by_policy = tests.set_index("policy").to_dict("index")
+    wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, "oracle-gain"))
+    figures = {}
+    if len(tests):
+        drawn = draw.differences(t, tests, "accuracy")
+        figures["differences"] = picture(drawn)
     return render(
         "report.html",
-        title=_title(tests.get(best), best, reference, at),
+        title=_title(by_policy.get(best), best, reference, at),
         settings=s,
         p=p,
         at=at,
@@ -168,27 +105,27 @@ def page(results: ClassResults, store: ViewStore | None, why_not: str) -> str:
         reference=reference,
         significant=SIGNIFICANT,
         found=found,
-        of_class=of_class,
-        labels=labels,
         policies=policies,
-        shown=shown,
-        one_view=t.sweep.query("policy == @reference or policy == @best").iloc[0][
-            "accuracy"
-        ],
-        tests=tests,
+        shown=[name for name in wanted if name in policies],
+        tests=by_policy,
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few_objects(t, at, len(p)),
         risks=board.promised_risks(t, s["risks"]),
-        by_class_at=_thresholds(results, at),
-        fixed_at=fixed_at,
-        spoken=spoken,
-        figures={
-            name: picture(figure)
-            for name, figure in _figures(results, best, at).items()
+        figures=figures,
+        failures=_failures(results, best, at),
+        made={
+            **origin(p, s),
+            "valley classes": ", ".join(s["valley_classes"]) or "none",
+            "first views": (
+                f"{s['runs']} of each object, the same for every policy and threshold; seed"
+                f" {s['seed']}"
+            ),
+            "bootstrap": f"{s['samples']} samples of objects",
+            "tests": (
+                "signs of the differences of objects flipped; Holm's correction is over all"
+                " policies and thresholds of a measure"
+            ),
         },
-        confusions=confusions,
-        failures=_failures(results, best, at, store),
-        made=_made(results, store, why_not),
     )
 
 
@@ -202,45 +139,6 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
         )
     more = "more" if test["difference"] > 0 else "less"
     return f"{best} is {100 * abs(test['difference']):.1f} points {more} accurate than {reference}"
-
-
-def _figures(results: ClassResults, best: str, at: float) -> dict[str, Figure]:
-    sweep = results.tables.sweep
-    reference = results.settings["reference"]
-    tests = board.accuracy_tests(results.tables, at)
-    figures = {}
-    if len(tests):
-        figures["differences"] = draw.differences(results.tables, tests, "accuracy")
-    figures |= {
-        measure: draw.threshold_curve(results, measure)
-        for measure in ("class_accuracy", "accuracy")
-    }
-
-    varying = [
-        budget
-        for budget in ("n_views", "travel_all")
-        if sweep[budget].max() > sweep[budget].min()
-    ]
-    figures |= {budget: draw.budget_curve(results, budget) for budget in varying}
-
-    ran = [
-        n
-        for n in dict.fromkeys((reference, best, *draw.ceiling(results)))
-        if n in set(sweep["policy"])
-    ]
-    return figures | {"reliability": draw.reliability_diagram(results, ran, at)}
-
-
-def _thresholds(results: ClassResults, at: float) -> dict[str, float]:
-    """Return policies by class at their published thresholds (tables 8 to 11)."""
-    ran = set(results.tables.sweep["policy"])
-    thresholds = results.settings["thresholds"]
-    wanted = {
-        name: published_threshold(name) or 0.99
-        for name in (LEM, *PUBLISHED_COLUMNS)
-        if name in ran
-    }
-    return {name: t if t in thresholds else at for name, t in wanted.items()}
 
 
 def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
@@ -273,103 +171,18 @@ def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
     ).head(most)
 
 
-def _failures(
-    results: ClassResults,
-    best: str,
-    at: float,
-    store: ViewStore | None,
-) -> list[dict[Any, Any]]:
+def _failures(results: ClassResults, best: str, at: float) -> list[dict[Any, Any]]:
     """Return the worst failures of a policy, each with its most confident episode."""
     p = results.predictions
     episodes = results.episodes(best, at)
     names = np.asarray(episodes["object"].astype(str))
     found = []
-
     for failure in worst_failures(episodes).to_dict("records"):
         name = failure["object"]
-        episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[
-            0
-        ]
+        mine = (names == name) & (episodes["run"] == failure["run"])
+        episode = episodes[mine].iloc[0]
         views = [int(v) for v in episode["views"]]
-        images = (
-            _images(store, name, views)
-            if store is not None and name in store.names
-            else {}
-        )
-        shown = {"answer": episode["answer"], "views": views, "images": images}
-        found.append(
-            failure | shown | {"conflicting": bool(p.conflicting[p.names.index(name)])}
-        )
-
+        conflicting = bool(p.conflicting[p.names.index(name)])
+        shown = {"answer": episode["answer"], "views": views}
+        found.append(failure | shown | {"conflicting": conflicting})
     return found
-
-
-def pictures_of(
-    predictions: Predictions,
-    store: Path | None = None,
-) -> tuple[ViewStore | None, str]:
-    """Open the view store with images of the objects.
-
-    Args:
-        predictions: of the objects.
-        store: path of a store; None for the one named in the predictions.
-
-    Returns:
-        The store and "", or None and the reason why there is none.
-
-    Raises:
-        ResultsError: the given store has other objects or viewpoints.
-    """
-    if store is not None:
-        given = ViewStore.open(store)
-        if given.sphere != predictions.sphere or not set(given.names) & set(
-            predictions.names
-        ):
-            raise ResultsError(
-                f"{store}: holds no views of these objects from these viewpoints"
-            )
-        return given, ""
-    try:
-        # raises an error for another store
-        stored_rows(predictions, "measures/depth_entropy")
-    except EntryError as error:
-        return None, f"No pictures: {error}; give their view store with --store."
-    return ViewStore.open(predictions.store), ""
-
-
-def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Return images of views as data URIs."""
-    row = store.names.index(name)
-    images: NDArray = store.image(row)
-
-    found = {}
-    for view in views:
-        file = BytesIO()
-        small = Image.fromarray(images[view]).resize(
-            (REPORT_PICTURE, REPORT_PICTURE),
-            Image.Resampling.LANCZOS,
-        )
-        small.save(file, "WEBP", quality=70)
-        found[f"{name} from view {view}"] = (
-            "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
-        )
-    return found
-
-
-def _made(
-    results: ClassResults, store: ViewStore | None, why_not: str
-) -> dict[str, str]:
-    s = results.settings
-    return {
-        **origin(results.predictions, s),
-        "valley classes": ", ".join(s["valley_classes"]) or "none",
-        "first views": (
-            f"{s['runs']} of each object, the same for every policy and threshold; seed {s['seed']}"
-        ),
-        "bootstrap": f"{s['samples']} samples of objects",
-        "tests": (
-            "signs of the differences of objects flipped; Holm's correction is over all policies"
-            " and thresholds of a measure"
-        ),
-        "pictures": store.path.name if store is not None else why_not,
-    }

@@ -1,4 +1,4 @@
-"""Write a folder of results: tables as CSV, Markdown and LaTeX, figures, and settings."""
+"""Write a folder of results: tables as CSV and Markdown, figures, and settings."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -13,10 +13,6 @@ from nextview.files import new_folder
 from nextview_lab.benchmark.board_page import Board, markdown, written
 from nextview_lab.benchmark.comparison import Tables, too_few
 from nextview_lab.benchmark.figures import differences, views_curve
-from nextview_lab.extras import extras
-
-with extras():
-    import pandas as pd
 
 RECORD = "benchmark.json"
 
@@ -34,9 +30,8 @@ class ComparedTables(Tables):
     chosen: str
 
     def sentences(self) -> list[str]:
-        """Return the conclusions: the selection of the reference, and sets that are too small."""
-        few = [f"{name}: {sentence}" for name, sentence in too_few(self.tests).items()]
-        return [*filter(None, [self.chosen]), *few]
+        """Return the conclusions: the selection of the reference, and whether there are too few."""
+        return [*filter(None, [self.chosen, too_few(self.tests)])]
 
 
 def write_results(
@@ -111,7 +106,6 @@ def write_compared(
 
     def more(part: Path) -> None:
         (part / "tables.md").write_text(compared_markdown(tables), encoding="utf-8")
-        (part / "table.tex").write_text(latex(tables), encoding="utf-8")
         to_png(views_curve(tables, measure, what), part / "accuracy.png")
         tests = tables.tests[tables.tests["measure"] == measure]
         if len(tests):
@@ -120,14 +114,3 @@ def write_compared(
             to_png(drawn, part / "differences.png")
 
     write_results(out, tables, made, more)
-
-
-def latex(tables: ComparedTables) -> str:
-    """Format the narrow boards as LaTeX tables, which need the package booktabs."""
-    parts = []
-    for board in tables.boards:
-        text = written(tables, board, board.narrow())
-        rows = pd.DataFrame(text.rows, columns=list(text.headings))
-        rows["policy"] = [policy.rpartition(":")[2] for policy in rows["policy"]]
-        parts.append(f"% {board.title}\n{rows.to_latex(index=False, escape=True)}")
-    return "\n".join(parts)

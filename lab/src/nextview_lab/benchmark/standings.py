@@ -389,10 +389,7 @@ def _board(
     shares = counted.measures(ALL, weights)
 
     compared = best_blind_method(scored) if reference is None else reference
-    tables = [
-        _main_table(scored, shares, weights, len(order)),
-        _places_table(scored, truths),
-    ]
+    tables = [_main_table(scored, shares, weights, len(order))]
     notes = [
         f"{len(truths)} episodes with {number_of(len(order), 'thing')}; episodes with one thing are"
         " resampled together.",
@@ -404,8 +401,8 @@ def _board(
             ALL, weights, compared, lambda key: key.measure == RIGHT and key.views > 1
         )
         if len(tests):
-            tables.insert(1, _differences_table(corrected([tests]), compared))
-            notes += too_few(tests).values()
+            tables.append(_differences_table(corrected([tests]), compared))
+            notes += filter(None, [too_few(tests)])
             if reference is None:
                 notes.append(
                     f"The reference, {compared}, is the best blind method on these same episodes,"
@@ -434,7 +431,7 @@ def _main_table(
         ("unknown", UNKNOWN_SAID, views),
     ]
 
-    numbers = values_of(shares, ALL)
+    numbers = values_of(shares)
     rows = []
     for one in scored:
         name = one.submission.method
@@ -513,24 +510,5 @@ def _differences_table(tests: "pd.DataFrame", reference: str) -> WrittenTable:
         "Share that is right, percentage points, on the same episodes; p-values of sign flips over"
         " the things, as they are and after Holm's correction over all rows.",
         ("method", "after", "difference", "p", "p, corrected"),
-        tuple(rows),
-    )
-
-
-def _places_table(
-    scored: Sequence[Scored], truths: Sequence[EpisodeTruth]
-) -> WrittenTable:
-    """Return the table by places."""
-    places = np.array([truth.place for truth in truths])
-    names = list(dict.fromkeys(sorted(places.tolist())))
-    rows = []
-    for one in scored:
-        cells = [f"{one.right[places == name, -1].mean():.3f}" for name in names]
-        rows.append((one.submission.method, *cells))
-    counts = (f"{name} ({int((places == name).sum())})" for name in names)
-    return WrittenTable(
-        "By place",
-        "Right after the last view; in brackets: number of episodes.",
-        ("method", *counts),
         tuple(rows),
     )

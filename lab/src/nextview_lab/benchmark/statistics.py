@@ -3,7 +3,7 @@
 Objects are resampled, because the views and runs of one object are not independent.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.stats import binomtest
@@ -116,39 +116,25 @@ def sign_flip_p(differences: Float) -> Float:
     found = np.ones(differences.shape[1])
     for column in np.flatnonzero(few):
         own = differences[differs[:, column], column]
-        found[column] = exchange_p(len(own), _sums(own[:, None]))[0]
+        found[column] = _exchange_p(own[:, None])[0]
     if not few.all():
-        found[~few] = exchange_p(len(differences), _sums(differences[:, ~few]))
+        found[~few] = _exchange_p(differences[:, ~few])
     return found
 
 
-def _sums(differences: Float) -> Callable[[Float], Float]:
-    return lambda signs: signs @ differences
-
-
-def exchange_p(families: int, difference: Callable[[Float], Float]) -> Float:
-    """Return p-values of the hypothesis that two policies do not differ, by exchanging them.
-
-    Args:
-        families: number F of families.
-        difference: of the two policies, (S, M), for signs of the families, (S, F) float64; a sign
-            of -1 exchanges the policies.
-
-    Returns:
-        p-values, (M,): the share of differences at least as far from 0 as the observed one; NaN if
-        that one is not known.
-    """
-    observed = np.abs(difference(np.ones((1, families)))[0])
+def _exchange_p(differences: Float) -> Float:
+    """Return the share of sign flips whose sum is as far from 0 as that of differences, (F, M)."""
+    families = len(differences)
+    observed = np.abs(np.ones((1, families)) @ differences)[0]
     count = np.zeros(len(observed))
     total = 0
     for signs in _flips(families):
-        # Undefined differences count as extreme.
-        count += (~(np.abs(difference(signs)) < observed - NO_SPREAD)).sum(0)
+        count += (np.abs(signs @ differences) >= observed - NO_SPREAD).sum(0)
         total += len(signs)
     if families > EXACT_FAMILIES:  # the observed signs are one of the possible draws
         count += 1
         total += 1
-    return np.where(np.isnan(observed), np.nan, count / total)
+    return count / total
 
 
 def _flips(families: int) -> Iterator[Float]:

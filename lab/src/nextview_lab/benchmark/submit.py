@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -200,14 +201,9 @@ def submit(
         msgspec.json.encode([frozen.sha256, run, how.name, how.version, how.max_views])
     ).hexdigest()
     with only_one(out), unfinished(out, key) as parts:
-        method = _method(frozen, how)
-        try:
-            track(
-                _episodes(frozen, numbers, method, how, parts), len(numbers), "episodes"
-            )
-            method.finish()
-        finally:
-            method.close()
+        with _method(frozen, how) as method:
+            steps = _episodes(frozen, numbers, method, how, parts)
+            track(steps, len(numbers), "episodes")
         episodes = tuple(
             read_record(parts / f"{number}.json", SubmittedEpisode, "answers")
             for number in numbers
@@ -265,13 +261,20 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
             )
 
 
-def _method(frozen: FrozenArchive, how: SubmitOptions) -> Method:
-    """Start the method."""
+@contextmanager
+def _method(frozen: FrozenArchive, how: SubmitOptions) -> Iterator[Method]:
+    """Start the method, and end it."""
     if how.command is None:
-        return NextviewMethod(how.policy, how.models, tuple(frozen.things), how.seed)
+        yield NextviewMethod(how.policy, how.models, tuple(frozen.things), how.seed)
+        return
     assert how.name is not None
     assert how.version is not None
-    return CommandMethod(how.command, how.name, how.version, how.blind, how.wait)
+    method = CommandMethod(how.command, how.name, how.version, how.blind, how.wait)
+    try:
+        yield method
+        method.finish()
+    finally:
+        method.close()
 
 
 def _episodes(

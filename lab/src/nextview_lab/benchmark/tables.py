@@ -37,7 +37,6 @@ from nextview_lab.benchmark.comparison import ALL, ONE, Counted, Key, corrected
 from nextview_lab.benchmark.jobs import Job, Settings, check_place, check_same, run_jobs
 from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample
-from nextview_lab.data.metrics import add_s
 from nextview_lab.extras import extras
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
@@ -51,8 +50,6 @@ CAMERA_FROM_TABLE = 0.6  # metres from the centre of the table
 TABLE_CENTRE = np.array([0, 0, 0.03])  # metres
 STRANGER_RADII = (0.04, 0.10)  # metres
 STRANGER = "stranger"
-ADD_S_POINTS = 1000  # of a scan
-CLOSE_POSE = 0.1  # of the diameter
 
 
 class TableRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -253,7 +250,6 @@ class Looking:
         scene: estimated scene.
         camera: over the table.
         owners: true object of each pixel, -1 for none, (H, W) int64, by frame.
-        cameras: estimated and true pose of the camera, (4, 4) each, metres, by frame.
         seconds: CPU time of the last frame.
     """
 
@@ -277,7 +273,6 @@ class Looking:
         self.scene = Scene(system, segmentation=segmentation, policy=policy, rng=rng)
         self.camera = camera
         self.owners: list[Index] = []
-        self.cameras: list[tuple[Float, Float]] = []
         self.seconds = 0.0
 
     def look(self, pose: Float) -> Frame:
@@ -291,7 +286,6 @@ class Looking:
         self.seconds = time.process_time() - begun
         if taken:
             self.owners.append(self.camera.owner)
-            self.cameras.append((pose, self.camera.true_pose))
         return frame
 
     def truth(self, thing: SceneObject) -> int:
@@ -307,13 +301,12 @@ class Looking:
         Returns:
             The numbers of: "things", taught ones on the table; "named", found objects with a name;
             "right", correctly named things; "sure" and "sure_right", the same for confident names;
-            "close" and "close_in_camera", correctly named things with a small ADD-S in the world,
-            and in the frame of the last camera that saw them; "strangers", found strangers, and
-            "unknown", strangers called unknown. And "seconds", the CPU time of the last frame.
+            "strangers", found strangers, and "unknown", strangers called unknown. And "seconds",
+            the CPU time of the last frame.
         """
         things = self.camera.table.things
         counts = Counter[str]()
-        right: dict[int, SceneObject] = {}
+        right: set[int] = set()
         of_stranger: set[bool] = set()  # whether the stranger has a name
 
         for found in self.scene.objects:
@@ -325,12 +318,8 @@ class Looking:
             counts["named"] += named
             counts["sure"] += named and found.confident
             if named and found.name == name and number not in right:
-                right[number] = found
+                right.add(number)
                 counts["sure_right"] += found.confident
-
-        for number, found in right.items():
-            for where, in_camera in (("close", False), ("close_in_camera", True)):
-                counts[where] += self._add_s(number, found, in_camera) < CLOSE_POSE
 
         of_all = {
             "things": len(things) - 1,
@@ -340,23 +329,6 @@ class Looking:
             "seconds": self.seconds,
         }
         return {name: float(value) for name, value in {**counts, **of_all}.items()}
-
-    def _add_s(self, number: int, found: SceneObject, in_camera: bool) -> float:
-        """Return the mean distance of the true surface to the estimated one (ADD-S), diameters."""
-        thing = self.camera.table.things[number]
-        points = thing.vertices[:: max(1, len(thing.vertices) // ADD_S_POINTS)]
-        pose = found.pose
-        assert pose is not None
-
-        true = self.camera.lean @ thing.pose
-        if in_camera:
-            frame = max(found.pixels)
-            believed, really = self.cameras[frame]
-            pose = np.linalg.inv(believed) @ pose
-            true = np.linalg.inv(really) @ thing.pose
-
-        diameter = float(np.linalg.norm(np.ptp(points, axis=0)))
-        return add_s(points, true, pose) / diameter
 
 
 def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun:
@@ -400,8 +372,6 @@ SHARES = {
     "precision": ("right", "named", "precision"),
     "recall, confident": ("sure_right", "things", "confident recall"),
     "precision, confident": ("sure_right", "sure", "confident precision"),
-    "ADD-S < 0.1 d, world": ("close", "right", ""),
-    "ADD-S < 0.1 d, camera": ("close_in_camera", "right", ""),
     "strangers unknown": ("unknown", "strangers", "strangers unknown"),
 }
 AFTER = {name: (top, bottom) for name, (top, bottom, _) in SHARES.items()}
@@ -522,7 +492,7 @@ def summarise_tables(
         corrected([tests]),
         settings.reference,
         tuple(
-            Board(f"After {k} frame{'s' * (k > 1)}", ALL, _columns(k), about)
+            Board(f"After {k} frame{'s' * (k > 1)}", _columns(k), about)
             for k in settings.views
         ),
         "",

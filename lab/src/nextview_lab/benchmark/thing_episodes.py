@@ -5,11 +5,10 @@ sensor with its own errors. Every view is simulated once, and every set of views
 exactly as in ``Session``, however many policies look at it.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -35,26 +34,9 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.surface import Surface
-from nextview.types import Float, Index
+from nextview.types import Float
 from nextview.views.expected_views import Outlook
 from nextview_lab.data.metrics import add_s
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """What a recogniser says of some views.
-
-    Attributes:
-        belief: in each thing, (T,) float64.
-        things: thing of each pose, the likeliest first, (M,) int64; empty without poses.
-        poses: from the frames of the scan files to the object frame, (M, 4, 4) float64, metres.
-        p_value: value of the test for unknown things, () float64; NaN if it is not known.
-    """
-
-    belief: Float
-    things: Index
-    poses: Float
-    p_value: Float
 
 
 class KnownThings:
@@ -85,8 +67,8 @@ class KnownThings:
         library = self.memory.library
         return library.caster.surfaces[library.names.index(self.names[thing])]
 
-    def __call__(self, observations: Sequence[Observation]) -> Answer:
-        """What it says of views of one thing: together if it can, else by the sum of all.
+    def __call__(self, observations: Sequence[Observation]) -> JointBelief:
+        """What it says of views of one thing; the belief is in the order of the names.
 
         Args:
             observations: views that show the thing, in one object frame.
@@ -95,13 +77,8 @@ class KnownThings:
             ModelError: its answer is invalid.
         """
         joint = self._together(observations)
-        poses = [each for each in joint.poses if each.thing in self.names]
-        return Answer(
-            belief=np.asarray(joint.belief, np.float64)[self._order],
-            things=np.array([self.names.index(each.thing) for each in poses], np.int64),
-            poses=np.array([each.pose for each in poses]).reshape(-1, 4, 4),
-            p_value=np.array(np.nan if joint.p_value is None else joint.p_value),
-        )
+        belief = np.asarray(joint.belief, np.float64)[self._order]
+        return replace(joint, belief=belief)
 
     def _together(self, observations: Sequence[Observation]) -> JointBelief:
         """What it says of views of one thing: together if it can, else by the sum of all."""
@@ -205,10 +182,30 @@ class ThingEpisode:
         self.thing = thing
         self._mesh = mesh
         self._seed = (setting.seed, thing, draw)
-        self.stage = Stage.of(mesh, setting, self._seed)
+        self._draw_scene(setting)
         self._views: dict[int, tuple[Observation, Float]] = {}
-        self._verified: dict[frozenset[int], tuple[Answer, float]] = {}
+        self._verified: dict[frozenset[int], JointBelief] = {}
         self.start = self._first_view()
+
+    def _draw_scene(self, setting: Setting) -> None:
+        """Rotate the thing, and draw its sensor and its surroundings."""
+        mesh = self._mesh
+        rng = np.random.default_rng(self._seed)
+        turn = rotation_z(rng.uniform(0, 2 * np.pi))
+        self._standing = rotated(mesh, turn)
+        radius = self._standing.metres
+        assert radius is not None  # the unit of its file is known
+        away = max(NEAREST_SURFACE + radius, min(USUAL_DISTANCE, RADII_AWAY * radius))
+        drawn = sensor_named(setting.sensor).draw(rng)
+        self._sensor = replace(drawn, radius=radius, distance=away, boxes=0.0)
+        # from the frame of the file to the true object frame, metres
+        self._in_truth = np.eye(4)
+        self._in_truth[:3, :3] = turn
+        self._in_truth[:3, 3] = -(turn @ mesh.centre + self._standing.centre)
+        self._around: Mesh | None = None
+        if setting.occlusion != "none":
+            share = VISIBLE_SHARES[setting.occlusion]
+            self._around = hiding_boxes(self._standing, share, (*self._seed, 2))
 
     def _first_view(self) -> int:
         """Return a view in which the thing is visible."""
@@ -225,11 +222,16 @@ class ThingEpisode:
     def _sensed(self, view: int) -> tuple[Observation, Float]:
         """Return the observation from a viewpoint, and the file's true pose in its camera."""
         if view not in self._views:
-            camera = self.stage.camera(view)
+            # with the setup errors of the episode and the noise of one view
+            rng = np.random.default_rng((*self._seed, 7))
+            camera = SensedCamera(
+                self._standing, self._sensor, rng, around=self._around
+            )
+            rng.spawn(view)
             observation = camera.observe(EPISODE_SPHERE.poses[view])
             in_camera = np.full((4, 4), np.nan)
             if camera.true_pose is not None:
-                in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
+                in_camera = np.linalg.inv(camera.true_pose) @ self._in_truth
             self._views[view] = observation, in_camera
         return self._views[view]
 
@@ -237,28 +239,27 @@ class ThingEpisode:
         """Return the views in which the thing is visible."""
         return [view for view in views if self.observation(view).seen]
 
-    def verified(self, views: Sequence[int]) -> tuple[Answer, float]:
-        """Return the verification of some views, and its CPU time in seconds."""
+    def verified(self, views: Sequence[int]) -> JointBelief:
+        """Return what the recogniser says of some views."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
-            observations = [self.observation(view) for view in sorted(used)]
-            begun = time.process_time()
-            found = self.things(observations)
-            self._verified[used] = found, time.process_time() - begun
+            self._verified[used] = self.things(
+                [self.observation(view) for view in sorted(used)]
+            )
         return self._verified[used]
 
     def named_right(self, views: Sequence[int]) -> bool:
         """Return True if the thing is named correctly after some views."""
-        return int(self.verified(views)[0].belief.argmax()) == self.thing
+        return int(self.verified(views).belief.argmax()) == self.thing
 
     def belief_in_truth(self, views: Sequence[int]) -> float:
         """Return the belief in the true thing after some views."""
-        return float(self.verified(views)[0].belief[self.thing])
+        return float(self.verified(views).belief[self.thing])
 
     def p_value(self, views: Sequence[int]) -> float | None:
         """Return the value of the test for unknown things; None if there is none."""
-        value = float(self.verified(views)[0].p_value)
-        return None if np.isnan(value) else value
+        value = self.verified(views).p_value
+        return None if value is None else float(value)
 
     def pose_error(self, views: Sequence[int]) -> float | None:
         """Return the pose error (ADD-S) in the last view, millimetres.
@@ -267,9 +268,9 @@ class ThingEpisode:
             The mean distance of surface points in the estimated pose to the nearest points of the
             true surface; None if the thing is not named correctly.
         """
-        found, _ = self.verified(views)
-        rows = np.flatnonzero(found.things == self.thing)
-        if int(found.belief.argmax()) != self.thing or not len(rows):
+        name = self.things.names[self.thing]
+        poses = [each.pose for each in self.verified(views).poses if each.thing == name]
+        if not poses or not self.named_right(views):
             return None
 
         seen = self.seen(views)
@@ -279,11 +280,9 @@ class ThingEpisode:
         assert radius is not None
         camera = scene.pose.copy()
         camera[:3, 3] *= radius
-        pose = found.poses[rows[0]]
-
         points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._sensed(seen[-1])[1]
-        return 1000 * add_s(points, np.linalg.inv(camera) @ pose, true)
+        return 1000 * add_s(points, np.linalg.inv(camera) @ poses[0], true)
 
     @cached_property
     def _surface(self) -> Surface:
@@ -306,7 +305,7 @@ class ThingEpisode:
         return EpisodeState(
             current=np.array([views[-1]]),
             visited=visited,
-            belief=self.verified(views)[0].belief[None],
+            belief=self.verified(views).belief[None],
             evidence=Evidence(np.zeros((1, classes))),
             step=len(views),
             observations=[[self.observation(view) for view in views]],
@@ -318,64 +317,6 @@ class ThingEpisode:
         return self.things.outlook(
             [self.observation(view) for view in self.seen(views)]
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """Simulated scene with a thing on its table.
-
-    Attributes:
-        standing: its mesh, rotated.
-        around: the boxes around it; None for none.
-        sensor: the simulated sensor.
-        seed: of the sensor errors.
-        in_truth: from the frame of the file to the true object frame, (4, 4), metres.
-    """
-
-    standing: Mesh
-    around: Mesh | None
-    sensor: Any
-    seed: tuple[int, ...]
-    in_truth: Float
-
-    @classmethod
-    def of(
-        cls,
-        mesh: Mesh,
-        setting: Setting,
-        seed: tuple[int, ...],
-    ) -> "Stage":
-        """Rotate a thing, and draw its sensor and its surroundings.
-
-        Args:
-            mesh: the thing, with a known unit, so that its lengths are metres.
-            setting: sensor, distance and occlusion.
-            seed: of all random numbers of the episode.
-        """
-        rng = np.random.default_rng(seed)
-        turn = rotation_z(rng.uniform(0, 2 * np.pi))
-        standing = rotated(mesh, turn)
-        radius = standing.metres
-        assert radius is not None  # the unit of its file is known
-        away = max(NEAREST_SURFACE + radius, min(USUAL_DISTANCE, RADII_AWAY * radius))
-        drawn = sensor_named(setting.sensor).draw(rng)
-        sensor = replace(drawn, radius=radius, distance=away, boxes=0.0)
-        in_truth = np.eye(4)
-        in_truth[:3, :3] = turn
-        in_truth[:3, 3] = -(turn @ mesh.centre + standing.centre)
-        around = None
-        if setting.occlusion != "none":
-            share = VISIBLE_SHARES[setting.occlusion]
-            around = hiding_boxes(standing, share, (*seed, 2))
-
-        return cls(standing, around, sensor, (*seed, 7), in_truth)
-
-    def camera(self, view: int) -> SensedCamera:
-        """Return the camera, with the setup errors of the episode and the noise of one view."""
-        rng = np.random.default_rng(self.seed)
-        camera = SensedCamera(self.standing, self.sensor, rng, around=self.around)
-        rng.spawn(view)
-        return camera
 
 
 def hiding_boxes(

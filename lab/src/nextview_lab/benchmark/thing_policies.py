@@ -1,6 +1,5 @@
 """Policies of the benchmark of things, including blind rules and an upper bound."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,16 +26,22 @@ SAMPLES = 24  # simulated images of each view
 STEP_SCALE = np.radians(30.0)
 
 
+# of an outlook, and of the hypotheses as each view would show them: the value of each view, (V,)
+ViewValues = Callable[[Outlook, HypothesisImages, np.random.Generator], Float]
+
+
 @dataclass(frozen=True, eq=False)
-class LowestEntropy(ABC):
+class LowestEntropy:
     """Chooses the view after which the entropy of the belief is expected to be lowest.
 
     Attributes:
         viewpoints: the candidates.
+        values: returns the value of each view of one episode, nats.
         needs: required inputs, see ``Policy.needs``.
     """
 
     viewpoints: Viewpoints
+    values: ViewValues
     needs: tuple[str, ...] = ("outlook",)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
@@ -70,78 +75,49 @@ class LowestEntropy(ABC):
             values[row, some] += self.values(outlook, images, rng)
         return best_view(self.viewpoints, state, values)
 
-    @abstractmethod
-    def values(
-        self,
-        outlook: Outlook,
-        images: HypothesisImages,
-        rng: np.random.Generator,
-    ) -> Float:
-        """Return the value of each view of one episode, (V,), nats.
 
-        Args:
-            outlook: with the belief so far.
-            images: the hypotheses as each view would show them.
-            rng: of samples.
-        """
-
-
-class SampledInformation(LowestEntropy):
-    """Chooses the view with the most mutual information, estimated by sampling.
+def sampled_information(
+    outlook: Outlook, images: HypothesisImages, rng: np.random.Generator
+) -> Float:
+    """Return the mutual information of each view, (V,), estimated by sampling.
 
     Denzler and Brown, "Information theoretic sensor data selection for active object recognition
     and state estimation", IEEE TPAMI 24(2), 2002: a hypothesis is drawn from the belief, an image
     from the hypothesis, and the entropy of the updated belief is averaged over the draws.
+
+    Args:
+        outlook: with the belief so far.
+        images: the hypotheses as each view would show them.
+        rng: of samples.
     """
-
-    def values(
-        self,
-        outlook: Outlook,
-        images: HypothesisImages,
-        rng: np.random.Generator,
-    ) -> Float:
-        """Return the negative mean entropy over sampled images; see ``LowestEntropy.values``.
-
-        Args:
-            outlook: with the belief so far.
-            images: the hypotheses as each view would show them.
-            rng: of samples.
-        """
-        belief = outlook.hypotheses.belief
-        truths = rng.choice(len(belief), SAMPLES, p=belief)
-        seen = _simulated(outlook, images, truths, rng)
-        return -_entropies(outlook, images, seen).mean(1)
+    belief = outlook.hypotheses.belief
+    truths = rng.choice(len(belief), SAMPLES, p=belief)
+    seen = _simulated(outlook, images, truths, rng)
+    return -_entropies(outlook, images, seen).mean(1)
 
 
-class PredictedEntropy(LowestEntropy):
-    """Chooses the view with the largest expected reduction of entropy, from predicted views.
+def predicted_entropy(
+    outlook: Outlook, images: HypothesisImages, rng: np.random.Generator
+) -> Float:
+    """Return the expected reduction of entropy by predicted views, (V,), less near the last one.
 
     Borotschnig, Paletta, Prantl and Pinz, "Appearance-based active object recognition", Image and
     Vision Computing 18, 2000: each hypothesis predicts its own view without noise, the reductions
     of entropy are weighted by the belief, and small motions are discouraged.
+
+    Args:
+        outlook: with the belief so far.
+        images: the hypotheses as each view would show them.
+        rng: not used.
     """
+    belief = outlook.hypotheses.belief
+    seen = _simulated(outlook, images, np.arange(len(belief)), None)
+    before = _entropy(belief[None], outlook.hypotheses.things)[0]
+    gained = before - _entropies(outlook, images, seen) @ belief
 
-    def values(
-        self,
-        outlook: Outlook,
-        images: HypothesisImages,
-        rng: np.random.Generator,
-    ) -> Float:
-        """Return the expected reduction, less near the current view; see ``LowestEntropy.values``.
-
-        Args:
-            outlook: with the belief so far.
-            images: the hypotheses as each view would show them.
-            rng: not used.
-        """
-        belief = outlook.hypotheses.belief
-        seen = _simulated(outlook, images, np.arange(len(belief)), None)
-        before = _entropy(belief[None], outlook.hypotheses.things)[0]
-        gained = before - _entropies(outlook, images, seen) @ belief
-
-        lengths = np.linalg.norm(images.origins, axis=1, keepdims=True)
-        arc = np.arccos(np.clip(images.origins / lengths @ outlook.towards, -1, 1))
-        return gained * (1 - np.exp(-((arc / STEP_SCALE) ** 2)))
+    lengths = np.linalg.norm(images.origins, axis=1, keepdims=True)
+    arc = np.arccos(np.clip(images.origins / lengths @ outlook.towards, -1, 1))
+    return gained * (1 - np.exp(-((arc / STEP_SCALE) ** 2)))
 
 
 def _simulated(
@@ -334,8 +310,8 @@ def rules_of(sphere: Viewpoints, grid: ViewSphere) -> dict[str, Callable[[], Pol
         "fixed": lambda: RingSteps(grid),
         "ring": lambda: RingSteps(grid, 1),
         "geometry": lambda: DiscriminateGeometry(sphere),
-        "sampled": lambda: SampledInformation(sphere),
-        "predicted": lambda: PredictedEntropy(sphere),
+        "sampled": lambda: LowestEntropy(sphere, sampled_information),
+        "predicted": lambda: LowestEntropy(sphere, predicted_entropy),
     }
 
 

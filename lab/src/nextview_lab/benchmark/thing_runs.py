@@ -4,7 +4,7 @@ Workers import this module, so it imports neither pandas nor matplotlib.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,10 @@ import msgspec
 import numpy as np
 
 from nextview.checks import number, whole
-from nextview.errors import DatasetError, PolicyError, UsageError, option
+from nextview.errors import DatasetError, PolicyError, UsageError
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
 from nextview.simulation.sensor import sensor_named
-from nextview.things.surface import Surface
 from nextview_lab.benchmark.jobs import Job, Settings
 from nextview_lab.benchmark.thing_episodes import (
     EPISODE_SPHERE,
@@ -38,7 +37,7 @@ from nextview_lab.benchmark.thing_policies import (
 SCAN_APART = 0.2  # radii, largest distance between a scan and the taught surface
 
 
-class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ThingRun(msgspec.Struct, frozen=True):
     """Results of one policy in one episode.
 
     Attributes:
@@ -48,7 +47,6 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         p_value: share of known things that are explained as badly after each view; None if it was
             not fitted.
         decision: CPU time of each choice, seconds.
-        verification: CPU time of each verification, seconds.
         pose_error: mean distance of the surface (ADD-S), millimetres, after each view; None if the
             thing is not named correctly.
     """
@@ -58,7 +56,6 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confidence: list[float]
     p_value: list[float | None]
     decision: list[float]
-    verification: list[float]
     pose_error: list[float | None]
 
 
@@ -99,11 +96,10 @@ def run(
     }
 
     while True:
-        found, seconds = episode.verified(views)
+        found = episode.verified(views)
         made["right"].append(episode.named_right(views))
         made["confidence"].append(float(found.belief.max()))
         made["p_value"].append(episode.p_value(views))
-        made["verification"].append(seconds)
         made["pose_error"].append(episode.pose_error(views))
         if len(views) == count:
             return ThingRun(views=views, **made)
@@ -223,7 +219,14 @@ def work(job: ThingJob) -> None:
     runs: dict[str, list[ThingRun]] = {} if before is None else before.runs
     # The upper bound comes first, as it verifies views that the others use.
     for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
-        runs[name] = replayed(episode, name, chosen[name], job)
+        rng = np.random.default_rng(
+            (how.seed, job.thing, job.draw, crc32(name.encode()))
+        )
+        times = how.repeats if name == "random" else 1
+        runs[name] = [
+            run(episode, chosen[name](episode), how.views[-1], rng)
+            for _ in range(times)
+        ]
     job.write(EpisodeRuns(things.names[job.thing], job.draw, runs))
 
 
@@ -249,45 +252,13 @@ def scan_of(
     surface = things.surface(thing)
     if surface is None:
         return mesh
-    if _apart(mesh, surface) <= SCAN_APART:
-        return mesh
-
-    for other in UNITS:
-        if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
-            raise DatasetError(
-                f"{file}: is not in {unit}: another size was taught; give"
-                f" {option('unit', other)}"
-            )
-    raise DatasetError(
-        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
-        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught"
-    )
-
-
-def _apart(mesh: Mesh, surface: Surface) -> float:
-    """Return the distance between the corners of two bounding boxes, radii of the surface."""
+    # corners of two bounding boxes
     ours = mesh.vertices * mesh.radius + mesh.centre
     boxes = [np.stack([one.min(0), one.max(0)]) for one in (ours, surface.vertices)]
-    return float(np.abs(boxes[0] - boxes[1]).max() / surface.radius)
-
-
-def replayed(
-    episode: ThingEpisode,
-    name: str,
-    make: Callable[[ThingEpisode], Policy],
-    job: ThingJob,
-) -> list[ThingRun]:
-    """Return the runs of one policy in one episode.
-
-    Args:
-        episode: the thing.
-        name: of the policy.
-        make: creates the policy for an episode.
-        job: first views and rules of all episodes.
-    """
-    rng = np.random.default_rng(
-        (job.settings.seed, job.thing, job.draw, crc32(name.encode()))
+    if np.abs(boxes[0] - boxes[1]).max() <= SCAN_APART * surface.radius:
+        return mesh
+    raise DatasetError(
+        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
+        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught."
+        f" Is it in {unit}?"
     )
-    times = job.settings.repeats if name == "random" else 1
-    views = job.settings.views[-1]
-    return [run(episode, make(episode), views, rng) for _ in range(times)]

@@ -33,20 +33,16 @@ MOST_WHOLE_COLUMNS = 7  # of a table with its intervals; the page has them all
 NAME_SHARE = 3  # the names of methods take this part of a line at most: a third
 
 
-def print_classes(found: ClassResults) -> None:
-    """Print the leaderboard, then raise an error if any policy failed."""
-    print_leaderboard(found)
-    if found.settings["failures"]:
-        raise EntryError("; ".join(found.settings["failures"].values()))
+def print_classes(results: ClassResults) -> None:
+    """Print the policies at the headline threshold, and the conclusions of the tests.
 
-
-def print_leaderboard(results: ClassResults) -> None:
-    """Print the policies at the headline threshold, and the conclusions of the tests."""
+    Then raise an error if any policy failed.
+    """
     tables = results.tables
     reference = results.settings["reference"]
     terminal = Terminal()
 
-    if not tables.sweep.empty:
+    if tables.choosing():
         at = board.headline_threshold(results.settings["thresholds"])
         print_tables([_policies(board.leaderboard(tables, at), at, reference)])
         terminal.print(
@@ -69,6 +65,8 @@ def print_leaderboard(results: ClassResults) -> None:
             terminal.print(
                 f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised."
             )
+    if results.settings["failures"]:
+        raise EntryError("; ".join(results.settings["failures"].values()))
 
 
 def _policies(rows: list[Any], threshold: float, reference: str) -> WrittenTable:
@@ -103,8 +101,8 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> WrittenTable
 def print_compared(found: ComparedTables) -> None:
     """Print a table for each board, in 80 columns, and the conclusions of the tests."""
     terminal = Terminal()
+    stars = significant(found)
     for each in found.boards:
-        stars = significant(found, each.name)
         columns = {
             name: replace(column, measures=column.measures[:1])
             for name, column in each.narrow().items()

@@ -9,6 +9,7 @@ import numpy as np
 from nextview.cli.common_options import NamedSplit, Workers
 from nextview.cli.progress import console, follow, say_done, track_all
 from nextview.errors import DatasetError, ModelError, UsageError
+from nextview.geometry.mesh import MAX_FACES
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.model_card import RECOGNISER, find_card, find_models
 from nextview_lab.data import measures as view_measures
@@ -17,6 +18,7 @@ from nextview_lab.data import store as view_store
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects
 from nextview_lab.data.store import ViewStore
+from nextview_lab.data.surfaces import mesh_views
 
 
 def render(
@@ -99,6 +101,8 @@ def measure(
     store: Path,
     /,
     measures: tuple[str, ...] = (),
+    meshes: Path | None = None,
+    max_faces: int = MAX_FACES,
     split: NamedSplit | None = None,
     held_out: str | None = None,
     objects: int | None = None,
@@ -112,20 +116,26 @@ def measure(
     Args:
         store: view store made by nextview-lab render.
         measures: names of measures (see nextview-lab list measures), or MODULE:FUNCTION for your
-            own; by default all that need only the depth.
+            own; by default all that need only the depth or, with --meshes, all.
+        meshes: dataset folder that the store was rendered from, for measures that need the meshes.
+        max_faces: largest number of triangles in a mesh, as for nextview-lab render.
         split: measure only this split.
         held_out: measure only objects that this model (name or card) held out of its training.
         objects: measure only this number of evenly spaced objects; a later run with twice the
             number includes the same objects.
         overwrite: recompute existing values.
     """
-    select = some_objects(ViewStore.open(store), split, held_out, objects)
+    opened = ViewStore.open(store)
+    views: view_measures.MeasuredViews = view_measures.depth_views
+    if meshes is not None:
+        views = mesh_views(opened, meshes, max_faces)
     steps = view_measures.measure(
         store,
         measures,
         **vars(workers),
-        objects=select,
+        objects=some_objects(opened, split, held_out, objects),
         overwrite=overwrite,
+        views=views,
     )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)

@@ -20,7 +20,6 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 from nextview_lab.data.store import DEPTH_UNIT, ViewStore, opened, writing
 from nextview_lab.errors import MeasureError
 
-Made = dict[str, Float32]  # values of one object, by array name
 QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
@@ -257,24 +256,36 @@ def measure(
     names = names_of(names, views is not depth_views)
     # raises an error if it is missing, before any work is done
     ViewStore.open(path).array("depth")
-    function = partial(_measure, names, views)
-    yield from keep(
-        path,
-        [f"measures/{name}" for name in names],
-        function,
-        workers,
-        scheduler,
-        objects,
-        overwrite,
-    )
+    arrays = [f"measures/{name}" for name in names]
+    with writing(path):
+        store = ViewStore.open(Path(path).absolute())
+        wanted = store.done & (
+            True if objects is None else np.isin(np.arange(len(store)), objects)
+        )
+        for array in arrays:
+            if overwrite:
+                store.remove(array)
+            store.add(array)
+
+        held = np.all([store.held(array) for array in arrays], axis=0)
+        try:
+            yield from counted(
+                partial(_measure, names, views, store.path),
+                np.flatnonzero(wanted & ~held).tolist(),
+                int(wanted.sum()),
+                lambda i: f"{path}: {store.names[i]}",
+                workers,
+                scheduler,
+            )
+        finally:  # remove arrays without any values
+            for array in arrays:
+                if not store.held(array).any():
+                    store.remove(array)
 
 
-def _measure(
-    names: tuple[str, ...],
-    views: MeasuredViews,
-    store: ViewStore,
-    i: int,
-) -> Made:
+def _measure(names: tuple[str, ...], views: MeasuredViews, path: Path, i: int) -> None:
+    """Compute measures of the views of an object, and write them to its store."""
+    store = opened(path)
     object_name = store.names[i]
     functions = {name: find_measure(name) for name in names}
     values = {name: np.empty(len(store.sphere), np.float32) for name in names}
@@ -300,66 +311,4 @@ def _measure(
                 f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not"
                 " finite"
             )
-    return {f"measures/{name}": found for name, found in values.items()}
-
-
-def keep(
-    path: Path,
-    names: Sequence[str],
-    function: Callable[[ViewStore, int], Made],
-    workers: int | None = None,
-    scheduler: str | None = None,
-    objects: Index | None = None,
-    overwrite: bool = False,
-) -> Iterator[tuple[int, int]]:
-    """Compute arrays for the objects that lack them and write them to the store.
-
-    Args:
-        path: of the store.
-        names: of the arrays.
-        function: called with the store and a row; returns the values of the arrays.
-        workers: number of processes; None for one per core, 0 for this process.
-        scheduler: address of a dask.distributed scheduler to use instead.
-        objects: rows of the objects, (n,) int64; None for all.
-        overwrite: whether to recompute existing values.
-
-    Yields:
-        Number of finished objects, and the total.
-    """
-    with writing(path):
-        store = ViewStore.open(Path(path).absolute())
-        wanted = store.done & (
-            True if objects is None else np.isin(np.arange(len(store)), objects)
-        )
-        for name in names:
-            if overwrite:
-                store.remove(name)
-            store.add(name)
-
-        held = np.all([store.held(name) for name in names], axis=0)
-        items = np.flatnonzero(wanted & ~held).tolist()
-        total = int(wanted.sum())
-        work = partial(_keep_object, store.path, function)
-
-        try:
-            yield from counted(
-                work,
-                items,
-                total,
-                lambda i: f"{path}: {store.names[i]}",
-                workers,
-                scheduler,
-            )
-        finally:  # remove arrays without any values
-            for name in names:
-                if not store.held(name).any():
-                    store.remove(name)
-
-
-def _keep_object(
-    path: Path,
-    function: Callable[[ViewStore, int], Made],
-    i: int,
-) -> None:
-    store = opened(path)
-    store.write(i, function(store, i))
+    store.write(i, {f"measures/{name}": found for name, found in values.items()})

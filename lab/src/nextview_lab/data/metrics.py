@@ -1,7 +1,6 @@
 """Accuracy, calibration error, and the errors of predicted maps and of poses."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nextview.types import Float, Floats, Index, Mask
@@ -45,22 +44,6 @@ def class_mean(top: Float, bottom: Float, labels: Index, weights: Float) -> Floa
         return total / classes
 
 
-def mean_over_classes(values: NDArray, labels: Index) -> float:
-    """Average values in each class, then over the classes.
-
-    Args:
-        values: any shape.
-        labels: class of each value, the same shape.
-
-    Returns:
-        The mean over the classes that occur.
-    """
-    top = np.asarray(values, np.float64).reshape(-1, 1)
-    return float(
-        class_mean(top, np.ones_like(top), labels.ravel(), np.ones((1, len(top))))[0, 0]
-    )
-
-
 def accuracy(answers: Index, labels: Index) -> dict[str, float]:
     """Return the accuracy over all answers and as the mean over classes.
 
@@ -72,9 +55,10 @@ def accuracy(answers: Index, labels: Index) -> dict[str, float]:
         "instance": over all; "class": mean over classes. Both rounded to four decimals.
     """
     right = answers == labels
+    of_classes = [right[labels == label].mean() for label in np.unique(labels)]
     return {
         "instance": round(float(right.mean()), 4),
-        "class": round(mean_over_classes(right, labels), 4),
+        "class": round(float(np.mean(of_classes)), 4),
     }
 
 
@@ -93,14 +77,11 @@ def recogniser_scores(logits: Floats, labels: Index) -> dict[str, dict[str, floa
     return {"single_view": accuracy(logits.argmax(2), spread), "all_views_fused": fused}
 
 
-def reliability(
-    confidence: Float,
-    right: Mask,
-    bins: int = 15,
-) -> tuple[Float, Float, Index]:
-    """Return the confidence and the accuracy in bins of equal width.
+def calibration_error(confidence: Float, right: Mask, bins: int = 15) -> float:
+    """Return the expected calibration error.
 
-    Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
+    It is the mean gap between confidence and accuracy over bins of equal width (Guo et al., On
+    calibration of modern neural networks, 2017, section 2).
 
     Args:
         confidence: of each answer, (N,), 0 to 1.
@@ -108,32 +89,11 @@ def reliability(
         bins: number of bins.
 
     Returns:
-        Mean confidence, accuracy and number of answers of each bin, (bins,) each.
-    """
-    at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
-    count = np.bincount(at, minlength=bins)
-    some = np.maximum(count, 1)
-    return (
-        np.bincount(at, confidence, bins) / some,
-        np.bincount(at, right, bins) / some,
-        count,
-    )
-
-
-def calibration_error(confidence: Float, right: Mask) -> float:
-    """Return the expected calibration error.
-
-    It is the mean gap between confidence and accuracy over the bins of ``reliability``.
-
-    Args:
-        confidence: of each answer, (N,), 0 to 1.
-        right: whether each answer is right, (N,) bool.
-
-    Returns:
         The error, 0 to 1.
     """
-    sure, accuracy, count = reliability(confidence, right)
-    return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
+    at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
+    gaps = np.bincount(at, confidence, bins) - np.bincount(at, right, bins)
+    return float(np.abs(gaps).sum() / max(1, len(at)))
 
 
 # scores of a map, and their digits on a card

@@ -18,8 +18,6 @@ each pixel, 0 for none |
 | NAME-meta.mat, meta/NAME.mat | YCB-Video, GraspNet: poses of the things in the image of labels |
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,7 +31,6 @@ from PIL import Image
 
 from nextview.captured.bop_scene import (
     EVERY_SCENE_CAMERAS,
-    BopCamera,
     BopFiles,
     BopObject,
     bop_files,
@@ -151,7 +148,9 @@ def real_frames(
     named = beside / NAMES
     names = named.read_text().split() if named.exists() else []
     if next(folder.glob(EVERY_SCENE_CAMERAS), None):
-        return [frame for files in bop_files(folder) for frame in _bop(files, names)]
+        return [
+            frame for files in bop_files(folder) for frame in bop_frames(files, names)
+        ]
 
     told: dict[str, list[Told]] = {}
     if (beside / TRUTH).exists():
@@ -219,37 +218,28 @@ def write_frames(folder: Path, intrinsics: Float, shots: Mapping[str, Shot]) -> 
     write_record(folder / TRUTH, {name: told for name, (_, _, told) in shots.items()})
 
 
-def bop_frame(
-    files: BopFiles,
-    camera: BopCamera,
-    image: int,
-    pose: Float | None = None,
-) -> CapturedFrame:
-    """An image of BOP, as yet unread.
+def bop_frames(files: BopFiles, names: Sequence[str] = ()) -> list[RealFrame]:
+    """Find the images of a scene of BOP, or of one of its cameras, in order.
 
     Args:
         files: of the scene.
-        camera: of the image.
-        image: its number.
-        pose: of the camera in the world, (4, 4), metres; None: the camera is the world.
+        names: of the models, by their numbers.
+
+    Raises:
+        DatasetError: a file is missing or damaged.
     """
-    name = f"{image:06d}"
-    return CapturedFrame(
-        name,
-        DepthFile(files.depth(name)),
-        camera.depth_scale * MILLIMETRES,
-        camera.intrinsics,
-        np.eye(4) if pose is None else pose,
-        image=files.picture(name),
-    )
-
-
-def _bop(files: BopFiles, names: Sequence[str]) -> list[RealFrame]:
-    """The frames of a camera in a scene of BOP."""
     objects = read_bop_objects(files)
     found = []
     for image, camera in sorted(read_bop_cameras(files).items()):
-        captured = bop_frame(files, camera, image)
+        name = f"{image:06d}"
+        captured = CapturedFrame(
+            name,
+            DepthFile(files.depth(name)),
+            camera.depth_scale * MILLIMETRES,
+            camera.intrinsics,
+            np.eye(4),
+            image=files.picture(name),
+        )
         here = objects.get(image, [])
         things = partial(_bop_things, files, captured, here, names)
         found.append(RealFrame(files.folder, captured, things))

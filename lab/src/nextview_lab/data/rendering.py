@@ -1,6 +1,5 @@
 """Render a dataset into a view store, in parallel and resumable."""
 
-import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -23,7 +22,6 @@ from nextview.geometry.mesh import (
     UNITS,
     Mesh,
     load_mesh,
-    mesh_warnings,
 )
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, rotation_z
@@ -49,13 +47,10 @@ from nextview_lab.data.store import (
 AnySensor = Sensor | SensorMix | None
 # bytes, largest chunk for the compressor, including its overhead
 LARGEST_CHUNK = 2**31 - 2**20
-ODD_MESHES = 10  # largest number of meshes that are named in warnings
 # largest depth that can be stored, object radii
 FARTHEST_STORED = np.iinfo(np.uint16).max * DEPTH_UNIT
 # separates the random numbers of sensors from those of deformations: larger than a byte of a name
 SENSING = 256
-
-_log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
@@ -140,8 +135,6 @@ class RenderOptions:
         seed: seed of the deformations and of the sensor errors; those of an object depend only on
             the seed and its name.
         deform: Random deformations of each mesh.
-        noise_seed: separate seed of the sensor errors, to render the same objects with other
-            errors.
         sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md); by default
             renders are free of noise.
         unit: unit of length of the mesh files (mm, cm, inch, foot, m), so that sizes are known
@@ -155,7 +148,6 @@ class RenderOptions:
 
     seed: int = 0
     deform: Deform = Deform()
-    noise_seed: int | None = None
     sensor: str | None = None
     unit: str | None = None
     split: str | None = None
@@ -204,8 +196,7 @@ def render(
         with ThreadPoolExecutor() as pool:
             hashes = list(pool.map(_hash, [e.path for e in entries]))
         recipe = {
-            name: getattr(options, name)
-            for name in ("seed", "noise_seed", "unit", "largest_part")
+            name: getattr(options, name) for name in ("seed", "unit", "largest_part")
         } | vars(options.deform)
         recipe |= {
             "sha256": hashes,
@@ -221,19 +212,15 @@ def render(
             key=lambda i: -entries[i].path.stat().st_size,
         )
         items = [(i, entries[i]) for i in todo]
-        odd: list[str] = []
         for (i, entry), result in each(
             partial(_render_entry, path, options, sensor),
             items,
             workers,
             scheduler,
         ):
-            reason: str | None
-            if isinstance(result, WorkerDied):
-                reason = f"{entry.path}: {result}"
-            else:
-                reason, doubts = result
-                odd += [f"{entry.path}: {'; '.join(doubts)}"] if doubts else []
+            reason: str | None = (
+                f"{entry.path}: {result}" if isinstance(result, WorkerDied) else result
+            )
             others = {
                 name: said
                 for name, said in store.attributes.failures.items()
@@ -247,18 +234,6 @@ def render(
             elif len(others) < len(store.attributes.failures):
                 store.note(failures=others)
             yield entry.name, reason
-    _warn(odd)
-
-
-def _warn(odd: list[str]) -> None:
-    """Log a sentence about each unusual mesh; only the first ones of many."""
-    for sentence in sorted(odd)[:ODD_MESHES]:
-        _log.warning("%s", sentence)
-    if len(odd) > ODD_MESHES:
-        _log.warning(
-            "and %d more meshes look odd; nextview recognise says it of each",
-            len(odd) - ODD_MESHES,
-        )
 
 
 def _check(
@@ -275,7 +250,6 @@ def _check(
         int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))),
     )
     whole(options.seed, "the seed", 0, 2**63 - 1)
-    whole(options.noise_seed or 0, "the seed of the noise", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
 
     if options.unit not in (None, *UNITS):
@@ -386,23 +360,19 @@ def _render_entry(
     options: RenderOptions,
     sensor: AnySensor,
     item: tuple[int, Entry],
-) -> tuple[str | None, tuple[str, ...]]:
-    """Render one object into the store.
-
-    Returns:
-        The reason if its mesh cannot be used; and sentences about unusual properties.
-    """
+) -> str | None:
+    """Render one object into the store; the reason if its mesh cannot be used."""
     i, entry = item
     store = opened(path)
     try:
-        rendered, doubts = _rendered(store, options, sensor, entry)
+        rendered = _rendered(store, options, sensor, entry)
     except (MeshError, DatasetError) as error:
-        return str(error), ()
+        return str(error)
     except MemoryError:
-        return f"{entry.path}: too large for this machine's memory", ()
+        return f"{entry.path}: too large for this machine's memory"
     # the status is written last, when the object is complete
     store.write(i, rendered | {"status": np.array(DONE, np.uint8)})
-    return None, doubts
+    return None
 
 
 def _rendered(
@@ -410,19 +380,17 @@ def _rendered(
     options: RenderOptions,
     sensor: AnySensor,
     entry: Entry,
-) -> tuple[dict[str, NDArray], tuple[str, ...]]:
-    """Return the stored arrays of an object, and unusual properties of its mesh."""
+) -> dict[str, NDArray]:
+    """Return the stored arrays of an object."""
     sphere = store.sphere
     size = store.attributes.size
-    seed = options.seed if options.noise_seed is None else options.noise_seed
-    rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
+    rng = np.random.default_rng([options.seed, SENSING, *entry.name.encode()])
     read = load_mesh(
         entry.path,
         unit=options.unit,
         max_faces=options.max_faces,
         largest_part=options.largest_part,
     )
-    doubts = mesh_warnings(read)
     mesh = deformed(store, read, entry.name)
     camera: Camera = (
         SimulatedCamera(mesh, size, sphere.distance)
@@ -432,4 +400,4 @@ def _rendered(
     # A store keeps the lengths of the files, whose unit may be specified later.
     metres = 1.0 if options.unit is None else UNITS[options.unit]
     radius = np.array(mesh.radius / metres)
-    return render_object(camera, sphere, size) | {"radius": radius}, doubts
+    return render_object(camera, sphere, size) | {"radius": radius}

@@ -60,8 +60,7 @@ class Attributes(msgspec.Struct, omit_defaults=True):
         azimuths: views on each ring.
         distance: from the camera to the object centre, object radii.
         size: side of the images, pixels.
-        seed: seed of the points, and of random rotations and stretches.
-        noise_seed: seed of the sensor errors; None if it is ``seed``.
+        seed: of the points, of random rotations and stretches, and of the sensor errors.
         stretch: each axis is scaled by a random factor from 1/(1 + stretch) to 1 + stretch.
         rotated: whether each object is rotated at random about the vertical.
         largest_part: whether only the largest connected part of each mesh is kept.
@@ -85,7 +84,6 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     distance: Annotated[float, Meta(gt=1, lt=1e300)]
     size: Pixels
     seed: Annotated[int, Meta(ge=0)] = 0
-    noise_seed: Annotated[int, Meta(ge=0)] | None = None
     stretch: Annotated[float, Meta(ge=0, lt=1e300)] = 0.0
     rotated: bool = False
     largest_part: bool = False

@@ -10,7 +10,7 @@ from PIL import Image
 
 from nextview.captured.frames import NO_DEPTH
 from nextview.checks import number
-from nextview.errors import ResultsError, UsageError
+from nextview.errors import UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera, pinhole_matrix
@@ -54,7 +54,6 @@ def write_capture(
         Number of finished views.
     """
     number(radius, "the object radius, in metres,", above=0)
-    _check_others(folder, len(sphere), masks)
     if (
         farthest := radius * (CAMERA_DISTANCE + max(1.0, 1.5 * TABLE_HALF_SIDE * table))
     ) > DEPTH_STEP * NO_DEPTH:
@@ -136,21 +135,3 @@ def _write_images(
     if masks:
         mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)
         Image.fromarray(mask).save(folder / f"mask_visib/{index:06d}_000000.png")
-
-
-def _check_others(folder: Path, views: int, masks: bool) -> None:
-    """Reject a folder with images that would be mistaken for those of the new views.
-
-    Raises:
-        ResultsError: it contains colour or grey images of views with these numbers, or masks
-            although none are written.
-    """
-    others = {"rgb": "", "gray": ""} | ({} if masks else {"mask_visib": "_*"})
-    for name, end in others.items():
-        for i in range(views):
-            found = next(folder.glob(f"{name}/{i:06d}{end}.*"), None)
-            if found is not None:
-                what = "an image that would be taken for one of the new views"
-                raise ResultsError(
-                    f"{found}: is {what}; remove the folder {name}, or give another one"
-                )

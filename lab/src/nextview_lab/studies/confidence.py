@@ -7,8 +7,6 @@ share of such names that are right, without those on strangers; and the share of
 get such a name: things with known pixels that nobody taught. With 95 % Wilson intervals.
 """
 
-from __future__ import annotations
-
 import csv
 from itertools import pairwise
 from pathlib import Path

@@ -7,8 +7,6 @@ Each folder FRAMES/SENSOR-DISTANCE has a frame of each thing as it may come to r
 degrees above, by each sensor from the same side at each distance, with its pixels and its pose.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -18,8 +18,6 @@ given again: the manifest is written last, and a folder without it is no archive
 SCANS holds NAME.ply, metres. MuJoCo is needed: ``pip install './lab[arm]'``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -22,8 +22,6 @@ more pixels of a picture of 64 x 64; so a view chosen at random often tells noth
 two files a pair, in one frame of reference, and ``pairs.csv``; the table of pairs is printed.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ cut, by what is around a thing, by how many things its frame shows, and by its d
 of a network of ``nextview-lab train segmentation``; without it the bundled one is asked.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,14 +1,11 @@
-"""What studies share: scans, results line by line, intervals of shares, progress."""
+"""What studies share: scans, and progress."""
 
-from __future__ import annotations
-
-import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rich.progress import track
 
@@ -18,7 +15,6 @@ from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 
 SECONDS_BETWEEN_LINES = 30.0  # of progress, where there is no terminal
 Item = TypeVar("Item")
-Asked = TypeVar("Asked", bound=tuple)
 
 
 def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
@@ -44,58 +40,6 @@ def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
 def mesh_of(scan: Path) -> Mesh:
     """A scan in metres, called as its file."""
     return replace(load_mesh(scan, unit="m"), name=scan.stem)
-
-
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The results in a file, one in each line; none if there is no file.
-
-    What a run that was killed left of its last line is cut off.
-    """
-    if not path.exists():
-        return []
-    written = path.read_bytes()
-    whole = written.rfind(b"\n") + 1
-    if whole < len(written):
-        with path.open("r+b") as file:
-            file.truncate(whole)
-    return [json.loads(line) for line in written[:whole].splitlines()]
-
-
-def results(
-    path: Path,
-    fields: Sequence[str],
-    asked: Sequence[Asked],
-    run: Callable[[Asked], dict[str, Any]],
-    what: str,
-) -> list[dict[str, Any]]:
-    """Results of all that is asked for; what a file holds already is not run again.
-
-    Args:
-        path: JSON lines, to which each result is added as soon as it is there.
-        fields: names of the values by which a result is known; they begin its line.
-        asked: tuples of these values.
-        run: returns the rest of the line.
-        what: is run, for the progress that is shown.
-
-    Returns:
-        A line for each that is asked for, in their order.
-    """
-
-    def key(values: Any) -> str:
-        return json.dumps(values, default=asdict)
-
-    known = {
-        key([line.get(name) for name in fields]): line for line in read_lines(path)
-    }
-    missing = [item for item in asked if key(item) not in known]
-    with path.open("a") as file:
-        for item in progress(missing, what) if missing else ():
-            known_by = dict(zip(fields, item, strict=True))
-            line = json.dumps(known_by | run(item), default=asdict)
-            file.write(f"{line}\n")
-            file.flush()
-            known[key(item)] = json.loads(line)
-    return [known[key(item)] for item in asked]
 
 
 def progress(items: Sequence[Item], what: str) -> Iterator[Item]:

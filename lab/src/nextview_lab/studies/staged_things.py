@@ -14,8 +14,6 @@ that a thing on a spoon or in a bowl touches what is seen. All lengths are in me
 level, a table of uneven planks has its top near a height of 0, and things are near the z axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -31,6 +29,9 @@ from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
 
 from nextview_lab.extras import extras
+
+with extras():
+    import mujoco
 
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -102,13 +103,6 @@ class Staging:
     stays: Callable[[Any, Any], bool]
 
 
-def physics() -> Any:
-    """MuJoCo, which is imported when something is staged."""
-    with extras():
-        import mujoco
-    return mujoco
-
-
 @cache
 def scan_of(folder: str, name: str) -> trimesh.Trimesh:
     """The scan of a thing, metres."""
@@ -158,8 +152,6 @@ def add_scan(
     scale: float = 1.0,
 ) -> None:
     """Add a scan to a scene, free to fall unless its place and rotation are given."""
-    mujoco = physics()
-
     body = spec.worldbody.add_body(name=body_name)
     if pose is None:
         body.add_freejoint()
@@ -187,8 +179,6 @@ def add_box(
     body: Any, low: Sequence[float], high: Sequence[float], turn: Float | None = None
 ) -> None:
     """Add a box to a body by two opposite corners, (3,), metres, and its rotation, (3, 3)."""
-    mujoco = physics()
-
     corners = rounded([low, high])
     box = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX)
     box.pos = corners.mean(0)
@@ -199,8 +189,6 @@ def add_box(
 
 def room(rng: np.random.Generator, table: bool = True) -> Any:
     """A floor and four walls, with a table of uneven planks whose top is near 0."""
-    mujoco = physics()
-
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.002
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -276,8 +264,6 @@ def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
 
 def touching(model: Any, data: Any) -> dict[str, float]:
     """What the thing touches, by names of bodies, and the normal force of each, newtons."""
-    mujoco = physics()
-
     forces: dict[str, float] = {}
     for number, contact in enumerate(data.contact):
         names = [
@@ -320,11 +306,6 @@ class Actor:
         """Join a scene."""
         add_scan(spec, "thing", pieces_of(self.folder, self.name), self.scan, pose)
 
-    def in_some_stable_pose(self, rng: np.random.Generator) -> Float:
-        """A rotation, (3, 3), in which it rests on any side of its hull that it can rest on."""
-        ups, _ = stable_ups(self.scan)
-        return with_up(ups[rng.integers(len(ups))], rng)
-
 
 def alone(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls on a table."""
@@ -338,11 +319,14 @@ def shelf(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls in a compartment of 36 x 70 x 42 cm that is open towards +x."""
     spec = room(rng, table=False)
     world = spec.worldbody
-    add_box(world, (-0.2, -0.37, -FLOOR_DEPTH), (0.18, 0.37, 0))
-    add_box(world, (-0.2, -0.37, 0.42), (0.18, 0.37, 0.44))
-    add_box(world, (-0.2, -0.37, 0), (-0.18, 0.37, 0.42))
-    add_box(world, (-0.18, -0.37, 0), (0.18, -0.35, 0.42))
-    add_box(world, (-0.18, 0.35, 0), (0.18, 0.37, 0.42))
+    for low, high in (
+        ((-0.2, -0.37, -FLOOR_DEPTH), (0.18, 0.37, 0)),
+        ((-0.2, -0.37, 0.42), (0.18, 0.37, 0.44)),
+        ((-0.2, -0.37, 0), (-0.18, 0.37, 0.42)),
+        ((-0.18, -0.37, 0), (0.18, -0.35, 0.42)),
+        ((-0.18, 0.35, 0), (0.18, 0.37, 0.42)),
+    ):
+        add_box(world, low, high)
     actor.enters(spec)
     spot = rng.uniform((-0.05, -0.15), (0.05, 0.15))
     begin = placed(actor.scan, turned(rng), spot, 0.02)
@@ -357,7 +341,11 @@ def stack(actor: Actor, rng: np.random.Generator) -> Staging:
     under = Actor(actor.folder, name, 0).scan
     add_scan(spec, "under", pieces_of(actor.folder, name), under)
     flat = with_up(stable_ups(under)[0][0], rng)
-    turn = turned(rng) if actor.tries < 3 else actor.in_some_stable_pose(rng)
+    if actor.tries < 3:
+        turn = turned(rng)
+    else:  # on any side of its hull that it can rest on
+        ups = stable_ups(actor.scan)[0]
+        turn = with_up(ups[rng.integers(len(ups))], rng)
     above = 0.008 + np.ptp(under.vertices @ flat[2])
     starts = {
         "under": placed(under, flat, np.zeros(2), 0.003),
@@ -370,11 +358,14 @@ def in_a_bin(actor: Actor, rng: np.random.Generator) -> Staging:
     """In a box of 40 x 30 x 10 cm, with four other things, poured in any order."""
     spec = room(rng)
     box = spec.worldbody.add_body(name="bin")
-    add_box(box, (-0.205, -0.155, 0.004), (0.205, 0.155, 0.008))
-    add_box(box, (-0.205, -0.155, 0.008), (-0.2, 0.155, 0.108))
-    add_box(box, (0.2, -0.155, 0.008), (0.205, 0.155, 0.108))
-    add_box(box, (-0.2, -0.155, 0.008), (0.2, -0.15, 0.108))
-    add_box(box, (-0.2, 0.15, 0.008), (0.2, 0.155, 0.108))
+    for low, high in (
+        ((-0.205, -0.155, 0.004), (0.205, 0.155, 0.008)),
+        ((-0.205, -0.155, 0.008), (-0.2, 0.155, 0.108)),
+        ((0.2, -0.155, 0.008), (0.205, 0.155, 0.108)),
+        ((-0.2, -0.155, 0.008), (0.2, -0.15, 0.108)),
+        ((-0.2, 0.15, 0.008), (0.2, 0.155, 0.108)),
+    ):
+        add_box(box, low, high)
 
     all_names = sorted(path.stem for path in Path(actor.folder).glob("*.ply"))
     scans = {name: scan_of(actor.folder, name) for name in all_names}
@@ -496,8 +487,6 @@ STAGES: dict[Place, Callable[[Actor, np.random.Generator], Staging]] = {
 
 def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     """Let all things fall: MuJoCo's model and data; None if one still moves after 6 seconds."""
-    mujoco = physics()
-
     model = staging.spec.compile()
     data = mujoco.MjData(model)
     for name, (place, turn) in staging.starts.items():
@@ -521,8 +510,6 @@ def staged(
     place: Place, folder: str, name: str, rng: np.random.Generator
 ) -> tuple[Any, Any] | None:
     """A thing at rest where it should be: MuJoCo's model and data; None after tries in vain."""
-    mujoco = physics()
-
     for tries in range(STAGINGS_TRIED):
         staging = STAGES[place](Actor(folder, name, tries), rng)
         scene = at_rest(staging)
@@ -628,8 +615,6 @@ def looked(
     model: Any, data: Any, pose: Float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint16], Bools]:
     """Measured depth, (H, W), steps, and the pixels of the thing, (H, W)."""
-    mujoco = physics()
-
     rows, columns = np.indices(IMAGE)
     across, down = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]
     right, below, ahead = pose[:3, :3].T

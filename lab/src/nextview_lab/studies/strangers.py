@@ -12,8 +12,6 @@ counts objects that were called unknown. ``--draws`` episodes are run with each 
 own angle, first view and sensor noise.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -14,16 +14,15 @@ Errors are those of the pose in the camera's frame: the distance of the middle o
 truth, and the angle of the rotation, or between the axes of a thing that is symmetric about one. A
 frame is off if they exceed 20 mm or 15 degrees. Times are those of the processor.
 
-OUT.jsonl gets a line for each trajectory. Trajectories that it contains are not run again, so a run
-that was stopped goes on.
+OUT.jsonl gets a line for each trajectory.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +42,15 @@ from nextview.scene.objects import SceneObject
 from nextview.scene.scene import Scene
 from nextview.scene.tracker import Tracker
 from nextview.sensing.frame import Frame
-from nextview.simulation.boxes import upright_boxes
 from nextview.simulation.sensor import SENSORS
 from nextview.types import Float
-from nextview_lab.studies.shared import mesh_of, results, scans_in
+from nextview_lab.studies.shared import mesh_of, progress, scans_in
 from nextview_lab.worlds.tables import (
     PlacedThing,
     SimulatedTable,
     TableCamera,
     poses_around,
+    table_and_floor,
 )
 
 RATE = 30  # frames a second
@@ -70,7 +69,6 @@ HAND = (0.204, 0.063, 0.066)  # metres
 DEEPEST_TIPS = 0.04  # metres below the top of a thing
 HIDDEN_SECONDS = 0.5
 HAND_FROM = 0.65  # share of the way from the camera to the thing
-FIELDS = ("seed", "number")  # by which a line of the results is known
 LOST_MILLIMETRES = 20.0
 LOST_DEGREES = 15.0
 CENTRE = np.array([0, 0, 0.08])
@@ -161,7 +159,7 @@ class Trajectory:
         ]
         hand = (self.hand[0] + self.hand_places[number], self.hand[1])
         others = [one for row, one in enumerate(self.table.things) if row != self.row]
-        world = [*((one.placed, one.faces) for one in others), *_table_and_floor()]
+        world = [*((one.placed, one.faces) for one in others), *table_and_floor()]
 
         alone, _ = RayCaster([own]).cast(origin, rays)
         depth, owner = RayCaster([own, *moved, hand, *world]).cast(origin, rays)
@@ -176,14 +174,6 @@ class Trajectory:
             measured, _ = SENSOR.measure(clean, rng.spawn(1)[0])
             frame = Frame(measured, SENSOR.intrinsics, self.camera, pixel_centre=0.5)
             yield frame, share
-
-
-def _table_and_floor() -> list[Triangles]:
-    """A table whose top is z = 0, and the floor."""
-    one = np.zeros(1)
-    top = upright_boxes(np.array([[1.5, 1.1, 0.03]]), one, np.zeros((1, 2)), -0.03)
-    floor = upright_boxes(np.array([[8.0, 8.0, 0.01]]), one, np.zeros((1, 2)), -0.75)
-    return [(top.vertices, top.faces), (floor.vertices, floor.faces)]
 
 
 def _slowed(path: Float, speed: float, rate: int) -> Float:
@@ -317,10 +307,10 @@ def _named_table(
 def follow(
     system: nextview.System,
     meshes: Sequence[Mesh],
-    asked: tuple[int, int],
+    seed: tuple[int, int],
 ) -> dict[str, Any]:
-    """Track one thing along a trajectory; ``asked`` are the values of ``FIELDS``."""
-    rng = np.random.default_rng(asked)
+    """Track one thing along a trajectory."""
+    rng = np.random.default_rng(seed)
     trajectory, scene, one = _named_table(system, meshes, rng)
     table = trajectory.table
     thing = table.things[trajectory.row]
@@ -416,7 +406,7 @@ def main(
 
     Args:
         scans: folder of the scans.
-        out: JSON lines, continued if it exists.
+        out: file of JSON lines to write.
         trajectories: number.
         seed: of all draws.
         models: memory that knows the scans by their names.
@@ -428,9 +418,13 @@ def main(
             f"{scans}: fewer than {THINGS} scans have names of known things"
         )
     meshes = [mesh_of(path) for path in paths]
-    asked = [(seed, number) for number in range(trajectories)]
-    run = partial(follow, system, meshes)
-    print(summary(results(out, FIELDS, asked, run, "trajectories")))
+    lines = []
+    with out.open("x") as file:
+        for number in progress(range(trajectories), "trajectories"):
+            lines.append(follow(system, meshes, (seed, number)))
+            file.write(f"{json.dumps(lines[-1])}\n")
+            file.flush()
+    print(summary(lines))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ recogniser says.
         --validation validation.npz [--objects 300] [--runs 10] [--policies random-all gain]
 
 What the models say of the views is predicted, and what the measures say is measured before
-(nextview-lab predict, nextview-lab measure, nextview_lab.thesis.measure). Writes into the folder
+(nextview-lab predict, nextview-lab measure). Writes into the folder
 the table (measures.md) and measures.csv (every number in a row of its own).
 
 For each measure: the rank correlation, over the views of an object, of its value with the
@@ -19,8 +19,6 @@ nextview-lab benchmark has for them. Intervals are 95 % bootstrap intervals over
 sign flips against random choice in the window, over objects, corrected by Holm's method for all
 measures, policies and numbers of views together.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -103,13 +101,6 @@ def agreement(
     }
 
 
-def valleys_of(validation: Predictions, measure: str) -> tuple[int, ...]:
-    """The classes (indices) for which the valley of a true map gained on the validation objects."""
-    maps = true_map(validation, map_name(measure))
-    gains = valley_gains(validation.sphere, validation.logits, maps, validation.labels)
-    return tuple(c for c, gain in gains.items() if gain > 0)
-
-
 def study(
     test: Predictions,
     validation: Predictions,
@@ -178,7 +169,10 @@ def study(
             note(name, {"correlation": correlations(values, reference)}, labels=True)
             note(name, agreement(test, values))
             entry = f"true-{map_name(name)}"
-            valleys = valleys_of(validation, name)
+            maps = true_map(validation, map_name(name))
+            unseen = validation.sphere, validation.logits, maps, validation.labels
+            # the classes for which the valley of the true map gained on the validation objects
+            valleys = tuple(c for c, gain in valley_gains(*unseen).items() if gain > 0)
             rows.append(
                 (
                     name,
@@ -223,7 +217,9 @@ def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
         for r in table.itertuples()
         if not r.label or r.quantity == "valleys"
     }
-    names = [*ordered(table)[::-1], *others(table)]
+    correlated = table[(table["quantity"] == "correlation") & (table["label"] == "")]
+    measures = correlated.sort_values("value", kind="stable")["measure"].tolist()
+    names = [*measures[::-1], *table["measure"]]  # others as they were named
     at = ", ".join(map(str, n_views))
     head = [
         "measure",
@@ -235,7 +231,7 @@ def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
         "valley for",
     ]
     rows = []
-    for name in [RANDOM, *names]:
+    for name in dict.fromkeys([RANDOM, *names]):
         r = found.get((name, "correlation"))
         cells = [name.replace("_", " ") if r else name]
         if r is None:
@@ -266,21 +262,6 @@ def points(row: Any) -> str:
         f"{round(100 * x, 1) + 0.0:+.1f}" for x in (row.value, row.low, row.high)
     )
     return f"{value}{'*' * (row.p_holm < 0.05)} ({low} to {high})"
-
-
-def ordered(table: pd.DataFrame) -> list[str]:
-    """The measures by their correlation, the lowest first."""
-    overall = table[(table["quantity"] == "correlation") & (table["label"] == "")]
-    return overall.sort_values("value", kind="stable")["measure"].tolist()
-
-
-def others(table: pd.DataFrame) -> list[str]:
-    """The policies that are beside the measures, as they were named."""
-    return [
-        name
-        for name in table["measure"].unique()
-        if name != RANDOM and name not in ordered(table)
-    ]
 
 
 def main(

@@ -2,8 +2,6 @@
 values are good.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Literal
@@ -15,7 +13,7 @@ from scipy.fft import irfft, irfft2, rfft, rfft2
 
 from nextview_lab.data.measures import MEASURES as BUILT_IN
 from nextview_lab.data.measures import Measure, MeasuredView
-from nextview_lab.thesis.surfaces import MeshView
+from nextview_lab.data.surfaces import MeshView
 
 CURVATURES = 32
 """Steps of the arc tangent of a curvature from 0 to infinity, half as wide at both ends: a flat

@@ -6,8 +6,6 @@ Every number and every verdict on the page is worked out here from the predictio
 in.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +21,7 @@ import tyro
 from nextview.cli.exit_status import orderly_end
 from nextview.files import sha256_of
 from nextview.recognition.belief import PLAIN_SUM
+from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ClassTables, nothing_differs, summarise
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT
 from nextview_lab.benchmark.entries import default_entries
@@ -32,6 +31,15 @@ from nextview_lab.data.predictions import Predictions
 
 AT = 0.97
 BASELINES = ("random", "furthest", "unidirectional")
+# measures of two tables, and their digits
+AT_PUBLISHED = {"accuracy": 3, "class_accuracy": 3, "travel_moved": 2}
+AT_ONE = {
+    "accuracy": 3,
+    "clean_accuracy": 3,
+    "n_views": 2,
+    "travel_all": 2,
+    "arc_all": 2,
+}
 LEMS = {
     "oracle-valley": "predicted map, valley by the true class (as published)",
     "lem": "predicted map, valley by the believed class",
@@ -184,121 +192,76 @@ def page(predictions: Path, samples: int = 2000) -> str:
         for name in BASELINES[1:]
     )
     out.append(f"- **The baselines**: {'; '.join(baselines)}.")
-    out += [
-        "",
-        "## At the published thresholds",
-        "",
-        (
-            "`nextview-lab benchmark classes predictions.npz results --uncalibrated`;"
-            " `measures.csv`. Published: tables 5, 8 and 9."
-        ),
-        "",
-        (
-            "| policy | threshold | accuracy | published | class accuracy | published | travel of"
-            " the moved | published |"
-        ),
-        "|---|---|---|---|---|---|---|---|",
+    published_rows = []
+    compared = ("oracle-valley", "lem", "lcm-oracle-valley", "lcm", "lcm-peak")
+    for name in (*BASELINES, *(name for name in compared if name in ran)):
+        t = published_threshold(name) or 0.99
+        cells = []
+        for measure, digits in AT_PUBLISHED.items():
+            theirs = published(name, t, measure, table.classes)
+            cells.append(number(name, t, measure, digits))
+            cells.append("" if theirs is None else f"{theirs:.{digits}f}")
+        published_rows.append([name, t, *cells])
+    every = [
+        [name, *(number(name, AT, m, digits) for m, digits in AT_ONE.items())]
+        for name in dict.fromkeys((*BASELINES, *lems))
     ]
-    for name in (
-        *BASELINES,
-        "oracle-valley",
-        "lem",
-        "lcm-oracle-valley",
-        "lcm",
-        "lcm-peak",
-    ):
-        if name in ran:
-            t = published_threshold(name) or 0.99
-            cells = []
-            for measure, digits in (
-                ("accuracy", 3),
-                ("class_accuracy", 3),
-                ("travel_moved", 2),
-            ):
-                theirs = published(name, t, measure, table.classes)
-                cells += [
-                    number(name, t, measure, digits),
-                    "" if theirs is None else f"{theirs:.{digits}f}",
-                ]
-            out.append(f"| {name} | {t} | " + " | ".join(cells) + " |")
-    out += [
-        "",
-        f"## Every policy at threshold {AT}",
-        "",
-        "`nextview-lab benchmark classes predictions.npz results --uncalibrated`; `measures.csv`.",
-        "",
-        "| policy | accuracy | without duplicates | views | travel, all episodes | arc, radians |",
-        "|---|---|---|---|---|---|",
+    against = [
+        [name, what, *(test[b][name, AT] for b in BASELINES)]
+        for name, what in lems.items()
     ]
-    for name in dict.fromkeys((*BASELINES, *lems)):
-        measures = (
-            ("accuracy", 3),
-            ("clean_accuracy", 3),
-            ("n_views", 2),
-            ("travel_all", 2),
-            ("arc_all", 2),
-        )
-        out.append(
-            f"| {name} | "
-            + " | ".join(number(name, AT, m, digits) for m, digits in measures)
-            + " |"
-        )
-    out += [
-        "",
-        f"## Accuracy against each baseline at threshold {AT}, points",
-        "",
-        (
-            "`nextview-lab benchmark classes predictions.npz results --uncalibrated --reference"
-            " BASELINE`; `tests.csv`."
-        ),
-        "",
-        "| policy | what it knows | "
-        + " | ".join(f"against {b}" for b in BASELINES)
-        + " |",
-        "|---|---|---|---|---|",
-    ]
-    for name, what in lems.items():
-        cells = [str(test[b][name, AT]) for b in BASELINES]
-        out.append(f"| {name} | {what} | " + " | ".join(cells) + " |")
-    out += [
-        "",
-        "## Does it depend on the threshold?",
-        "",
-        "Accuracy against random, points; `tests.csv`.",
-        "",
-        "| policy | " + " | ".join(map(str, THESIS_THRESHOLDS)) + " |",
-        "|---" * (1 + len(THESIS_THRESHOLDS)) + "|",
-    ]
-    for name in (
-        name
+    by_threshold = [
+        [name, *(test["random"][name, t] for t in THESIS_THRESHOLDS)]
         for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain")
         if name in lems
-    ):
-        out.append(
-            f"| {name} | "
-            + " | ".join(str(test["random"][name, t]) for t in THESIS_THRESHOLDS)
-            + " |"
-        )
-    out += [
-        "",
-        "## Fixed views",
-        "",
-        (
-            "`measures.csv`, rows without a threshold. Published: tables 3 and 12, from a network"
-            " for 40 classes."
-        ),
-        "",
-        "| views | accuracy | class accuracy | published | views |",
-        "|---|---|---|---|---|",
     ]
+    fixed = []
     for name, paths in grid.paths.items():
         if paths.fixed:
             theirs = published(name, None, "class_accuracy", table.classes)
-            out.append(
-                f"| {name} | {number(name, None, 'accuracy')} |"
-                f" {number(name, None, 'class_accuracy')} |"
-                f" {'' if theirs is None else f'{theirs:.3f}'} | {paths.views.shape[1]} |"
-            )
+            cells = [number(name, None, m) for m in ("accuracy", "class_accuracy")]
+            beside = "" if theirs is None else f"{theirs:.3f}"
+            fixed.append([name, *cells, beside, paths.views.shape[1]])
+
+    command = "`nextview-lab benchmark classes predictions.npz results --uncalibrated"
+    for title, about, head, rows in (
+        (
+            "At the published thresholds",
+            f"{command}`; `measures.csv`. Published: tables 5, 8 and 9.",
+            "policy | threshold | accuracy | published | class accuracy | published | travel of the"
+            " moved | published",
+            published_rows,
+        ),
+        (
+            f"Every policy at threshold {AT}",
+            f"{command}`; `measures.csv`.",
+            "policy | accuracy | without duplicates | views | travel, all episodes | arc, radians",
+            every,
+        ),
+        (
+            f"Accuracy against each baseline at threshold {AT}, points",
+            f"{command} --reference BASELINE`; `tests.csv`.",
+            " | ".join(
+                ["policy | what it knows", *(f"against {b}" for b in BASELINES)]
+            ),
+            against,
+        ),
+        (
+            "Does it depend on the threshold?",
+            "Accuracy against random, points; `tests.csv`.",
+            " | ".join(["policy", *map(str, THESIS_THRESHOLDS)]),
+            by_threshold,
+        ),
+        (
+            "Fixed views",
+            "`measures.csv`, rows without a threshold. Published: tables 3 and 12, from a network"
+            " for 40 classes.",
+            "views | accuracy | class accuracy | published | views",
+            fixed,
+        ),
+    ):
+        text = markdown(head.split(" | "), rows).rstrip()
+        out += ["", f"## {title}", "", about, "", text]
     duplicates = [n for n, c in zip(table.names, table.conflicting, strict=True) if c]
     out += [
         "",

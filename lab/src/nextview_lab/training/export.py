@@ -286,8 +286,7 @@ def export_recogniser(
     spec = InputSpec(recipes[0].input, recipes[0].size)
 
     held_out = frozenset.intersection(*(frozenset(each.held_out) for each in runs))
-    validated = frozenset.intersection(*(frozenset(each.validation) for each in runs))
-    validation = np.flatnonzero(np.isin(views.names, list(validated)))
+    validation = np.flatnonzero(np.isin(views.names, list(held_out)))
     if len(validation) == 0:
         raise ModelError(
             f"{folders[0]} and the others have no validation object of {store} in common"

@@ -39,10 +39,10 @@ from nextview_lab.training.export import export_onnx
 from nextview_lab.training.fitting_set import hold_out, load_sensed
 from nextview_lab.training.recipes import GainRecipe
 from nextview_lab.training.rollout import (
-    ReplayTable,
     Value,
     candidate_values,
     fit_travel_weight,
+    for_replay,
     judge_all,
     rollout,
 )
@@ -131,7 +131,7 @@ class Score:
 
 
 def walk(
-    table: ReplayTable,
+    data: Predictions,
     policies: list[Policy],
     recipe: GainRecipe,
     rng: np.random.Generator,
@@ -139,7 +139,7 @@ def walk(
     """Collect the states when each policy is followed once over every object.
 
     Args:
-        table: the objects.
+        data: of the objects.
         policies: the policies.
         recipe: of the training.
         rng: source of all random numbers.
@@ -149,11 +149,11 @@ def walk(
         ones, (S, V) float32, with cells as in ``policies.learned_tables``; free choices, (S, V)
         bool; and the objects, (S,) int64.
     """
-    sphere = table.data.sphere
+    sphere = data.sphere
     parts = []
     for policy in policies:
         for moment in rollout(
-            table,
+            data,
             policy,
             recipe.max_views - 1,
             rng,
@@ -161,7 +161,7 @@ def walk(
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             value = np.take_along_axis(
-                candidate_values(table, moment, recipe.objective),
+                candidate_values(data, moment, recipe.objective),
                 view,
                 1,
             )
@@ -183,11 +183,11 @@ def walk(
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
-def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
+def train(data: Predictions, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
     """Train the networks of one fold.
 
     Args:
-        table: the objects of the fold.
+        data: of the objects of the fold.
         recipe: of the training.
         fold: number of the fold, which together with the seed determines all random numbers.
 
@@ -195,7 +195,6 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         After every epoch the policy, at travel weight 0 and over all views.
     """
     rng = np.random.default_rng([recipe.seed, fold])
-    data = table.data
     sphere = data.sphere
     n = len(data)
     c = len(data.classes)
@@ -234,7 +233,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     ]
 
     for _ in range(recipe.epochs):
-        *states, objects = walk(table, policies, recipe, rng)
+        *states, objects = walk(data, policies, recipe, rng)
         for batch in np.array_split(rng.permutation(len(objects)), batches):
             seen, value, free = (torch.from_numpy(values[batch]) for values in states)
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
@@ -265,7 +264,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 
 def best_epoch(
     folds: Sequence[Iterable[Gain]],
-    tables: Sequence[ReplayTable],
+    tables: Sequence[Predictions],
     recipe: GainRecipe,
 ) -> Iterator[Best]:
     """Run the training of all folds and keep the best epoch.
@@ -377,7 +376,6 @@ class TrainedGain:
     Attributes:
         card: path of its card.
         objects: number of training objects.
-        validated_on: description of the validation objects.
         value: mean objective after 2, 3, ... views at travel weight 0, (views - 1,).
         travel_weight: the chosen weight of travel.
         states: number of states in which the exported file was compared with the networks.
@@ -386,7 +384,6 @@ class TrainedGain:
 
     card: Path
     objects: int
-    validated_on: str
     value: Float
     travel_weight: float
     states: int
@@ -396,7 +393,6 @@ class TrainedGain:
 def train_gain(
     predictions: Path,
     out: Path,
-    validation: Path | None = None,
     folds: int = 20,
     travel_weight: float | None = None,
     local: bool = False,
@@ -413,10 +409,8 @@ def train_gain(
         predictions: predictions of training objects that the recogniser has not seen (nextview-lab
             predict --held-out).
         out: card to write (NAME.json); the networks are written next to it (NAME.onnx).
-        validation: predictions of other such objects, which select the epoch and the travel weight.
-            By default PREDICTIONS select them by cross-validation.
-        folds: without VALIDATION: number of folds; one policy is trained without each fold and
-            validated on it, and the result is the mean of all.
+        folds: number of folds; one policy is trained without each fold and validated on it, and the
+            result is the mean of all.
         travel_weight: weight of a grid cell of travel; by default the lowest at which the policy
             travels no farther than a random walk in the local window.
         local: choose only views of the local window.
@@ -435,7 +429,7 @@ def train_gain(
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
-    data = _load(predictions, validation, sensed, recipe, folds)
+    data = _load(predictions, sensed, recipe, folds)
     best: list[Best] = []
 
     def epochs() -> Iterator[int]:
@@ -467,7 +461,6 @@ def train_gain(
     return TrainedGain(
         out,
         data.objects,
-        data.validated_on,
         value.mean,
         travel_weight,
         len(states),
@@ -483,68 +476,32 @@ class _Data:
         about: card of a policy trained on it, without its table.
     """
 
-    learned: list[ReplayTable]
-    validated: list[ReplayTable]
+    learned: list[Predictions]
+    validated: list[Predictions]
     objects: int
-    validated_on: str
     about: PolicyCard
     rng: np.random.Generator
 
 
-def _sources(
-    predictions: Path,
-    validation: Path | None,
-    sensed: Sequence[Path],
-    recipe: GainRecipe,
-) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
-    """Open and check training and validation data."""
-    table = Predictions.load(predictions).deduplicate()
-    other = table if validation is None else Predictions.load(validation).deduplicate()
-    if (other.classes, other.sphere) != (table.classes, table.sphere):
-        raise PredictionsError(
-            f"{validation}: is of other classes or viewpoints than {predictions}"
-        )
-
-    if sensed and validation is not None:
-        raise UsageError(
-            "predictions through sensors choose with those that are learned from: no --validation"
-        )
-
-    variants = load_sensed(sensed, table)
-    sources = (
-        [(predictions, table)]
-        if validation is None
-        else [(predictions, table), (validation, other)]
-    )
-    sources += zip(sensed, variants, strict=True)
-
-    for path, p in sources:
-        _check(path, p, recipe)
-    return table, other, variants, sources
-
-
 def _load(
     predictions: Path,
-    validation: Path | None,
     sensed: Sequence[Path],
     recipe: GainRecipe,
     folds: int,
 ) -> _Data:
-    table, other, variants, sources = _sources(predictions, validation, sensed, recipe)
+    table = Predictions.load(predictions).deduplicate()
+    variants = load_sensed(sensed, table)
+    sources = [(predictions, table), *zip(sensed, variants, strict=True)]
+    for path, p in sources:
+        _check(path, p, recipe)
     everything = np.arange(len(table))
-    if validation is None:
-        # few objects have one fold each
-        folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
-        validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
-        learning = [np.setdiff1d(everything, part) for part in validating]
-        validated_on = f"the same, each judged by networks of {folds - 1} other folds"
-    else:
-        validating = [np.arange(len(other))]
-        learning = [everything[~np.isin(table.names, other.names)]]
-        validated_on = f"{len(other)} others"
+    # few objects have one fold each
+    folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
+    validating = hold_out(table.labels, table.depth_entropy, folds, recipe.seed)
+    learning = [np.setdiff1d(everything, part) for part in validating]
     rng = np.random.default_rng([recipe.seed, 1])
-    learned = [ReplayTable.select(table, part, rng, variants) for part in learning]
-    validated = [ReplayTable.select(other, part, rng, variants) for part in validating]
+    learned = [for_replay(table, part, rng, variants) for part in learning]
+    validated = [for_replay(table, part, rng, variants) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split"
     if sensed:
@@ -556,11 +513,11 @@ def _load(
         table.sphere.azimuths,
         table.classes,
         {},
-        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on"
-        f" {validated_on}",
+        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on the same, each"
+        f" judged by networks of {folds - 1} other folds",
         tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
         tuple(
-            (part.data.calibration.temperature, part.data.calibration.correlation)
+            (part.calibration.temperature, part.calibration.correlation)
             for part in learned
         ),
         asdict(recipe),
@@ -570,7 +527,7 @@ def _load(
             )
         ),
     )
-    return _Data(learned, validated, objects, validated_on, about, rng)
+    return _Data(learned, validated, objects, about, rng)
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:

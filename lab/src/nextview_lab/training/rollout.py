@@ -23,45 +23,30 @@ from nextview_lab.training.fitting_set import for_fitting
 OBJECTIVES = ("belief", "log-belief", "right")
 
 
-@dataclass(frozen=True)
-class ReplayTable:
-    """Outputs of held-out models for N objects, calibrated.
+def for_replay(
+    predictions: Predictions,
+    kept: NDArray,
+    rng: Generator,
+    sensed: Sequence[Predictions] = (),
+) -> Predictions:
+    """Select some of the objects of predictions, calibrated.
 
-    Attributes:
-        data: the predictions.
+    If their recogniser has no calibration, it is fitted here.
+
+    Args:
+        predictions: of the objects.
+        kept: indices of the objects.
+        rng: source of all random numbers.
+        sensed: predictions of the same objects through sensors.
+
+    Raises:
+        PredictionsError: no object is left.
     """
-
-    data: Predictions
-
-    @classmethod
-    def select(
-        cls,
-        predictions: Predictions,
-        kept: NDArray,
-        rng: Generator,
-        sensed: Sequence[Predictions] = (),
-    ) -> "ReplayTable":
-        """Select some of the objects of predictions.
-
-        If their recogniser has no calibration, it is fitted here.
-
-        Args:
-            predictions: of the objects.
-            kept: indices of the objects.
-            rng: source of all random numbers.
-            sensed: predictions of the same objects through sensors.
-
-        Returns:
-            The table.
-
-        Raises:
-            PredictionsError: no object is left.
-        """
-        if len(kept) == 0:
-            raise PredictionsError("no object is left to learn from")
-        parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
-        data = Predictions.joined(parts)
-        return cls(replace(data, calibration=calibration_of(data, rng)))
+    if len(kept) == 0:
+        raise PredictionsError("no object is left to learn from")
+    parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
+    data = Predictions.joined(parts)
+    return replace(data, calibration=calibration_of(data, rng))
 
 
 @dataclass(frozen=True)
@@ -82,7 +67,7 @@ class DecisionState:
 
 
 def rollout(
-    table: ReplayTable,
+    data: Predictions,
     policy: Policy,
     n_views: int,
     rng: Generator,
@@ -90,7 +75,7 @@ def rollout(
     """Follow a policy once over every object from a random first view.
 
     Args:
-        table: the N objects.
+        data: of the N objects.
         policy: the policy.
         n_views: views of each episode.
         rng: source of all random numbers.
@@ -98,8 +83,7 @@ def rollout(
     Yields:
         The state of all episodes after each view.
     """
-    data = table.data
-    sphere = table.data.sphere
+    sphere = data.sphere
 
     starts = rng.integers(len(sphere), size=len(data))
     length = FixedLength(max_views=n_views)
@@ -141,7 +125,7 @@ def rollout(
 
 
 def value_after(
-    table: ReplayTable,
+    data: Predictions,
     total: Float,
     n_views: NDArray | int,
     kind: str,
@@ -149,7 +133,7 @@ def value_after(
     """Return the value of sums of log-evidence.
 
     Args:
-        table: the N objects.
+        data: of the N objects.
         total: sums of the log-evidence of each object, (N, ..., D).
         n_views: number of views in the sums, (N, ...).
         kind: one of OBJECTIVES.
@@ -158,8 +142,8 @@ def value_after(
         Values, (N, ...) float64.
     """
     return value_of(
-        table.data.calibration.log_belief(total, n_views, len(table.data.classes)),
-        table.data.labels,
+        data.calibration.log_belief(total, n_views, len(data.classes)),
+        data.labels,
         kind,
     )
 
@@ -181,11 +165,11 @@ def value_of(logs: Float, labels: Index, kind: str) -> Float:
     return of_truth if kind == "log-belief" else np.exp(of_truth)
 
 
-def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
+def candidate_values(data: Predictions, moment: DecisionState, kind: str) -> Float:
     """Return the value of taking each view next.
 
     Args:
-        table: the N objects.
+        data: of the N objects.
         moment: the state of the episodes.
         kind: one of OBJECTIVES.
 
@@ -193,11 +177,11 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
         Values, (N, V) float64.
     """
     # a view without a visible object has no weight in the sum
-    counts = table.data.seen.astype(np.float64)
+    counts = data.seen.astype(np.float64)
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
     return value_after(
-        table,
-        moment.total[:, None] + counts[..., None] * table.data.log_evidence,
+        data,
+        moment.total[:, None] + counts[..., None] * data.log_evidence,
         n_views,
         kind,
     )
@@ -216,7 +200,7 @@ class Value(NamedTuple):
 
 
 def judge(
-    table: ReplayTable,
+    data: Predictions,
     policy: Policy,
     n_views: int,
     kind: str,
@@ -226,7 +210,7 @@ def judge(
     """Follow a policy several times over every object and return its value.
 
     Args:
-        table: the objects.
+        data: of the objects.
         policy: the policy.
         n_views: views of each episode.
         kind: one of OBJECTIVES.
@@ -236,14 +220,14 @@ def judge(
     Returns:
         Mean value and travel after 2, 3, ... views.
     """
-    weights = table.data.weights / len(table.data) / rounds
+    weights = data.weights / len(data) / rounds
     reached = np.zeros((2, n_views - 1))
     for _ in range(rounds):
-        for moment in rollout(table, policy, n_views, rng):
+        for moment in rollout(data, policy, n_views, rng):
             k = moment.state.step
             if k > 1:
                 value = value_after(
-                    table,
+                    data,
                     moment.total,
                     np.maximum(moment.seen, 1),
                     kind,
@@ -252,8 +236,8 @@ def judge(
     return Value(*reached)
 
 
-# tables, each with a policy to follow over its objects
-Judged = Sequence[tuple[ReplayTable, Policy]]
+# predictions, each with a policy to follow over their objects
+Judged = Sequence[tuple[Predictions, Policy]]
 TRAVEL_WEIGHTS = (
     0.0,
     0.0005,
@@ -280,10 +264,10 @@ def judge_all(
     seed: int | list[int],
     rounds: int = 8,
 ) -> Value:
-    """Return the mean value over the objects of several tables; see ``judge``.
+    """Return the mean value over the objects of several predictions; see ``judge``.
 
     Args:
-        judged: tables, each with its own policy.
+        judged: predictions, each with its own policy.
         n_views: views of each episode.
         kind: one of OBJECTIVES.
         seed: of the random numbers.
@@ -296,11 +280,11 @@ def judge_all(
         judge(*pair, n_views, kind, np.random.default_rng(seed), rounds)
         for pair in judged
     ]
-    return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
+    return Value(*np.average(values, 0, [len(data) for data, _ in judged]))
 
 
 def fit_travel_weight(
-    judged: Sequence[tuple[ReplayTable, Gain]],
+    judged: Sequence[tuple[Predictions, Gain]],
     n_views: int,
     kind: str,
     seed: int,
@@ -310,7 +294,7 @@ def fit_travel_weight(
     The random walk stays in the local window. The choice is among TRAVEL_WEIGHTS.
 
     Args:
-        judged: tables, each with its own policy.
+        judged: predictions, each with its own policy.
         n_views: views of each episode.
         kind: one of OBJECTIVES.
         seed: of the random numbers.
@@ -319,14 +303,14 @@ def fit_travel_weight(
         The weight, value per grid cell; the largest one if all travel farther.
     """
     limit = judge_all(
-        [(table, Random(table.data.sphere)) for table, _ in judged],
+        [(data, Random(data.sphere)) for data, _ in judged],
         n_views,
         kind,
         seed,
     ).travel
     for weight in TRAVEL_WEIGHTS:
         paying = [
-            (table, replace(policy, travel_weight=weight)) for table, policy in judged
+            (data, replace(policy, travel_weight=weight)) for data, policy in judged
         ]
         if (judge_all(paying, n_views, kind, seed).travel <= limit).all():
             return weight

@@ -375,21 +375,19 @@ def is_first() -> bool:
     return rank_zero_only.rank == 0
 
 
-class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Run(msgspec.Struct, frozen=True):
     """Description of a run, stored in its folder.
 
     Attributes:
         recipe: settings of the training.
         weights: SHA-256 of the initial weights; None for random ones.
-        held_out: names of the validation objects.
-        validation: names of the objects that select the checkpoint; in new runs the same.
+        held_out: names of the validation objects, which select the checkpoint.
         commands: commands that led to the run.
     """
 
     recipe: dict[str, Any]
     weights: str | None
     held_out: tuple[str, ...]
-    validation: tuple[str, ...]
     commands: tuple[str, ...]
 
 
@@ -435,12 +433,10 @@ def new_run(
         raise ModelError(f"{weights}: there is no such checkpoint")
 
     sha256 = None if weights is None else sha256_of(weights)
-    names = tuple(held_out)
     return Run(
         asdict(recipe),
         sha256,
-        names,
-        names,
+        tuple(held_out),
         tuple(dict.fromkeys((*before, command()))),
     )
 

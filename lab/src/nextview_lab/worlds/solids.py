@@ -4,8 +4,6 @@ Every function draws one solid in metres at an arbitrary position, with a longes
 requested size. No solid is a scan or a copy of a product.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -193,7 +193,6 @@ class TableCamera:
         table: SimulatedTable,
         sensor: Sensor,
         rng: np.random.Generator,
-        room: Sequence[Triangles] = (),
     ) -> None:
         """Set up a camera over a table.
 
@@ -201,15 +200,12 @@ class TableCamera:
             table: with the objects.
             sensor: noise model, and the errors of its setup.
             rng: for the errors.
-            room: surroundings of the table, in its frame, metres: walls, furniture.
         """
         self.sensor = sensor
-        self._room = tuple(room)
         self._rng = rng
         angles = [*rng.normal(0, sensor.tilt, 2), 0]
         self.lean = np.eye(4)
         self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
-        self._count = 0
         self.change(table)
         self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(
             -1,
@@ -223,13 +219,7 @@ class TableCamera:
         things: list[Triangles] = [
             (thing.placed, thing.faces) for thing in table.things
         ]
-        size = np.array(
-            [[*TABLE_SIDES, TABLE_THICKNESS], [FLOOR_SIDE, FLOOR_SIDE, 0.01]]
-        )
-        for box, height in zip(size, (-TABLE_THICKNESS, -TABLE_HEIGHT), strict=True):
-            mesh = upright_boxes(box[None], np.zeros(1), np.zeros((1, 2)), height)
-            things.append((mesh.vertices, mesh.faces))
-        self._caster = RayCaster([*things, *self._room])
+        self._caster = RayCaster([*things, *table_and_floor()])
 
     @property
     def truth(self) -> dict[str, Float]:
@@ -267,6 +257,17 @@ class TableCamera:
         self.owner[measured == 0] = -1
         self.shown = np.bincount(self.owner[self.owner >= 0], minlength=self._count)
         return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
+
+
+def table_and_floor() -> list[Triangles]:
+    """Return a table whose top is the plane z = 0, and the floor."""
+    sides = (*TABLE_SIDES, TABLE_THICKNESS), (FLOOR_SIDE, FLOOR_SIDE, 0.01)
+    bottoms = -TABLE_THICKNESS, -TABLE_HEIGHT
+    solids: list[Triangles] = []
+    for size, bottom in zip(sides, bottoms, strict=True):
+        box = upright_boxes(np.array([size]), np.zeros(1), np.zeros((1, 2)), bottom)
+        solids.append((box.vertices, box.faces))
+    return solids
 
 
 def poses_around(

@@ -2,20 +2,25 @@
 pixel shows, and how the surface bends.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.geometry.mesh import Mesh
+from nextview.data.folders import list_dataset
+from nextview.errors import DatasetError
+from nextview.files import sha256_of
+from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
 from nextview.geometry.observation import checked_pose, pinhole
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.simulation.simulated import SimulatedCamera
-from nextview_lab.data.measures import MeasuredView
+from nextview_lab.data.measures import MeasuredView, MeasuredViews
+from nextview_lab.data.rendering import deformed
+from nextview_lab.data.store import DEPTH_UNIT, ViewStore
 
 APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
 # what stands no farther before a face is not told from it, object radii: two steps of a store's
@@ -419,3 +424,51 @@ def view_of(
         pose,
         SimulatedCamera(mesh, size, distance).observe(pose).depth,
     )
+
+
+def mesh_views(
+    store: ViewStore,
+    meshes: Path,
+    max_faces: int = MAX_FACES,
+) -> MeasuredViews:
+    """Return a function of a store and a row that iterates over the views of an object's mesh.
+
+    Args:
+        store: the views.
+        meshes: the dataset folder that they were rendered from.
+        max_faces: of a mesh at most.
+
+    Raises:
+        DatasetError: the views are of a sensor, or a mesh is missing.
+    """
+    if store.attributes.sensor is not None:
+        raise DatasetError(
+            f"{store.path}: was rendered through a sensor, whose depth does not tell which face is"
+            " seen"
+        )
+    files = {entry.name: entry.path.absolute() for entry in list_dataset(meshes)}
+    for i in np.flatnonzero(store.done):
+        if store.names[i] not in files:
+            raise DatasetError(
+                f"{meshes}: holds no mesh called {store.names[i]}, of which {store.path} has views"
+            )
+    return partial(_views_of_mesh, files, max_faces)
+
+
+def _views_of_mesh(
+    files: dict[str, Path], max_faces: int, store: ViewStore, i: int
+) -> Iterator[MeshView]:
+    """Iterate over the views of an object of a store."""
+    depths = store.read("depth", i)
+    name = store.names[i]
+    hashes = store.attributes.sha256
+    if hashes and sha256_of(files[name]) != hashes[i]:
+        raise DatasetError(
+            f"{files[name]}: is not the mesh that {store.path} was rendered from"
+        )
+    part = store.attributes.largest_part
+    read = load_mesh(files[name], max_faces=max_faces, largest_part=part)
+    mesh = deformed(store, read, name)
+    camera = FaceCamera(mesh, depths.shape[-1], store.sphere.distance)
+    for depth, pose in zip(depths, store.sphere.poses, strict=True):
+        yield camera.view(pose, depth * DEPTH_UNIT)  # float64, as when it was rendered
