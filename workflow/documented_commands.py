@@ -48,7 +48,7 @@ from scipy.ndimage import uniform_filter
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs/images"
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "examples"), str(ROOT)]
 
 PAGES = (
     "README.md",
@@ -111,7 +111,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     ),
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
     r"SceneRecorder\(": "a part of a loop; tests/test_scene_viewers.py records scenes",
-    r"look_alikes|benchmark things (YCB|HALF_SCANS)": (
+    r"look_alikes|(benchmark things|studies\.strangers) (YCB|HALF_SCANS)": (
         "needs the YCB scans, and minutes"
     ),
     r"agent_on_things": (
@@ -121,8 +121,8 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"--ensemble runs/second": "needs the run of the line before",
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
-    r"nextview learn |\blearn\(": "nextview[teach]",
-    r"nextview-lab |nextview_lab": "nextview-lab",
+    r"nextview learn |\blearn\(|grasp_point": "nextview[teach]",
+    r"nextview-lab |nextview_lab|site/pictures": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
     r"thesis\.measure_study": "nextview-lab[benchmark]",
@@ -186,6 +186,7 @@ from stand_ins import arm, intrinsics
 system = nextview.load()
 session = system.session(distance=0.6)
 depth, pose = arm.look()
+my_camera = nextview.SimulatedCamera(nextview.load_mesh("samples/chair.off"))
 """
     ),
     "docs/your_table.md": (
@@ -258,11 +259,15 @@ import nextview
 if Path("mine").exists():  # what the first block has made
     system = nextview.load(models="mine", unknown=0.02)
     session = system.session(distance=0.5)
-    from nextview.sensing import Frame
-    from stand_ins import arm, intrinsics
+    import sys
 
-    depth, pose = arm.look()
-    session.update(Frame(depth, intrinsics, pose))
+    import numpy as np
+
+    sys.path.insert(0, "examples")
+    from grasp_point import Robot
+
+    robot = Robot(np.random.default_rng(0))
+    session.update(robot.look(robot.first_pose()))
     poses = session.poses
 """
     ),
@@ -397,6 +402,8 @@ def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
 
 def make_inputs(folder: Path) -> None:
     """What the commands of the pages find in their working folder."""
+    from grasp_point import mug
+
     from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
     from nextview.recognition.model_card import find_card
 
@@ -446,7 +453,7 @@ def make_inputs(folder: Path) -> None:
     shutil.copytree(folder / "data/ModelNet10/chair/test", folder / "chairs")
     shutil.copy(folder / "samples/chair.off", folder)
     for name, mesh in (
-        ("mug", trimesh.creation.cylinder(0.04, 0.1)),
+        ("mug", mug()),
         ("box", trimesh.creation.box((0.1, 0.2, 0.06))),
     ):
         (folder / "scans").mkdir(exist_ok=True)
