@@ -83,13 +83,10 @@ def test_meshes_without_a_unit_are_refused_at_once_with_the_units_they_may_have(
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
     tmp_path, knobs, knobs_memory, taught_afresh
 ):
-    again = []
-
     def stopping(done, total, what):
         for count in done:
             if count == 2:
                 raise KeyboardInterrupt
-            again.append(count)
 
     with pytest.raises(KeyboardInterrupt):
         learn(

@@ -4,6 +4,7 @@ folders of several cameras, and what a standing camera changes.
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -187,14 +188,7 @@ def test_an_error_of_a_camera_is_a_warning_that_leaves_names_confident():
     assert [warning.name for warning in found] == ["camera"]
     assert not found[0].holds
     assert "camera right is " in found[0].message
-    assert KnownFrames((left,), (None,)).check(replace_name(right, ""), None) == []
-
-
-def replace_name(frame, name):
-    """The same frame of a camera with another name."""
-    other = frame.with_depth(frame.depth)
-    object.__setattr__(other, "camera", name)
-    return other
+    assert KnownFrames((left,), (None,)).check(replace(right, camera=""), None) == []
 
 
 def test_a_camera_with_a_name_may_stand_still_while_the_scene_changes():
@@ -205,15 +199,15 @@ def test_a_camera_with_a_name_may_stand_still_while_the_scene_changes():
     known = KnownFrames((before,), (None,))
     assert [warning.name for warning in known.check(after, None)] == ["stale pose"]
 
-    left = replace_name(before, "left")
+    left = replace(before, camera="left")
     named = KnownFrames((left,), (None,))
-    assert named.stands(replace_name(after, "left"))
-    assert named.check(replace_name(after, "left"), None) == []
+    assert named.stands(replace(after, camera="left"))
+    assert named.check(replace(after, camera="left"), None) == []
     # once it has moved, it may have an old pose
     moved = KnownFrames(
-        (replace_name(seen([TABLE], RIGHT, rng), "left"), left), (None, None)
+        (replace(seen([TABLE], RIGHT, rng), camera="left"), left), (None, None)
     )
-    found = moved.check(replace_name(after, "left"), None)
+    found = moved.check(replace(after, camera="left"), None)
     assert [warning.name for warning in found] == ["stale pose"]
 
 
@@ -389,8 +383,8 @@ def pair():
     stated = poses[1].copy()
     stated[:3, 3] += [0.002, -0.002, 0.001]
     return (
-        replace_name(left, "left"),
-        replace_name(right.with_pose(stated), "right"),
+        replace(left, camera="left"),
+        replace(right.with_pose(stated), camera="right"),
         camera.truth,
     )
 

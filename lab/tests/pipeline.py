@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.data.folders import Entry
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview_lab.data.measures import MeasuredView
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.data.store import DONE, RENDERED_ARRAYS, ViewStore, describe
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["ball", "box", "pillar"]
@@ -66,21 +64,6 @@ def benchmark(predictions: Path, out: Path, **settings):
     from nextview_lab.benchmark.classes import ClassSettings, benchmark_classes
 
     return benchmark_classes(predictions, out, ClassSettings(**settings))
-
-
-def store_of(
-    path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays
-) -> ViewStore:
-    """A store whose objects are rendered, if only these arrays of it hold anything:
-    depth_entropy, image.
-    """
-    both = zip(names, map(str, labels), strict=True)
-    entries = [Entry(Path(f"{name}.off"), name, label, "train") for name, label in both]
-    store = ViewStore.create(path, describe(entries, sphere, size, {}))
-    for name, values in arrays.items():
-        store.group[name if name in RENDERED_ARRAYS else f"measures/{name}"][:] = values
-    store.group["status"][:] = DONE
-    return store
 
 
 def of_depth(depth, distance=3.0) -> MeasuredView:
