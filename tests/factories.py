@@ -44,11 +44,11 @@ SAMPLE_FILES = Path(__file__).parents[1] / "samples"
 # Commands
 
 
-def refused(capsys, *arguments) -> str:
+def refused(capsys, *arguments, run=main) -> str:
     """What a command that ends with status 2 says on standard error, in one line."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
+        run([str(argument) for argument in arguments])
     assert end.value.code == 2
     return " ".join(capsys.readouterr().err.split())
 

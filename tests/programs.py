@@ -4,6 +4,8 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
+import pytest
+
 from nextview.cli.call_with_arguments import entry
 from nextview.cli.commands import NEXTVIEW, Command
 from nextview.cli.main import run
@@ -28,8 +30,12 @@ def example_of(name: str, command: Command) -> str:
     return f"{name.partition(' ')[0]} {command.example}"
 
 
-def check_help(name: str, command: Command, shown: str) -> None:
+def check_help(name: str, command: Command, run_line, capsys) -> None:
     """Check that the help of a command explains each of its options, and ends with an example."""
+    with pytest.raises(SystemExit) as end:
+        run_line(f"{name} --help")
+    assert end.value.code == 0
+    shown = capsys.readouterr().out
     assert shown.startswith(f"usage: {name} ")
     without = ("nextview demo", "nextview demo-episode", "nextview explore")
     assert "(required)" in shown or name in without

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from exact_views import mesh_of
 
 from nextview.errors import UsageError
-from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
+from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import (
     ViewSphere,
@@ -39,14 +40,6 @@ KNOB = ((0.02, 0.02, 0.02), (0.05, 0.0, 0.0))  # on the side of +x
 HANDLE = ((0.05, 0.015, 0.06), (0.06, 0.0, 0.0))
 
 
-def box_mesh(*boxes) -> Mesh:
-    parts = [trimesh.creation.box(extents) for extents, _ in boxes]
-    for part, (_, middle) in zip(parts, boxes, strict=True):
-        part.apply_translation(middle)
-    whole = trimesh.util.concatenate(parts)
-    return make_mesh(whole.vertices, whole.faces, unit="m")
-
-
 def surfaces_of(*meshes: Mesh) -> SurfaceCaster:
     return SurfaceCaster(
         [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
@@ -68,7 +61,7 @@ def cameras(sphere=SPHERE) -> np.ndarray:
 
 def knob_or_not(belief=(0.5, 0.5), order=(0, 1), surroundings=None) -> ExpectedViews:
     """A box, and the same with a knob; hypotheses in some order."""
-    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
+    caster = surfaces_of(mesh_of(BODY), mesh_of(BODY, KNOB))
     hypotheses = hypotheses_of(order, np.array(belief)[list(order)])
     return expected_views(caster, hypotheses, cameras(), SENSOR, surroundings)
 
@@ -83,7 +76,7 @@ def test_the_best_view_shows_the_place_in_which_two_things_differ():
 
 
 def test_a_motion_absorbed_by_registration_gives_no_information():
-    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY))
+    caster = surfaces_of(mesh_of(BODY), mesh_of(BODY))
     hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
     hypotheses.poses[1, :3, 3] = (0.0015, -0.001, 0.0)
     found = expected_views(caster, hypotheses, cameras(), SENSOR)
@@ -127,13 +120,13 @@ def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
     np.testing.assert_allclose(found.information("thing"), 0, atol=1e-12)
     np.testing.assert_allclose(found.information("pose"), np.log(2))
 
-    caster = surfaces_of(box_mesh(BODY, HANDLE))
+    caster = surfaces_of(mesh_of(BODY, HANDLE))
     two = hypotheses_of((0, 0), (0.5, 0.5), yaws=(0.0, np.pi))
     by_render = expected_views(caster, two, cameras(), SENSOR)
     np.testing.assert_allclose(by_render.information("thing"), 0, atol=1e-12)
     assert by_render.information("pose").max() > 0.6
     quarter = hypotheses_of((0, 0), (0.5, 0.5), yaws=(0.0, np.pi / 2))
-    square = expected_views(surfaces_of(box_mesh(BODY)), quarter, cameras(), SENSOR)
+    square = expected_views(surfaces_of(mesh_of(BODY)), quarter, cameras(), SENSOR)
     assert square.information("pose").max() < 0.1  # it looks the same
 
 
@@ -141,7 +134,7 @@ def test_poses_of_one_thing_are_worth_telling_apart_only_for_the_pose():
 @pytest.mark.parametrize("side", [0.0, 180.0])
 def test_a_view_is_expected_to_tell_where_the_score_tells(shown, side):
     """With the handle in sight, and behind the body."""
-    meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
+    meshes = [mesh_of(BODY), mesh_of(BODY, HANDLE)]
     mesh = meshes[shown]
     camera = SimulatedCamera(mesh, 200)
     found = camera.observe(look_at_origin(np.radians(36.0), np.radians(side)))
@@ -174,7 +167,7 @@ def test_a_view_is_expected_to_tell_where_the_score_tells(shown, side):
 def outlook_of(belief, taken=1) -> Outlook:
     """A box, or the same with a knob, last seen from the side of -x."""
     return Outlook(
-        caster=surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB)),
+        caster=surfaces_of(mesh_of(BODY), mesh_of(BODY, KNOB)),
         hypotheses=hypotheses_of((0, 1), belief),
         sensor=SENSOR,
         surroundings=SeenSurroundings.nothing(),
@@ -265,7 +258,7 @@ def test_poses_of_a_robot_are_ranked():
 
 
 def test_what_is_not_the_object_explains_nothing_and_costs_nothing():
-    mesh = box_mesh(BODY)
+    mesh = mesh_of(BODY)
     camera = SimulatedCamera(mesh, 200)
     found = camera.observe(look_at_origin(np.radians(36.0), 0.0))
     shown = found.depth > 0

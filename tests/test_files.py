@@ -77,23 +77,24 @@ def test_links_and_paths_of_another_kind_are_rejected(tmp_path):
         files.check_new(tmp_path, overwrite=True)
 
 
+FULL = """
+import signal
+from pathlib import Path
+from nextview.files import ResultsError, new_file
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+try:
+    with new_file(Path("a"), True) as part:
+        part.write_bytes(bytes(10**6))
+except ResultsError as error:
+    print(error)
+"""
+
+
 def test_a_full_disk_is_one_sentence_and_leaves_the_old_file(tmp_path):
     (tmp_path / "a").write_text("old")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    program = (
-        "import signal; signal.signal(signal.SIGXFSZ, "
-        "signal.SIG_IGN)\nfrom pathlib import Path\n"
-    )
-    program += (
-        "from nextview.files import new_file\nfrom nextview.errors "
-        "import ResultsError\ntry:\n"
-    )
-    program += (
-        " with new_file(Path('a'), True) as part: part.write_bytes(bytes(10**6))\n"
-    )
-    program += "except ResultsError as error: print(error)"
     done = subprocess.run(
-        [sys.executable, "-c", program],
+        [sys.executable, "-c", FULL],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -66,18 +66,8 @@ def test_several_objects_give_a_line_of_json_each_and_failures_are_named(chair, 
 
 def test_every_bundled_policy_runs_live(chair, capsys):
     for name in bundled_policies():
-        arguments = [
-            "--policy",
-            name,
-            "--threshold",
-            "1",
-            "--max-views",
-            "3",
-            "--start",
-            "9",
-            "--json",
-        ]
-        main(["recognise", str(chair), *arguments])
+        options = "--threshold 1 --max-views 3 --start 9 --json"
+        main(f"recognise {chair} --policy {name} {options}".split())
         views = json.loads(capsys.readouterr().out)["views"]
         assert len({view["view"] for view in views}) == 3
         if name.endswith("local"):

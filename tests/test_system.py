@@ -18,19 +18,13 @@ SAMPLE = SAMPLE_FILES / "chair.off"
 
 @pytest.mark.parametrize("options", [{}, {"risk": 0.1}])
 def test_python_and_command_line_stop_alike(options, capsys):
-    system, given = (
-        nextview.load(**options),
-        [word for name in options for word in (f"--{name}", str(options[name]))],
-    )
+    system = nextview.load(**options)
+    given = [f"--{name}={value}" for name, value in options.items()]
+    table = SAMPLE.with_stem("table")
     for start in range(0, 40, 14):
-        main(
-            [
-                *f"recognise {SAMPLE.with_stem('table')} --start {start} --json".split(),
-                *given,
-            ]
-        )
+        main([*f"recognise {table} --start {start} --json".split(), *given])
         printed = json.loads(capsys.readouterr().out)
-        result = system.recognise(SAMPLE.with_stem("table"), start=start)
+        result = system.recognise(table, start=start)
         assert [view["view"] for view in printed["views"]] == [
             view.index for view in result.views
         ]
@@ -91,13 +85,8 @@ def test_the_bundled_models_keep_their_accuracy():
 def test_the_sample_meshes_are_told_apart_from_any_view():
     """Falls where the bundled models do."""
     system = nextview.load()
-    both = itertools.product(SAMPLE_MESHES, range(0, 40, 5))
-    assert (
-        np.mean(
-            [
-                system.recognise(SAMPLE.with_stem(n), start=k).answer == n
-                for n, k in both
-            ]
-        )
-        > 0.9
-    )
+    right = [
+        system.recognise(SAMPLE.with_stem(name), start=start).answer == name
+        for name, start in itertools.product(SAMPLE_MESHES, range(0, 40, 5))
+    ]
+    assert np.mean(right) > 0.9

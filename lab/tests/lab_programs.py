@@ -1,8 +1,9 @@
 """Run a command line in this process, by the program that has the command."""
 
 from collections.abc import Sequence
+from functools import partial
 
-import pytest
+import factories
 
 from nextview.cli.commands import LAB, NEXTVIEW
 from nextview.cli.main import run
@@ -35,10 +36,4 @@ def called(line: str) -> None:
     main(line.split())
 
 
-def refused(capsys, *arguments) -> str:
-    """What a command that ends with status 2 says on standard error, in one line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    assert end.value.code == 2
-    return " ".join(capsys.readouterr().err.split())
+refused = partial(factories.refused, run=main)

@@ -1,5 +1,5 @@
 """The store survives what happens to long jobs, done for real: kills, full disks, broken meshes,
-second runs.
+second runs. What is rendered through a sensor is the same to the bit then, too.
 """
 
 import os
@@ -14,19 +14,23 @@ import numpy as np
 import pytest
 import trimesh
 
+from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview_lab.data.rendering import render
+from nextview.simulation.sensor import sensor_named
+from nextview_lab.data.rendering import RenderOptions, render
 from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore
 
-SPHERE = ViewSphere.named("12")
-SIZE = 64
+SPHERE = ViewSphere((20.0,), 3)
+SIZE = 224
+SENSED = RenderOptions(sensor="wrist:2")
 SCRIPT = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
 from nextview_lab.data.rendering import RenderOptions, render
 from nextview.geometry.viewsphere import ViewSphere
 dataset, path = sys.argv[1:]
-for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 64, workers=2), 1):
+given = ViewSphere((20.0,), 3), 224, RenderOptions(sensor="wrist:2")
+for n, _ in enumerate(render(Path(dataset), Path(path), *given, workers=2), 1):
     if n == 3:
         print(*(child.pid for child in multiprocessing.active_children()), flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -47,9 +51,8 @@ def assert_same(a: Path, b: Path) -> None:
 def whole(furniture, tmp_path_factory) -> Path:
     """A store made without interruption, by this process."""
     path = tmp_path_factory.mktemp("whole") / "views.zarr"
-    assert [
-        reason for _, reason in render(furniture, path, SPHERE, SIZE, workers=0)
-    ] == [None] * 18
+    rendered = render(furniture, path, SPHERE, SIZE, SENSED, workers=0)
+    assert [reason for _, reason in rendered] == [None] * 18
     return path
 
 
@@ -94,8 +97,14 @@ def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(
     assert 3 <= done < 18
     # As if the kill had come in the middle of a write: zarr writes aside under such a name.
     (path / "image" / "c" / "0.00.partial").write_bytes(b"half")
-    assert len(list(render(furniture, path, SPHERE, SIZE, workers=0))) == 18 - done
+    for other in (RenderOptions(), RenderOptions(sensor="wrist")):
+        with pytest.raises(DatasetError):
+            list(render(furniture, path, SPHERE, SIZE, other, workers=0))
+    left = render(furniture, path, SPHERE, SIZE, SENSED, workers=0)
+    assert len(list(left)) == 18 - done
     assert_same(whole, path)
+    sensor = ViewStore.open(path).group.attrs["sensor"]
+    assert sensor == sensor_named("wrist:2").to_dict()
 
 
 def test_broken_meshes_are_recorded_and_tried_again(meshes, tmp_path):
@@ -200,11 +209,8 @@ def test_a_dask_cluster_renders_the_same(furniture, whole, tmp_path):
         dashboard_address=None,
         silence_logs=50,
     ) as cluster:
-        names = [
-            name
-            for name, _ in render(
-                furniture, path, SPHERE, SIZE, scheduler=cluster.scheduler_address
-            )
-        ]
+        address = cluster.scheduler_address
+        rendered = render(furniture, path, SPHERE, SIZE, SENSED, scheduler=address)
+        names = [name for name, _ in rendered]
     assert sorted(names) == sorted(ViewStore.open(path).names)
     assert_same(whole, path)
