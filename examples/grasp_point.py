@@ -2,9 +2,9 @@
 
     python examples/grasp_point.py
 
-A mug and a carton are taught from their scans: ``pip install 'nextview[teach]'``. The mug then stands
-somewhere on a table, seen by a noisy depth camera, which is simulated here: on a robot, ``look``
-gives its frames.
+A mug and a carton are taught from their scans, which needs ``pip install 'nextview[teach]'``. The
+mug then stands somewhere on a table, seen by a noisy depth camera, which is simulated here: on a
+robot, ``look`` gives its frames.
 """
 
 import tempfile
