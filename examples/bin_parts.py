@@ -1,6 +1,6 @@
 """Five machine parts for picking from a bin; generated, so they are free of any rights (CC0).
 
-python examples/bin_parts.py PARTS          # writes five STL files in millimetres
+python examples/bin_parts.py PARTS          # five STL files in millimetres; needs nextview-lab
 nextview learn PARTS taught --unit mm       # needs nextview[teach]
 
 Each part is a union of convex pieces with holes. A physics engine uses the pieces; the meshes that

@@ -106,7 +106,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_bags.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"studies\.frozen|nextview-bench|^for policy in": (
+    r"studies\.frozen|nextview-bench|submit ARCHIVE|^for policy in": (
         "needs the YCB scans, and hours; lab/tests/test_submit.py runs methods on a small archive"
     ),
     r"NpzDepth": "a part of a reader that is to be put into nextview itself",
@@ -122,7 +122,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview learn |\blearn\(|grasp_point": "nextview[teach]",
-    r"nextview-lab |nextview_lab|site/pictures": "nextview-lab",
+    r"nextview-lab |nextview_lab|site/pictures|bin_parts": "nextview-lab",
     r"nextview-lab (train|export) ": "nextview-lab[train]",
     r"nextview-lab (benchmark|evaluate|report) ": "nextview-lab[benchmark]",
     r"thesis\.measure_study": "nextview-lab[benchmark]",

@@ -334,6 +334,7 @@ def sensors(view: int) -> Figure:
         for each in column:
             each.set(xticks=[], yticks=[])
             each.grid(visible=False)
+            each.spines[:].set_visible(False)
     for each, label in zip(axes[:, 0], ("depth", "raw", "denoised"), strict=True):
         each.set_ylabel(label, fontsize=10)
     return figure
