@@ -205,6 +205,10 @@ class Arm:
 
 arm = Arm()
 intrinsics = table.sensor.intrinsics
+
+
+def my_network(colour):
+    return table.owner + 1
 """
     ),
     "docs/tracking.md": (
