@@ -23,7 +23,8 @@ from nextview.things.point_pairs import (
     oriented,
 )
 from nextview.things.propose import PROPOSED, PROPOSED_OF_ONE
-from nextview.things.visible_points import looking_from, spread_directions
+from nextview.things.moments import looking_from
+from nextview.things.visible_points import spread_directions
 
 MUG = mesh_of(((0.08, 0.08, 0.1), (0, 0, 0)), ((0.05, 0.015, 0.06), (0.06, 0, 0.015)))
 BRACKET = mesh_of(((0.12, 0.06, 0.02), (0, 0, 0)), ((0.02, 0.02, 0.1), 3 * (0.02,)))
