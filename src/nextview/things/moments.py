@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from nextview.sensing.view import View
-from nextview.things.point_pairs import FEWEST, TURNS, rank_within
+from nextview.things.point_pairs import FEWEST, TURNS
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 OUTLYING = (
     4.0  # standard deviations of the depth, beyond which a point is of something else
 )
-AMONG = 8  # times as many poses of one thing as are wanted are ranked
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +81,16 @@ class Moments:
         ray = view.camera[:3, 3] - middle
         look = looking_from((ray / np.linalg.norm(ray))[None])[0]
         seen = (points - middle) @ look.T
-        ahead = np.abs(seen[:, 2] - np.median(seen[:, 2]))
-        seen = seen[ahead < OUTLYING * seen[:, 2].std() + 1e-9]
         goal = as_vectors(np.cov(seen.T, bias=True)).astype(np.float32)
 
         # the most similar poses of each thing, then of all
         off = np.einsum("tpi,tpi->tp", self.products, self.products)
         off -= 2 * (self.products @ goal)
         off[~among] = np.inf
-        count = min(AMONG * of_one, off.shape[1])
-        poses = np.argpartition(off, count - 1, axis=1)[:, :count]
-        things = np.repeat(np.arange(len(off)), count)
+        poses = np.argpartition(off, of_one, axis=1)[:, :of_one]
+        things = np.repeat(np.arange(len(off)), of_one)
         order = np.argsort(np.take_along_axis(off, poses, 1).ravel(), kind="stable")
-        order = order[among[things[order]]]
-        order = order[rank_within(things[order]) < of_one][:most]
+        order = order[among[things[order]]][:most]
         things = things[order]
         direction, turn = np.divmod(poses.ravel()[order], TURNS)
         to_world = look.T @ about_the_ray()[turn]

@@ -28,7 +28,6 @@ SIZE_COST = 0.1  # nats, of a pixel of what has another size than it was taught 
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
 POSE_ERROR = 0.005  # standard deviation of the pose of a thing, radii
 FARTHEST = 4.0  # standard deviations within which a pixel may show the surface
-LEAST_MARGIN = 0.005  # metres, the same at least
 OWN_SHARE = 0.3  # of a piece, from which on all of it should be explained
 FEWEST_OWN = 8  # pixels of a piece, from which on it should end where the thing ends
 STEEPEST = 0.15  # cosine of the steepest surface that is measured
@@ -263,7 +262,7 @@ def _compared(
     variance = grid.sigma.ravel()[cells] ** 2 + slope**2
     variance += own.astype(np.float32)[row]
     off = measured - z
-    margin = np.maximum(FARTHEST * np.sqrt(variance), LEAST_MARGIN)
+    margin = FARTHEST * np.sqrt(variance)
     likely = np.log(np.exp(-(off**2) / 2 / variance) + np.exp(OUTLIER))
 
     got = measured > 0

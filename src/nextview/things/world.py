@@ -33,10 +33,7 @@ from nextview.types import Float, Float32, Index, Mask
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
 STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
 EXPLAINED = (
-    0.6  # share of a segment that is explained, from which on it is not searched
-)
-EXPLAINED_OF_UNION = (
-    0.3  # the same of several segments together: one of them is explained
+    0.3  # share of a segment that is explained, from which on it is not searched
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 AS_LIKELY = (
@@ -185,13 +182,13 @@ class World:
             if last is not None and any(row[:-1]):
                 strange.ravel()[last.cells] = True
 
-        for segments, share, most, known in (
-            (view.instances, SURE_SHARE, EXPLAINED, before),
-            (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
-            (view.fragments, CLEAR_SHARE, EXPLAINED, strange),
+        for segments, share, known in (
+            (view.instances, SURE_SHARE, before),
+            (view.unions, CLEAR_SHARE, strange),
+            (view.fragments, CLEAR_SHARE, strange),
         ):
             shown = world.explained(share) | view.enlarged(known)
-            left = [mask for mask in segments() if shown[mask].mean() < most]
+            left = [mask for mask in segments() if shown[mask].mean() < EXPLAINED]
             world = world._with_proposals(left, among)
 
         shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
