@@ -109,6 +109,30 @@ def test_a_thing_of_which_a_part_is_hidden_is_proposed_near_the_truth(library):
     assert np.count_nonzero(found) >= 7
 
 
+def test_moments_propose_a_whole_thing_near_its_pose(library):
+    for turn in Rotation.random(4, rng=0).as_matrix():
+        observations, true = turned_views(THINGS[0], turn)
+        view = view_of(observations[0])
+        among = np.ones(len(library), bool)
+        things, rotations, centres = library.visible.moments.propose(
+            view, view.labels > 0, among, 150, 6
+        )
+        own = np.flatnonzero(things == 0)
+        assert 0 < len(own) <= 6
+        off = Rotation.from_matrix(rotations[own] @ turn.T).magnitude()
+        centre = turn @ THINGS[0].centre + true[:3, 3]
+        apart = np.linalg.norm(centres[own] - centre, axis=1)
+        assert ((np.degrees(off) < 30) & (apart < 0.03)).any()
+
+        # what is ruled out is not proposed
+        among[0] = False
+        things, _, _ = library.visible.moments.propose(
+            view, view.labels > 0, among, 150, 6
+        )
+        assert 0 not in things
+        assert len(things)
+
+
 def test_directions_are_spread_evenly_and_cameras_look_along_them():
     directions = spread_directions(162)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
