@@ -23,7 +23,8 @@ from nextview.things.point_pairs import (
     oriented,
 )
 from nextview.things.propose import PROPOSED, PROPOSED_OF_ONE
-from nextview.things.visible_points import looking_from, spread_directions
+from nextview.things.moments import looking_from
+from nextview.things.visible_points import spread_directions
 
 MUG = mesh_of(((0.08, 0.08, 0.1), (0, 0, 0)), ((0.05, 0.015, 0.06), (0.06, 0, 0.015)))
 BRACKET = mesh_of(((0.12, 0.06, 0.02), (0, 0, 0)), ((0.02, 0.02, 0.1), 3 * (0.02,)))
@@ -106,6 +107,30 @@ def test_a_thing_of_which_a_part_is_hidden_is_proposed_near_the_truth(library):
             found.append(((np.degrees(off) < 30) & (apart < 0.03)).any())
     # one of eight views may show a single face, of which there are many
     assert np.count_nonzero(found) >= 7
+
+
+def test_moments_propose_a_whole_thing_near_its_pose(library):
+    for turn in Rotation.random(4, rng=0).as_matrix():
+        observations, true = turned_views(THINGS[0], turn)
+        view = view_of(observations[0])
+        among = np.ones(len(library), bool)
+        things, rotations, centres = library.visible.moments.propose(
+            view, view.labels > 0, among, 150, 6
+        )
+        own = np.flatnonzero(things == 0)
+        assert 0 < len(own) <= 6
+        off = Rotation.from_matrix(rotations[own] @ turn.T).magnitude()
+        centre = turn @ THINGS[0].centre + true[:3, 3]
+        apart = np.linalg.norm(centres[own] - centre, axis=1)
+        assert ((np.degrees(off) < 30) & (apart < 0.03)).any()
+
+        # what is ruled out is not proposed
+        among[0] = False
+        things, _, _ = library.visible.moments.propose(
+            view, view.labels > 0, among, 150, 6
+        )
+        assert 0 not in things
+        assert len(things)
 
 
 def test_directions_are_spread_evenly_and_cameras_look_along_them():

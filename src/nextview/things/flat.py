@@ -15,7 +15,6 @@ from nextview.sensing.frame import within
 from nextview.sensing.view import View
 from nextview.things.score import (
     FARTHEST,
-    LEAST_MARGIN,
     LEFT_OVER,
     OUTLIER,
     PIXEL_GAIN,
@@ -71,7 +70,7 @@ def _of_segment(
         )
         away = slopes[0, :, 0] * normal[0] + (slopes[:, :1, 1] * normal[1] + normal[2])
         z = 1 / np.maximum(away, 1e-3)
-        margin = np.maximum(FARTHEST * sigma, LEAST_MARGIN)
+        margin = FARTHEST * sigma
         off = depth - z
         near = (depth > 0) & (np.abs(off) < margin)
         if np.count_nonzero(near & left) < LEAST_FLAT * np.count_nonzero(own):

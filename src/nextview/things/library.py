@@ -232,6 +232,14 @@ class Hypotheses:
         """Those in the size that was taught, (M,) bool."""
         return np.asarray(np.isclose(self.sizes, 1).all(1))
 
+    def turned(self, angle: float) -> Hypotheses:
+        """Return six of each: turned about each axis of the world, both ways, radians."""
+        vectors = angle * np.concatenate([np.eye(3), -np.eye(3)])
+        turns = Rotation.from_rotvec(vectors).as_matrix()
+        rotations = turns @ self.rotations[:, None]
+        each = self[np.repeat(np.arange(len(self)), len(turns))]
+        return replace(each, rotations=rotations.reshape(-1, 3, 3))
+
     def in_other_sizes(self) -> Hypotheses:
         """Return eight of each: larger and smaller, as a whole and along each axis."""
         along = np.concatenate([np.eye(3), np.ones((1, 3))])

@@ -1,7 +1,9 @@
 """Propose things and poses where a view shows something that is not explained.
 
-Pairs of points give poses of things that fit a segment or a part of it. They are registered, and
-those that match best are scored. Few points of each are enough to reject most.
+Moments give poses of things that fit a segment, pairs of points also those that fit a part of it.
+They are registered, and those that match best are scored. Few points of each are enough to reject
+most. The best ones are registered again from poses beside their own: the way to the best pose of a
+thing with thin or hollow parts is often barred by worse ones.
 """
 
 from __future__ import annotations
@@ -13,21 +15,25 @@ import numpy as np
 from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
-from nextview.things.score import score
-from nextview.types import Float, Mask
+from nextview.things.score import totals
+from nextview.types import Float, Float32, Mask
 
 PROPOSED = 600  # poses that pairs of points propose, at most
 PROPOSED_OF_ONE = 20  # the same of one thing
+BY_MOMENTS, BY_MOMENTS_OF_ONE = 150, 6  # the same that moments propose
 REGISTERED = 120  # poses that are registered after a first look, at most
-LEAST_MATCH = (
-    0.1  # of the best hypothesis of a segment, below which it shows none of the things
-)
 MATCHED = 40  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 4  # the same of one thing
+RESTARTED, RESTARTED_OF_ONE = 12, 2  # of these that are registered from other starts
+RESTART = 0.25  # radians, by which they are turned
 SCORED = 16  # hypotheses that are rendered, at most
 SCORED_OF_ONE = 3  # the same of one thing
 KEPT = 8  # hypotheses of one segment that are kept, at most
 KEPT_OF_ONE = 2  # the same of one thing
+ROUGH = (
+    0.03  # standard deviation of the depth of a pose that is not registered yet, radii
+)
+ASIDE = 0.08  # radii, within which such a pose may be off to the side
 SAME_POSE = 0.1  # radians, and radii of the thing, within which two poses are one
 COARSER, COARSEST = 2, 3  # grids on which they are rendered to choose among them
 
@@ -65,8 +71,16 @@ def _of_segment(
 
     A thing may go on in other instances, so at last it is drawn into these, too.
     """
-    pairs = library.visible.pairs
-    found = Hypotheses.of(*pairs.propose(view, mask, among, PROPOSED, PROPOSED_OF_ONE))
+    pairs, moments = library.visible.pairs, library.visible.moments
+    found = Hypotheses.joined(
+        [
+            Hypotheses.of(*way.propose(view, mask, among, most, of_one))
+            for way, most, of_one in (
+                (pairs, PROPOSED, PROPOSED_OF_ONE),
+                (moments, BY_MOMENTS, BY_MOMENTS_OF_ONE),
+            )
+        ]
+    )
     if not len(found):
         return None
 
@@ -77,32 +91,24 @@ def _of_segment(
     found = found[np.argsort(-match)[:REGISTERED]]
     found = register(library, [view], found, (0.2, 0.12), 48, outline)
     match = matched(library, view, found, mask, 64)
-    if match.max() < LEAST_MATCH:
-        return None
     found = best(library, found, match, MATCHED, MATCHED_OF_ONE)
 
     # fewer closer, then by their score
     closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
     found = register(library, [view], found, closer, 96, instances)
-    totals = _totals(library, view, found, COARSEST)
-    found = best(library, found, totals, SCORED, SCORED_OF_ONE)
+    gains = totals(library, view, found, COARSEST)
+    some = best(library, found, gains, RESTARTED, RESTARTED_OF_ONE)
+    some = register(library, [view], some.turned(RESTART), closer, 96, instances)
+    found = Hypotheses.joined([found, some])
+    gains = np.append(gains, totals(library, view, some, COARSEST))
+    found = best(library, found, gains, SCORED, SCORED_OF_ONE)
     found = register(library, [view], found, (0.03, 0.03), 128, instances)
     found = register(library, [view], found, (0.02,), 128)
-    totals = _totals(library, view, found, COARSER)
-    gains = np.flatnonzero(totals > 0)
-    if not len(gains):
+    gains = totals(library, view, found, COARSER)
+    explain = np.flatnonzero(gains > 0)
+    if not len(explain):
         return None
-    return best(library, found[gains], totals[gains], KEPT, KEPT_OF_ONE)
-
-
-def _totals(library: Library, view: View, some: Hypotheses, coarser: int) -> Float:
-    """Score hypotheses on a coarser grid of a view, nats, (M,); -infinity outside of the image."""
-    return np.array(
-        [
-            -np.inf if one is None else one.total
-            for one in score(library, view, some, coarser)
-        ]
-    )
+    return best(library, found[explain], gains[explain], KEPT, KEPT_OF_ONE)
 
 
 def best(
@@ -152,12 +158,11 @@ def matched(
         count: number of points of each hypothesis.
     """
     seen = Projected.of(library, view, some, count)
-    sigma = np.hypot(0.003, view.noise.at(seen.depth) * seen.depth**2)
-    off = seen.depth - seen.points[:, 2]
-    measured = seen.inside & (seen.depth > 0)
-    own = mask[seen.row, seen.column]
-    match = measured & (np.abs(off) < 3 * sigma)
-    margin = np.maximum(3 * sigma, 0.006)
+    radius = library.radii[some.things][:, None]
+    off, own, measured = _beside(view, seen, mask, ASIDE * radius)
+    sigma = np.hypot(ROUGH * radius, view.noise.at(seen.depth) * seen.depth**2)
+    margin = 3 * sigma
+    match = measured & (np.abs(off) < margin)
     through = measured & (off >= margin)
     front = measured & (off <= -margin)
     visible = np.maximum((seen.inside & ~(front & ~own)).sum(1), 1)
@@ -170,3 +175,34 @@ def matched(
         seen.fill * side**2 * (match & own).mean(1) / max(1, np.count_nonzero(mask))
     )
     return np.where(share > 0, share * np.minimum(1, covered), share)
+
+
+def _beside(
+    view: View, seen: Projected, mask: Mask, aside: Float
+) -> tuple[Float32, Mask, Mask]:
+    """Compare points with the pixels at and beside them, and keep those that fit best.
+
+    Args:
+        view: the view.
+        seen: points of M hypotheses in it.
+        mask: pixels of the segment, (H, W) bool.
+        aside: how far the pixels beside are away, (M, 1), metres.
+
+    Returns:
+        How far what is measured lies behind each point, (M, N) float32, metres; whether it belongs
+        to the segment, (M, N) bool; and whether anything is measured, (M, N) bool.
+    """
+    height, width = view.frame.shape
+    pixels = aside * view.frame.pinhole.fx / np.maximum(seen.middle[:, 2:], 0.05)
+    step = np.rint(pixels).astype(np.int32)
+    off = np.full(seen.row.shape, np.inf, np.float32)
+    own = np.zeros(seen.row.shape, bool)
+    for down, right in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)):
+        row = (seen.row + down * step).clip(0, height - 1)
+        column = (seen.column + right * step).clip(0, width - 1)
+        depth = view.depth[row, column]
+        gap = np.where(depth > 0, depth - seen.points[:, 2], np.float32(np.inf))
+        better = np.abs(gap) < np.abs(off)
+        off = np.where(better, gap, off)
+        own = np.where(better, mask[row, column], own)
+    return off, own, seen.inside & np.isfinite(off)

@@ -28,7 +28,6 @@ SIZE_COST = 0.1  # nats, of a pixel of what has another size than it was taught 
 EDGE_WEIGHT = 0.3  # of pixels on the outline, which mix two surfaces
 POSE_ERROR = 0.005  # standard deviation of the pose of a thing, radii
 FARTHEST = 4.0  # standard deviations within which a pixel may show the surface
-LEAST_MARGIN = 0.005  # metres, the same at least
 OWN_SHARE = 0.3  # of a piece, from which on all of it should be explained
 FEWEST_OWN = 8  # pixels of a piece, from which on it should end where the thing ends
 STEEPEST = 0.15  # cosine of the steepest surface that is measured
@@ -88,9 +87,8 @@ def score(
     grid = view.grid(coarser)
     found: list[Score | None] = [None] * len(some)
     for rows, window in _windows(library, view, some, grid):
-        for row, one in zip(
-            rows, _scored(library, view, some[rows], grid, window), strict=True
-        ):
+        compared = _compared(library, view, some[rows], grid, window)
+        for row, one in zip(rows, compared.scores(grid), strict=True):
             if one is not None and coarser > 1:
                 count = coarser**2
                 one = Score(
@@ -102,6 +100,27 @@ def score(
                     one.hidden * count,
                 )
             found[row] = one
+    return found
+
+
+def totals(library: Library, view: View, some: Hypotheses, coarser: int) -> Float:
+    """Compare hypotheses with a view, as ``score`` does, and return no more than the totals.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses.
+        coarser: factor of the distance between the pixels that are compared.
+
+    Returns:
+        Nats, (M,); -infinity for one that lies outside of the image.
+    """
+    grid = view.grid(coarser)
+    found = np.full(len(some), -np.inf)
+    for rows, window in _windows(library, view, some, grid):
+        one = _compared(library, view, some[rows], grid, window)
+        total = np.bincount(one.row, one.gain, len(rows)) + one.paid
+        found[rows] = np.where(one.inside, coarser**2 * total, -np.inf)
     return found
 
 
@@ -171,9 +190,64 @@ def _windows(
         )
 
 
-def _scored(
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """What M hypotheses say of a view: a row for each of N pixels that show one, and their sums.
+
+    Attributes:
+        row: number of the hypothesis, (N,) int64.
+        cells: pixel of the grid, (N,) int64.
+        gain: nats, (N,) float32.
+        on: whether its surface is measured, (N,) bool.
+        front: whether something in front of it is measured, (N,) bool.
+        paid: for what is not as it should be, nats, (M,).
+        seen: number of pixels that should show each, (M,).
+        through: number of those that show what is behind it, (M,).
+        hidden: number of pixels that show what is in front of it, (M,).
+        inside: whether each lies within the image, (M,) bool.
+    """
+
+    row: Index
+    cells: Index
+    gain: Float32
+    on: Mask
+    front: Mask
+    paid: Float
+    seen: Float
+    through: Float
+    hidden: Float
+    inside: Mask
+
+    def scores(self, grid: Grid) -> Iterator[Score | None]:
+        """Return the score of each; None for one outside of the image."""
+        count = len(self.paid)
+        kept = self.on | self.front
+        row, cells = self.row[kept], self.cells[kept]
+        # blocks of different hypotheses are different
+        apart = -(-grid.depth.shape[0] // BLOCK) * BLOCK * grid.depth.shape[1]
+        even = evened(
+            self.gain[kept], cells + row * apart, self.on[kept], grid.depth.shape[1]
+        )
+        ends = np.searchsorted(row, np.arange(count + 1))
+        for one in range(count):
+            part = slice(ends[one], ends[one + 1])
+            yield (
+                Score(
+                    cells[part].astype(np.int32),
+                    even[part],
+                    float(self.paid[one]),
+                    float(self.seen[one]),
+                    float(self.through[one]),
+                    float(self.hidden[one]),
+                )
+                if self.inside[one]
+                else None
+            )
+
+
+def _compared(
     library: Library, view: View, some: Hypotheses, grid: Grid, window: _Window
-) -> Iterator[Score | None]:
+) -> _Compared:
     """Compare hypotheses with windows of one size."""
     shown, z, cosine = _rendered(library, view, some, grid, window)
     pixels = np.flatnonzero(shown)
@@ -188,7 +262,7 @@ def _scored(
     variance = grid.sigma.ravel()[cells] ** 2 + slope**2
     variance += own.astype(np.float32)[row]
     off = measured - z
-    margin = np.maximum(FARTHEST * np.sqrt(variance), LEAST_MARGIN)
+    margin = FARTHEST * np.sqrt(variance)
     likely = np.log(np.exp(-(off**2) / 2 / variance) + np.exp(OUTLIER))
 
     got = measured > 0
@@ -214,25 +288,8 @@ def _scored(
     seen = np.bincount(row, weight * (got & ~front & ~(on & carries)), count)
     hidden = np.bincount(row, weight * front, count)
 
-    kept = on | front
-    row, cells = row[kept], cells[kept]
-    # blocks of different hypotheses are different
-    apart = -(-grid.depth.shape[0] // BLOCK) * BLOCK * grid.depth.shape[1]
-    even = evened(gain[kept], cells + row * apart, on[kept], grid.depth.shape[1])
-    ends = np.searchsorted(row, np.arange(count + 1))
-    for one in range(count):
-        if not shown[one].any():
-            yield None
-            continue
-        part = slice(ends[one], ends[one + 1])
-        yield Score(
-            cells[part].astype(np.int32),
-            even[part],
-            float(paid[one]),
-            float(seen[one]),
-            float(through[one]),
-            float(hidden[one]),
-        )
+    inside = shown.any((1, 2))
+    return _Compared(row, cells, gain, on, front, paid, seen, through, hidden, inside)
 
 
 def evened(gain: Float32, cells: Index, on: Mask, columns: int) -> Float32:

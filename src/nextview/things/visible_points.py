@@ -9,6 +9,7 @@ import numpy as np
 
 from nextview.cores import cores
 from nextview.geometry.pinhole import PinholeCamera
+from nextview.things.moments import Moments, looking_from
 from nextview.things.point_pairs import PointPairs
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
@@ -58,6 +59,11 @@ class VisiblePoints:
             self.points.reshape(count, -1, 3), self.normals.reshape(count, -1, 3)
         )
 
+    @cached_property
+    def moments(self) -> Moments:
+        """Moments of what each direction sees."""
+        return Moments.of(self.points, looking_from(self.directions))
+
 
 _IN_USE: WeakValueDictionary[bytes, VisiblePoints] = WeakValueDictionary()
 
@@ -97,22 +103,6 @@ def spread_directions(count: int) -> Float:
 
 
 ALL_AROUND = spread_directions(DIRECTIONS)
-
-
-def looking_from(directions: Float) -> Float:
-    """Rotations from the world to cameras that look at the origin.
-
-    Args:
-        directions: unit vectors from the origin to the cameras, (N, 3).
-
-    Returns:
-        Rotation matrices, (N, 3, 3), whose rows are the camera axes: x right, y down, z forward.
-    """
-    forward = -directions
-    aside = np.where(np.abs(forward[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    right = np.cross(forward, aside)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([right, np.cross(forward, right), forward], 1)
 
 
 def _rendered(

@@ -18,18 +18,22 @@ from scipy.spatial.transform import Rotation
 from nextview.sensing.view import View
 from nextview.things.flat import planes
 from nextview.things.library import Hypotheses, Library
-from nextview.things.propose import COARSER, COARSEST, SAME_POSE, best, propose
+from nextview.things.propose import (
+    COARSER,
+    COARSEST,
+    RESTART,
+    SAME_POSE,
+    best,
+    propose,
+)
 from nextview.things.register import camera_error, register
-from nextview.things.score import PIXEL_GAIN, Score, score, total
+from nextview.things.score import PIXEL_GAIN, Score, score, total, totals
 from nextview.types import Float, Float32, Index, Mask
 
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
 STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
 EXPLAINED = (
-    0.6  # share of a segment that is explained, from which on it is not searched
-)
-EXPLAINED_OF_UNION = (
-    0.3  # the same of several segments together: one of them is explained
+    0.3  # share of a segment that is explained, from which on it is not searched
 )
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 AS_LIKELY = (
@@ -37,6 +41,7 @@ AS_LIKELY = (
 )
 RIVALS_OF_ONE = 2  # hypotheses of one thing at one place that are kept
 LOOKALIKES, LOOKALIKES_OF_ONE = 4, 2  # of a new or doubtful thing that are kept
+RESTARTED = 3  # hypotheses of a place that are registered from other starts, at most
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
 SURE_SHARE = 0.7  # the same, above which a later view is not searched for a better name
@@ -177,41 +182,59 @@ class World:
             if last is not None and any(row[:-1]):
                 strange.ravel()[last.cells] = True
 
-        for segments, share, most, known in (
-            (view.instances, SURE_SHARE, EXPLAINED, before),
-            (view.unions, CLEAR_SHARE, EXPLAINED_OF_UNION, strange),
-            (view.fragments, CLEAR_SHARE, EXPLAINED, strange),
+        for segments, share, known in (
+            (view.instances, SURE_SHARE, before),
+            (view.unions, CLEAR_SHARE, strange),
+            (view.fragments, CLEAR_SHARE, strange),
         ):
             shown = world.explained(share) | view.enlarged(known)
-            left = [mask for mask in segments() if shown[mask].mean() < most]
+            left = [mask for mask in segments() if shown[mask].mean() < EXPLAINED]
             world = world._with_proposals(left, among)
 
         shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
         world = world._with_proposals(view.leftovers(shown), among)
-        return world.with_lookalikes(among).with_other_sizes().pruned()
+        world = world.with_lookalikes(among).with_other_starts()
+        return world.with_other_sizes().pruned()
 
     def _with_proposals(self, segments: Iterable[Mask], among: Mask) -> World:
         """Return the world with what segments of the last view may show."""
         new = propose(self.library, self.views[-1], segments, among)
         return self if new is None else self.with_hypotheses(new).chosen()
 
-    def with_other_sizes(self) -> World:
-        """Return the world with new or doubtful things in another size, that which fits best.
+    def with_other_starts(self) -> World:
+        """Return the world with new or doubtful things, registered from turned poses.
 
-        As often as in other sizes they are registered in their own.
+        The likeliest others of their places are registered so, too.
         """
-        own = some = self.hypotheses[self._doubtful()]
+        totals = self.totals
+        taught = self.hypotheses.taught
+        rows: set[int] = set()
+        for row in self._doubtful():
+            near = self.rivals(row)
+            near = near[taught[near] & (totals[near] > AS_LIKELY * totals[row])]
+            rows.update(near[np.argsort(-totals[near])][:RESTARTED].tolist())
+        if not rows:
+            return self
+        some = self.hypotheses[np.array(sorted(rows), np.int64)]
+        closer = (0.12, 0.08, 0.06, 0.04, 0.03, 0.02)
+        new = register(self.library, self.views, some.turned(RESTART), closer, 96)
+        gains = self._coarse_totals(new).reshape(len(some), -1)
+        first = gains.shape[1] * np.arange(len(some))
+        better = gains.max(1) > self._coarse_totals(some)
+        return self.with_hypotheses(new[(first + gains.argmax(1))[better]]).chosen()
+
+    def with_other_sizes(self) -> World:
+        """Return the world with new or doubtful things in another size, that which fits best."""
+        some = self.hypotheses[self._doubtful()]
         if not len(some):
             return self
-        closer = (0.06, 0.04, 0.03)
         for _ in range(RESIZED):
-            own = register(self.library, self.views, own, closer, 96)
             new = some.in_other_sizes()
-            new = register(self.library, self.views, new, closer, 96)
+            new = register(self.library, self.views, new, (0.06, 0.04, 0.03), 96)
             totals = self._coarse_totals(new).reshape(len(some), -1)
             some = new[totals.argmax(1) + totals.shape[1] * np.arange(len(some))]
         other = some[np.flatnonzero(~some.taught)]
-        return self.with_hypotheses(Hypotheses.joined([own, other])).chosen()
+        return self.with_hypotheses(other).chosen()
 
     def _doubtful(self) -> Index:
         """Return the rows of things that are new, or that explain less than is sure."""
@@ -244,8 +267,8 @@ class World:
 
     def _coarse_totals(self, some: Hypotheses) -> Float:
         """Score hypotheses on a coarser grid of all views, nats, (M,)."""
-        columns = [score(self.library, one, some, COARSEST) for one in self.views]
-        return np.array([total(row) for row in zip(*columns, strict=True)])
+        gains = [totals(self.library, one, some, COARSEST) for one in self.views]
+        return np.where(np.isfinite(gains), gains, 0).sum(0)
 
     def with_hypotheses(self, new: Hypotheses) -> World:
         """Return the world with more hypotheses, registered to all views."""
