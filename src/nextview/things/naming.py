@@ -18,8 +18,8 @@ PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats cou
 TOTAL_ERROR = 0.01  # of what a hypothesis explains: error by its pose and scan
 # log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
 # explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -9.65, 12.7, 0.32, 12.7
-LARGEST_LEAD = 0.2  # of what it explains: a larger lead counts as much
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.8, 12.3, 0.5, 32.8
+LARGEST_LEAD = 0.1  # of what it explains: a larger lead counts as much
 CONFIDENT = 0.97  # belief from which on a name is confident
 LIKELY = 0.5  # belief below which an object is unknown
 OUTLINE_PIXELS = 2.0  # of the grid, within which an outline is where it is measured
