@@ -288,8 +288,9 @@ def _compared(
     seen = np.bincount(row, weight * (got & ~front & ~(on & carries)), count)
     hidden = np.bincount(row, weight * front, count)
 
-    inside = shown.any((1, 2))
-    return _Compared(row, cells, gain, on, front, paid, seen, through, hidden, inside)
+    sums = (np.asarray(each, np.float64) for each in (paid, seen, through, hidden))
+    inside = np.asarray(shown.any((1, 2)))
+    return _Compared(row, cells, gain, on, front, *sums, inside)
 
 
 def evened(gain: Float32, cells: Index, on: Mask, columns: int) -> Float32:
