@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 from nextview.sensing.view import View
 from nextview.session.target import view_of
 from nextview.things.library import Hypotheses
+from nextview.things.moments import looking_from
 from nextview.things.point_pairs import (
     oriented,
 )
 from nextview.things.propose import PROPOSED, PROPOSED_OF_ONE
-from nextview.things.moments import looking_from
 from nextview.things.visible_points import spread_directions
 
 MUG = mesh_of(((0.08, 0.08, 0.1), (0, 0, 0)), ((0.05, 0.015, 0.06), (0.06, 0, 0.015)))

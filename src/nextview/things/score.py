@@ -230,18 +230,17 @@ class _Compared:
         )
         ends = np.searchsorted(row, np.arange(count + 1))
         for one in range(count):
+            if not self.inside[one]:
+                yield None
+                continue
             part = slice(ends[one], ends[one + 1])
-            yield (
-                Score(
-                    cells[part].astype(np.int32),
-                    even[part],
-                    float(self.paid[one]),
-                    float(self.seen[one]),
-                    float(self.through[one]),
-                    float(self.hidden[one]),
-                )
-                if self.inside[one]
-                else None
+            yield Score(
+                cells[part].astype(np.int32),
+                even[part],
+                float(self.paid[one]),
+                float(self.seen[one]),
+                float(self.through[one]),
+                float(self.hidden[one]),
             )
 
 
@@ -288,8 +287,18 @@ def _compared(
     seen = np.bincount(row, weight * (got & ~front & ~(on & carries)), count)
     hidden = np.bincount(row, weight * front, count)
 
-    inside = shown.any((1, 2))
-    return _Compared(row, cells, gain, on, front, paid, seen, through, hidden, inside)
+    return _Compared(
+        row,
+        cells,
+        gain,
+        on,
+        front,
+        np.asarray(paid, np.float64),
+        np.asarray(seen, np.float64),
+        np.asarray(through, np.float64),
+        np.asarray(hidden, np.float64),
+        np.asarray(shown.any((1, 2))),
+    )
 
 
 def evened(gain: Float32, cells: Index, on: Mask, columns: int) -> Float32:
