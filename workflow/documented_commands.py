@@ -931,7 +931,7 @@ def main(
             print(page, flush=True)
             beside = Path(place) / "beside" if page in BESIDE else None
             if beside is not None:
-                shutil.copytree(inputs, beside)
+                shutil.copytree(inputs, beside, dirs_exist_ok=True)
             failed += run_page(page, environments, folder, beside, update)
             shutil.rmtree(folder)
 
