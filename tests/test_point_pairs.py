@@ -16,10 +16,10 @@ from exact_views import (
 )
 from scipy.spatial.transform import Rotation
 
+from nextview.geometry.axes import looking_from
 from nextview.sensing.view import View
 from nextview.session.target import view_of
 from nextview.things.library import Hypotheses
-from nextview.things.moments import looking_from
 from nextview.things.point_pairs import (
     oriented,
 )

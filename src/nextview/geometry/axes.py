@@ -1,4 +1,4 @@
-"""Directions and axes that a user gives."""
+"""Directions and axes: those that a user gives, and those of cameras."""
 
 from typing import Any
 
@@ -54,3 +54,19 @@ def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
+
+
+def looking_from(directions: Float) -> Float:
+    """Rotations from the world to cameras that look at the origin.
+
+    Args:
+        directions: unit vectors from the origin to the cameras, (N, 3).
+
+    Returns:
+        Rotation matrices, (N, 3, 3), whose rows are the camera axes: x right, y down, z forward.
+    """
+    forward = -directions
+    aside = np.where(np.abs(forward[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    right = np.cross(forward, aside)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], 1)

@@ -141,7 +141,8 @@ class VerifiedRecogniser(NetworkRecogniser):
         alone = alone / alone.sum()
         if any(observation.radius is None for observation in observations):
             return JointBelief(alone, why_no_pose=NO_SCALE, doubt=NO_SCALE)
-        radius, radii = float(observations[-1].radius or 0.0), self.library.radii
+        radius = float(observations[-1].radius or 0.0)
+        radii = self.library.radii
         if not radii.min() / OTHER_SIZE < radius < radii.max() * OTHER_SIZE:
             return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
 
@@ -182,9 +183,11 @@ class VerifiedRecogniser(NetworkRecogniser):
         """Return what explains the object in some views best."""
         among: Mask = ~self.ruled_out[self.labels]
         seen = tuple(observations)
-        world, known = World(self.library), 0
+        known = 0
+        world = World(self.library)
         if self._last is not None and self._last[0] == seen[: len(self._last[0])]:
-            known, world = len(self._last[0]), self._last[1]
+            known = len(self._last[0])
+            world = self._last[1]
         for observation in seen[known:]:
             view = corrected(world, view_of(observation))
             # what is looked at is an object, and no piece of a wall

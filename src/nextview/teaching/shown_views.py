@@ -149,10 +149,12 @@ def _views(
     about = recogniser.card.memory
     assert about is not None
     if about.things[thing].upright:
-        lies, shares = recogniser.memory.rotations[thing][None], np.ones(1)
+        lies = recogniser.memory.rotations[thing][None]
+        shares = np.ones(1)
     else:
         stable = stable_poses(mesh)
-        lies, shares = stable.rotations, stable.shares
+        lies = stable.rotations
+        shares = stable.shares
 
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lies[rng.choice(len(lies), p=shares)]
     camera = SensedCamera(rotated(mesh, turn), sensor, rng.spawn(1)[0])

@@ -39,6 +39,7 @@ def planes(view: View) -> tuple[Score, ...]:
     stride = view.stride
     found: list[Score] = []
     held = np.zeros(grid.depth.shape, bool)
+
     for labels in (view.labels, view.pieces):
         small = np.where(measured, labels[::stride, ::stride], 0)
         counts = np.bincount(small.ravel())

@@ -90,6 +90,7 @@ class Library:
         self.near = near
         self.caster = SurfaceCaster(surfaces)
         self.camera = CAMERA_ERROR
+
         self.visible: VisiblePoints = (
             visible_points(self.caster, threads)
             if directions is None

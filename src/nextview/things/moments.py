@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nextview.geometry.axes import looking_from
 from nextview.sensing.view import View
 from nextview.things.point_pairs import FEWEST, TURNS
 from nextview.types import Float, Float32, Floats, Index, Mask
@@ -96,22 +97,6 @@ class Moments:
         to_world = look.T @ about_the_ray()[turn]
         arms = np.einsum("nij,nj->ni", to_world, self.means[things, direction])
         return things, to_world @ self.looks[direction], middle - arms
-
-
-def looking_from(directions: Float) -> Float:
-    """Rotations from the world to cameras that look at the origin.
-
-    Args:
-        directions: unit vectors from the origin to the cameras, (N, 3).
-
-    Returns:
-        Rotation matrices, (N, 3, 3), whose rows are the camera axes: x right, y down, z forward.
-    """
-    forward = -directions
-    aside = np.where(np.abs(forward[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    right = np.cross(forward, aside)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([right, np.cross(forward, right), forward], 1)
 
 
 def about_the_ray() -> Float:

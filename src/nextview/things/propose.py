@@ -15,17 +15,19 @@ import numpy as np
 from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
-from nextview.things.score import totals
+from nextview.things.score import total_scores
 from nextview.types import Float, Float32, Mask
 
 PROPOSED = 600  # poses that pairs of points propose, at most
 PROPOSED_OF_ONE = 20  # the same of one thing
-BY_MOMENTS, BY_MOMENTS_OF_ONE = 150, 6  # the same that moments propose
+BY_MOMENTS = 150  # poses that moments propose, at most
+BY_MOMENTS_OF_ONE = 6  # the same of one thing
 REGISTERED = 120  # poses that are registered after a first look, at most
 MATCHED = 40  # hypotheses that are registered more closely, at most
 MATCHED_OF_ONE = 4  # the same of one thing
-RESTARTED, RESTARTED_OF_ONE = 12, 2  # of these that are registered from other starts
-RESTART = 0.25  # radians, by which they are turned
+RESTARTED = 12  # hypotheses that are registered from turned poses, too, at most
+RESTARTED_OF_ONE = 2  # the same of one thing
+RESTART = 0.25  # radians, by which these are turned
 SCORED = 16  # hypotheses that are rendered, at most
 SCORED_OF_ONE = 3  # the same of one thing
 KEPT = 8  # hypotheses of one segment that are kept, at most
@@ -71,16 +73,11 @@ def _of_segment(
 
     A thing may go on in other instances, so at last it is drawn into these, too.
     """
-    pairs, moments = library.visible.pairs, library.visible.moments
-    found = Hypotheses.joined(
-        [
-            Hypotheses.of(*way.propose(view, mask, among, most, of_one))
-            for way, most, of_one in (
-                (pairs, PROPOSED, PROPOSED_OF_ONE),
-                (moments, BY_MOMENTS, BY_MOMENTS_OF_ONE),
-            )
-        ]
-    )
+    pairs = library.visible.pairs
+    by_pairs = pairs.propose(view, mask, among, PROPOSED, PROPOSED_OF_ONE)
+    moments = library.visible.moments
+    by_moments = moments.propose(view, mask, among, BY_MOMENTS, BY_MOMENTS_OF_ONE)
+    found = Hypotheses.joined([Hypotheses.of(*by_pairs), Hypotheses.of(*by_moments)])
     if not len(found):
         return None
 
@@ -96,19 +93,19 @@ def _of_segment(
     # fewer closer, then by their score
     closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
     found = register(library, [view], found, closer, 96, instances)
-    gains = totals(library, view, found, COARSEST)
-    some = best(library, found, gains, RESTARTED, RESTARTED_OF_ONE)
+    totals = total_scores(library, view, found, COARSEST)
+    some = best(library, found, totals, RESTARTED, RESTARTED_OF_ONE)
     some = register(library, [view], some.turned(RESTART), closer, 96, instances)
     found = Hypotheses.joined([found, some])
-    gains = np.append(gains, totals(library, view, some, COARSEST))
-    found = best(library, found, gains, SCORED, SCORED_OF_ONE)
+    totals = np.append(totals, total_scores(library, view, some, COARSEST))
+    found = best(library, found, totals, SCORED, SCORED_OF_ONE)
     found = register(library, [view], found, (0.03, 0.03), 128, instances)
     found = register(library, [view], found, (0.02,), 128)
-    gains = totals(library, view, found, COARSER)
-    explain = np.flatnonzero(gains > 0)
+    totals = total_scores(library, view, found, COARSER)
+    explain = np.flatnonzero(totals > 0)
     if not len(explain):
         return None
-    return best(library, found[explain], gains[explain], KEPT, KEPT_OF_ONE)
+    return best(library, found[explain], totals[explain], KEPT, KEPT_OF_ONE)
 
 
 def best(

@@ -86,6 +86,7 @@ def score(
     """
     grid = view.grid(coarser)
     found: list[Score | None] = [None] * len(some)
+
     for rows, window in _windows(library, view, some, grid):
         compared = _compared(library, view, some[rows], grid, window)
         for row, one in zip(rows, compared.scores(grid), strict=True):
@@ -103,7 +104,7 @@ def score(
     return found
 
 
-def totals(library: Library, view: View, some: Hypotheses, coarser: int) -> Float:
+def total_scores(library: Library, view: View, some: Hypotheses, coarser: int) -> Float:
     """Compare hypotheses with a view, as ``score`` does, and return no more than the totals.
 
     Args:
@@ -222,7 +223,8 @@ class _Compared:
         """Return the score of each; None for one outside of the image."""
         count = len(self.paid)
         kept = self.on | self.front
-        row, cells = self.row[kept], self.cells[kept]
+        row = self.row[kept]
+        cells = self.cells[kept]
         # blocks of different hypotheses are different
         apart = -(-grid.depth.shape[0] // BLOCK) * BLOCK * grid.depth.shape[1]
         even = evened(

@@ -8,8 +8,9 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from nextview.cores import cores
+from nextview.geometry.axes import looking_from
 from nextview.geometry.pinhole import PinholeCamera
-from nextview.things.moments import Moments, looking_from
+from nextview.things.moments import Moments
 from nextview.things.point_pairs import PointPairs
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask

@@ -27,7 +27,7 @@ from nextview.things.propose import (
     propose,
 )
 from nextview.things.register import camera_error, register
-from nextview.things.score import PIXEL_GAIN, Score, score, total, totals
+from nextview.things.score import PIXEL_GAIN, Score, score, total, total_scores
 from nextview.types import Float, Float32, Index, Mask
 
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
@@ -215,6 +215,8 @@ class World:
             rows.update(near[np.argsort(-totals[near])][:RESTARTED].tolist())
         if not rows:
             return self
+
+        # of each the best one, if it is better
         some = self.hypotheses[np.array(sorted(rows), np.int64)]
         closer = (0.12, 0.08, 0.06, 0.04, 0.03, 0.02)
         new = register(self.library, self.views, some.turned(RESTART), closer, 96)
@@ -267,7 +269,7 @@ class World:
 
     def _coarse_totals(self, some: Hypotheses) -> Float:
         """Score hypotheses on a coarser grid of all views, nats, (M,)."""
-        gains = [totals(self.library, one, some, COARSEST) for one in self.views]
+        gains = [total_scores(self.library, one, some, COARSEST) for one in self.views]
         return np.where(np.isfinite(gains), gains, 0).sum(0)
 
     def with_hypotheses(self, new: Hypotheses) -> World:
