@@ -22,7 +22,6 @@ from nextview.geometry.resting import resting_poses
 EXTRAS = (
     "torch",
     "pandas",
-    "gymnasium",
     "viser",
     "rerun",
     "distributed",
