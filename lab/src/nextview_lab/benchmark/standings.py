@@ -1,34 +1,26 @@
-"""The leaderboard of a frozen archive: files of results are checked, compared and put on a page."""
+"""The leaderboard of a frozen archive: files of results are checked, compared and put on a page.
+
+Names of methods and of archives come from elsewhere: each is one line without control characters.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nextview.checks import number_of, one_line, whole
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ResultsError, UsageError
 from nextview.files import check_new, new_folder, read_record
 from nextview.geometry.mesh import load_mesh
-from nextview.recognition.poses import PoseCandidate, turn_apart
 from nextview.things.surface import Surface
-from nextview.things.symmetry import find_symmetries
-from nextview.types import Float, Index
+from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import (
-    NONE,
-    Leaderboard,
-    WrittenTable,
-    as_markdown,
-    plain,
-    points,
-)
+from nextview_lab.benchmark.board_page import NONE, WrittenTable, points
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -45,8 +37,8 @@ from nextview_lab.benchmark.submit import (
     SaidAfterView,
     Submission,
     SubmittedEpisode,
-    mean_seconds,
 )
+from nextview_lab.data.metrics import add_s
 from nextview_lab.extras import extras
 
 with extras():
@@ -60,11 +52,9 @@ SHARES = {
     name: (name, ONE)
     for name in (RIGHT, CONFIDENT_RIGHT, CONFIDENT_WRONG, UNKNOWN_SAID)
 }
-SURFACE_POINTS = 20_000  # among which the nearest is looked for
-JUDGED_POINTS = 2_000  # of the true surface
+SURFACE_POINTS = 2_000
 MOST_SAMPLES = 100_000  # of the bootstrap
 PAGE_FILE = "leaderboard.html"
-TEXT_FILE = "leaderboard.md"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,18 +65,13 @@ class Scored:
         submission: the file.
         said: after each view of each episode, in the order of the archive.
         right: whether the name is right, (episodes, views) bool.
-        distances: median distance of surfaces, mm, after the last view of the episodes whose name
-            is right and has a pose, (E,).
-        turns: rotation error modulo symmetries of the same episodes, degrees, (E,).
-        posed: rows of these episodes, (E,) int64.
+        errors: ADD-S, mm, after the last view of the episodes whose name is right and has a pose.
     """
 
     submission: Submission
     said: tuple[tuple[SaidAfterView, ...], ...]
     right: Any
-    distances: Float
-    turns: Float
-    posed: Index
+    errors: tuple[float, ...]
 
     def episodes(self) -> "pd.DataFrame":
         """Return the long table: each episode after each view, and what was said after the last."""
@@ -108,57 +93,21 @@ class Scored:
         )
 
 
-class KnownShape:
-    """The scan of a thing, to compare poses of it."""
+@dataclass(frozen=True)
+class Leaderboard:
+    """Methods that are compared on an archive.
 
-    def __init__(self, file: Path, name: str) -> None:
-        """Read the scan.
+    Attributes:
+        archive: its name.
+        reference: the method with which the others are compared; None without a blind one.
+        tables: all of them, the most important first.
+        notes: what a reader has to know.
+    """
 
-        Args:
-            file: of the scan, in metres.
-            name: of the thing.
-        """
-        self._surface = Surface.from_mesh(load_mesh(file, unit="m"), name)
-        rng = np.random.default_rng(0)
-        triangles = self._surface.triangles_by_area(SURFACE_POINTS, rng)
-        corners = self._surface.vertices[self._surface.faces[triangles]].astype(float)
-        shares = rng.dirichlet((1.0, 1.0, 1.0), SURFACE_POINTS)
-        self._points = (shares[:, :, None] * corners).sum(1)
-        edges = corners[:, 1:] - corners[:, :1]
-        normals = np.cross(edges[:, 0], edges[:, 1])
-        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        self._tree = cKDTree(self._points)
-
-    @cached_property
-    def symmetry(self) -> tuple[Any, ...]:
-        """Axes about which it looks the same after a turn."""
-        return find_symmetries(self._surface)
-
-    def distance(self, pose: Float, true: Float) -> float:
-        """Return the median distance of the true surface from the posed one, millimetres.
-
-        Args:
-            pose: that is judged, (4, 4), metres.
-            true: pose, (4, 4), metres.
-        """
-        there = self._points[:JUDGED_POINTS] @ true[:3, :3].T + true[:3, 3]
-        in_scan = (there - pose[:3, 3]) @ pose[:3, :3]
-        _, nearest = self._tree.query(in_scan)
-        off = ((in_scan - self._points[nearest]) * self._normals[nearest]).sum(1)
-        return float(1000 * np.median(np.abs(off)))
-
-    def turn(self, pose: Float, true: Float) -> float:
-        """Return the angle between two poses modulo the symmetries, degrees.
-
-        Args:
-            pose: the one, (4, 4).
-            true: the other, (4, 4).
-        """
-        one, other = (
-            PoseCandidate("", 0, each, 1.0, symmetry=self.symmetry)
-            for each in (pose, true)
-        )
-        return turn_apart(one, other)
+    archive: str
+    reference: str | None
+    tables: tuple[WrittenTable, ...]
+    notes: tuple[str, ...]
 
 
 def leaderboard_of(
@@ -181,12 +130,12 @@ def leaderboard_of(
     Args:
         folder: with the result files of nextview-lab submit (.json).
         archive: folder of the archive, with its truth.
-        out: folder to write, with leaderboard.html and leaderboard.md.
+        out: folder to write, with leaderboard.html.
         reference: method with which the others are compared; by default the blind one that is right
             most often after the first view.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap.
-        overwrite: replace the two files in OUT.
+        overwrite: replace the page in OUT.
         track: follows the files.
 
     Returns:
@@ -208,16 +157,21 @@ def leaderboard_of(
         )
 
     truths = frozen.truths()
-    shapes: dict[str, KnownShape] = {}
+    clouds: dict[str, Float] = {}
     scored: list[Scored] = []
-    track(_score_all(read, frozen, truths, shapes, scored), len(read), "methods")
+
+    def score() -> Iterator[int]:
+        for one in read:
+            scored.append(_scored(one, frozen, truths, clouds))
+            yield len(scored)
+
+    track(score(), len(read), "methods")
     scored.sort(key=lambda one: (-one.right[:, -1].mean(), one.submission.method))
 
     board = _board(frozen, scored, list(truths.values()), reference, samples, seed)
     with new_folder(Path(out), overwrite) as part:
         page = render("leaderboard.html", board=board, sha256=frozen.sha256)
         (part / PAGE_FILE).write_text(page, encoding="utf-8")
-        (part / TEXT_FILE).write_text(as_markdown(board), encoding="utf-8")
     return board
 
 
@@ -241,9 +195,11 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
         _check_submission(one, frozen, str(file))
         # no episode has more: what was asked for beyond is no work
         longest = max(len(each.said) for each in one.episodes)
-        one = msgspec.structs.replace(one, views=longest)
-        shown = one_line(one.method)
-        if shown in read:
+        named = {
+            name: one_line(getattr(one, name), 100) for name in ("method", "version")
+        }
+        one = msgspec.structs.replace(one, views=longest, **named)
+        if one.method in read:
             raise ResultsError(f"{file}: another file has the method {one.method}, too")
 
         first = next(iter(read.values()), one)
@@ -252,7 +208,7 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
                 f"{file}: has {number_of(one.views, 'view')} of each episode,"
                 f" {first.method} {first.views}; they are compared after equally many"
             )
-        read[shown] = one
+        read[one.method] = one
     return list(read.values())
 
 
@@ -306,32 +262,17 @@ def _check_episode(
         check_said(said.name, said.confidence, said.pose, tuple(frozen.things), where)
 
 
-def _score_all(
-    read: Sequence[Submission],
-    frozen: FrozenArchive,
-    truths: dict[str, EpisodeTruth],
-    shapes: dict[str, KnownShape],
-    scored: list[Scored],
-) -> Iterator[int]:
-    """Compare each file with the truth; yields how many are done."""
-    for done, one in enumerate(read, 1):
-        scored.append(_scored(one, frozen, truths, shapes))
-        yield done
-
-
 def _scored(
     one: Submission,
     frozen: FrozenArchive,
     truths: dict[str, EpisodeTruth],
-    shapes: dict[str, KnownShape],
+    clouds: dict[str, Float],
 ) -> Scored:
-    """Compare a file with the truth."""
+    """Compare a file with the truth; ``clouds`` keeps points on the scans."""
     by_number = {each.episode: each.said for each in one.episodes}
     said = tuple(by_number[number] for number in truths)
     right = np.zeros((len(said), one.views), bool)
-    posed = []
-    distances = []
-    turns = []
+    errors = []
 
     for row, (answers, truth) in enumerate(zip(said, truths.values(), strict=True)):
         names = [each.name == truth.thing for each in answers]
@@ -340,16 +281,14 @@ def _scored(
         pose = answers[-1].pose
         if not names[-1] or pose is None:
             continue
-        if truth.thing not in shapes:
-            shapes[truth.thing] = KnownShape(frozen.scan(truth.thing), truth.thing)
-        shape = shapes[truth.thing]
-        found = np.array(pose)
-        true = np.array(truth.pose)
-        posed.append(row)
-        distances.append(shape.distance(found, true))
-        turns.append(shape.turn(found, true))
-    rows = np.array(posed, np.int64)
-    return Scored(one, said, right, np.array(distances), np.array(turns), rows)
+        if truth.thing not in clouds:
+            scan = load_mesh(frozen.scan(truth.thing), unit="m")
+            surface = Surface.from_mesh(scan, truth.thing)
+            rng = np.random.default_rng(0)
+            clouds[truth.thing] = surface.sample(SURFACE_POINTS, rng)
+        off = add_s(clouds[truth.thing], np.array(pose), np.array(truth.pose))
+        errors.append(1000 * off)
+    return Scored(one, said, right, tuple(errors))
 
 
 def best_blind_method(scored: Sequence[Scored]) -> str | None:
@@ -389,7 +328,7 @@ def _board(
     shares = counted.measures(ALL, weights)
 
     compared = best_blind_method(scored) if reference is None else reference
-    tables = [_main_table(scored, shares, weights, len(order))]
+    tables = [_main_table(scored, shares, len(order))]
     notes = [
         f"{len(truths)} episodes with {number_of(len(order), 'thing')}; episodes with one thing are"
         " resampled together.",
@@ -408,15 +347,13 @@ def _board(
                     f"The reference, {compared}, is the best blind method on these same episodes,"
                     " which favours it."
                 )
-    return plain(
-        Leaderboard(frozen.manifest.name, compared, tuple(tables), tuple(notes))
-    )
+    name = one_line(frozen.manifest.name)
+    return Leaderboard(name, compared, tuple(tables), tuple(notes))
 
 
 def _main_table(
     scored: Sequence[Scored],
     shares: "pd.DataFrame",
-    weights: Float,
     things: int,
 ) -> WrittenTable:
     """Return the table of all methods."""
@@ -439,31 +376,18 @@ def _main_table(
             _with_interval(numbers[name, measure, at], things)
             for _, measure, at in columns
         ]
-
-        seconds = mean_seconds(one.submission.episodes)
-        rows.append(
-            (
-                f"{name} ({one.submission.version})",
-                *cells,
-                _median(one.distances, one.posed, weights),
-                _median(one.turns, one.posed, weights),
-                NONE if seconds is None else f"{seconds:.2f}",
-            )
-        )
+        off = f"{np.median(one.errors):.1f}" if one.errors else NONE
+        rows.append((f"{name} ({one.submission.version})", *cells, off))
 
     return WrittenTable(
         "Methods",
         f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
-        " of things that are named right. CPU time is that of a method and of processes that it has"
-        " waited for."
-        " In brackets: 95 % bootstrap intervals; Wilson's, with as many samples as things, where"
-        " all episodes agree.",
+        " of things that are named right. In brackets: 95 % bootstrap intervals; Wilson's, with as"
+        " many samples as things, where all episodes agree.",
         (
             "method",
             *(heading for heading, _, _ in columns),
-            "surface off, mm, median",
-            "rotation off, degrees, median",
-            "CPU, s a view",
+            "ADD-S, mm, median",
         ),
         tuple(rows),
     )
@@ -478,20 +402,6 @@ def _with_interval(number: tuple[float, float, float], things: int) -> str:
     if value in (0, 1):
         low, high = st.wilson(int(value) * things, things)
     return f"{value:.3f} ({low:.3f} to {high:.3f})"
-
-
-def _median(values: Float, rows: Index, weights: Float) -> str:
-    """Format a median of some episodes with its interval; ``weights`` are (S, episodes)."""
-    if not len(values):
-        return NONE
-    order = np.argsort(values)
-    once = np.ones((1, weights.shape[1]))
-    total = np.cumsum(np.vstack([once, weights])[:, rows[order]], axis=1)
-    total = total[total[:, -1] > 0]
-    half = (total >= total[:, -1:] / 2).argmax(1)
-    medians = values[order][half]
-    low, high = np.quantile(medians[1:], (0.025, 0.975))
-    return f"{medians[0]:.1f} ({low:.1f} to {high:.1f})"
 
 
 def _differences_table(tests: "pd.DataFrame", reference: str) -> WrittenTable:

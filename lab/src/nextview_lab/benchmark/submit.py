@@ -1,17 +1,15 @@
 """Run a method over a frozen archive, and write its answers into one file of results."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import numpy as np
 
-from nextview.checks import number, number_of, one_line, whole
+from nextview.checks import one_line, whole
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import UsageError
 from nextview.files import (
@@ -35,13 +33,11 @@ from nextview_lab.benchmark.methods import (
 SUBMISSION_FORMAT = 1
 COMMON_VIEWS = 3  # of an episode
 LONGEST_NAME = 80  # letters of a method's name, of its version, and of a policy
-LONGEST_VIEW = 1e7  # seconds of CPU
 
 # what a field of a file of results may be: more would be no result, but work
 ViewNumber = Annotated[int, msgspec.Meta(ge=0, lt=LARGEST_FROZEN_VIEWS)]
 ViewCount = Annotated[int, msgspec.Meta(ge=1, le=LARGEST_FROZEN_VIEWS)]
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
-Seconds = Annotated[float, msgspec.Meta(ge=0, le=LONGEST_VIEW)]
 ShortText = Annotated[
     str, msgspec.Meta(min_length=1, max_length=len("nextview ") + LONGEST_NAME)
 ]
@@ -63,9 +59,6 @@ class SubmitOptions:
         blind: the next views of --command ignore the images, so that it can be the reference for
             those that look.
         max_views: views of each episode, or all of them where there are fewer.
-        episodes: number of episodes, the first ones, for a first try; by default all. The
-            leaderboard refuses a file without all.
-        wait: seconds to wait for an answer of --command.
         seed: seed of nextview's random policies.
     """
 
@@ -76,8 +69,6 @@ class SubmitOptions:
     version: str | None = None
     blind: bool = False
     max_views: int = COMMON_VIEWS
-    episodes: int | None = None
-    wait: float = 600.0
     seed: int = 0
 
 
@@ -90,7 +81,6 @@ class SaidAfterView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         confidence: probability of the name.
         confident: whether a robot should act on it.
         pose: from the scan to the world, (4, 4), metres; None without one.
-        cpu_seconds: that it took; None where it is not known.
     """
 
     view: ViewNumber
@@ -98,7 +88,6 @@ class SaidAfterView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confidence: Probability
     confident: bool
     pose: PoseRows | None
-    cpu_seconds: Seconds | None
 
 
 class SubmittedEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -139,35 +128,13 @@ class Submission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     episodes: tuple[SubmittedEpisode, ...]
 
 
-@dataclass(frozen=True)
-class Submitted:
-    """What was run.
-
-    Attributes:
-        method: name of the method.
-        episodes: how many were run, those of an earlier run too.
-        cpu_seconds: of a view, mean; None where that of a view is not known.
-        whole: whether these are all episodes of the archive.
-    """
-
-    method: str
-    episodes: int
-    cpu_seconds: float | None
-    whole: bool
-
-    def __str__(self) -> str:
-        seconds = "-" if self.cpu_seconds is None else f"{self.cpu_seconds:.2f}"
-        time = f", {seconds} s of CPU a view"
-        return f"{self.method}: {number_of(self.episodes, 'episode')}{time}"
-
-
 def submit(
     archive: Path,
     out: Path,
     how: SubmitOptions = SubmitOptions(),
     overwrite: bool = False,
     track: TrackProgress = silently,
-) -> Submitted:
+) -> Submission:
     """Run a method over the episodes of a frozen archive, and write its answers.
 
     A method sees a depth image, a mask and poses of cameras, names what it sees, and chooses
@@ -182,7 +149,7 @@ def submit(
         track: follows the episodes.
 
     Returns:
-        What was run.
+        What the method said.
 
     Raises:
         DatasetError: the archive is damaged.
@@ -193,7 +160,6 @@ def submit(
     check_new(out, overwrite)
     _check_options(out, how)
     frozen = FrozenArchive(archive)
-    numbers = frozen.numbers[: how.episodes]
     ours = f"--models {how.models} --policy {how.policy} --seed {how.seed}"
     run = ours if how.command is None else how.command
 
@@ -202,11 +168,11 @@ def submit(
     ).hexdigest()
     with only_one(out), unfinished(out, key) as parts:
         with _method(frozen, how) as method:
-            steps = _episodes(frozen, numbers, method, how, parts)
-            track(steps, len(numbers), "episodes")
+            steps = _episodes(frozen, method, how, parts)
+            track(steps, len(frozen.numbers), "episodes")
         episodes = tuple(
             read_record(parts / f"{number}.json", SubmittedEpisode, "answers")
-            for number in numbers
+            for number in frozen.numbers
         )
         submission = Submission(
             SUBMISSION_FORMAT,
@@ -220,24 +186,7 @@ def submit(
             episodes,
         )
         write_record(out, submission, overwrite)
-
-    return Submitted(
-        method.name,
-        len(episodes),
-        mean_seconds(episodes),
-        len(episodes) == len(frozen.numbers),
-    )
-
-
-def mean_seconds(episodes: Sequence[SubmittedEpisode]) -> float | None:
-    """Return the CPU time of a view, mean, seconds; None where that of one is not known.
-
-    Args:
-        episodes: what was said.
-    """
-    times = [said.cpu_seconds for one in episodes for said in one.said]
-    known = [seconds for seconds in times if seconds is not None]
-    return float(np.mean(known)) if known and len(known) == len(times) else None
+    return submission
 
 
 def _check_options(out: Path, how: SubmitOptions) -> None:
@@ -245,9 +194,6 @@ def _check_options(out: Path, how: SubmitOptions) -> None:
     if out.suffix.lower() != ".json":
         raise UsageError(f"{out}: the name ends in .json")
     whole(how.max_views, "the number of views", 1, LARGEST_FROZEN_VIEWS)
-    if how.episodes is not None:
-        whole(how.episodes, "the number of episodes", 1)
-    number(how.wait, "the time to wait, seconds,", above=0)
     if how.command is None and (how.name or how.version or how.blind):
         raise UsageError("--name, --version and --blind are for a --command")
     if how.command is not None and not (how.name and how.version):
@@ -269,7 +215,7 @@ def _method(frozen: FrozenArchive, how: SubmitOptions) -> Iterator[Method]:
         return
     assert how.name is not None
     assert how.version is not None
-    method = CommandMethod(how.command, how.name, how.version, how.blind, how.wait)
+    method = CommandMethod(how.command, how.name, how.version, how.blind)
     try:
         yield method
         method.finish()
@@ -279,16 +225,15 @@ def _method(frozen: FrozenArchive, how: SubmitOptions) -> Iterator[Method]:
 
 def _episodes(
     frozen: FrozenArchive,
-    numbers: tuple[str, ...],
     method: Method,
     how: SubmitOptions,
     parts: Path,
 ) -> Iterator[int]:
     """Run each episode that is not done, and keep its answers; yields how many are done."""
-    for done, number_ in enumerate(numbers, 1):
-        part = parts / f"{number_}.json"
+    for done, number in enumerate(frozen.numbers, 1):
+        part = parts / f"{number}.json"
         if not part.exists():
-            write_record(part, run_episode(frozen, number_, method, how.max_views))
+            write_record(part, run_episode(frozen, number, method, how.max_views))
         yield done
 
 
@@ -335,9 +280,7 @@ def run_episode(
             held=told.held,
             things=things,
         )
-        begun = method.cpu_seconds()
         answer = method.answer(look)
-        seconds = method.cpu_seconds() - begun
         check_answer(answer, look, f"{method.name}, episode {episode}, view {step}")
         said.append(
             SaidAfterView(
@@ -346,7 +289,6 @@ def run_episode(
                 answer.confidence,
                 answer.confident,
                 answer.pose,
-                round(seconds, 3) if isfinite(seconds) else None,
             )
         )
         if look.free:

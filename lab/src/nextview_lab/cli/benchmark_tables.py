@@ -13,12 +13,7 @@ from rich.table import Table
 from nextview.checks import number_of
 from nextview.cli.progress import Terminal, console
 from nextview_lab.benchmark import class_tables as board
-from nextview_lab.benchmark.board_page import (
-    Leaderboard,
-    WrittenTable,
-    points,
-    written,
-)
+from nextview_lab.benchmark.board_page import WrittenTable, points, written
 from nextview_lab.benchmark.bop import BopRun
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant
@@ -26,7 +21,7 @@ from nextview_lab.benchmark.evaluation import Evaluation
 from nextview_lab.benchmark.page import Number, numbers
 from nextview_lab.benchmark.real import RealRun, real_table
 from nextview_lab.benchmark.results import ComparedTables
-from nextview_lab.benchmark.submit import Submitted
+from nextview_lab.benchmark.standings import Leaderboard
 from nextview_lab.errors import EntryError
 
 MOST_WHOLE_COLUMNS = 7  # of a table with its intervals; the page has them all
@@ -171,21 +166,6 @@ def _cell(number: Number, digits: int) -> str:
     low, high = (f"{end:.{digits}f}" for end in (number.low, number.high))
     interval = f" ({low}-{high})" if number.high > number.low else ""
     return f"{number.value:.{digits}f}{interval}"
-
-
-def print_submitted(run: Submitted) -> None:
-    """Print what was run.
-
-    Args:
-        run: what was run.
-    """
-    Terminal().print(str(run), soft_wrap=True)
-    if not run.whole:
-        console.print(
-            "these are not all episodes of the archive: the leaderboard refuses the file",
-            style="yellow",
-            soft_wrap=True,
-        )
 
 
 def print_standings(board: Leaderboard) -> None:

@@ -172,7 +172,6 @@ COMMANDS = {
         "nextview_lab.benchmark.submit:submit",
         "run a method over a frozen archive of episodes",
         "wrote {out}; next: nextview-lab leaderboard FOLDER {archive} OUT",
-        f"{CLI}.benchmark_tables:print_submitted",
         example="submit nextview-bench-1.0 results/random.json --policy random",
     ),
     "leaderboard": Command(
