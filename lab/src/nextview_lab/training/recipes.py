@@ -77,8 +77,6 @@ class RecogniserRecipe:
             in turn.
         lr_schedule: schedule of the learning rate: one cycle up and down, or halved every fifth
             epoch.
-        patience: stop after so many epochs without a better class mean on validation; 0 never stops
-            early.
         interpolation: position of the final weights between the initial (0) and the trained ones
             (1). Values below 1 retain more of the initial network (Wortsman et al., "Robust
             fine-tuning of zero-shot models", CVPR 2022).
@@ -103,7 +101,6 @@ class RecogniserRecipe:
     augment: bool = True
     balanced: bool = True
     lr_schedule: Literal["one-cycle", "halving"] = "one-cycle"
-    patience: int = 0
     interpolation: float = 1.0
 
     def __post_init__(self) -> None:
@@ -163,8 +160,6 @@ class MapRecipe:
             fifth epoch.
         validation_share: share of the training split that is held out for validation.
         seed: seed of all random draws.
-        patience: stop after so many epochs without a lower error on validation; 0 never stops
-            early.
     """
 
     measure: str = "depth_entropy"
@@ -186,7 +181,6 @@ class MapRecipe:
     lr_schedule: Literal["one-cycle", "tenth"] = "one-cycle"
     validation_share: float = 0.1
     seed: int = 0
-    patience: int = 0
 
     def __post_init__(self) -> None:
         _check(
@@ -269,9 +263,6 @@ class SegmentationRecipe:
         validation_share: share of the meshes that is held out for validation, and number of
             validation frames relative to --frames.
         seed: seed of all random numbers, including those of the frames.
-        patience: stop after so many epochs without a lower loss on validation; 0 never stops early.
-        interpolation: position of the final weights between the initial (0) and the trained ones
-            (1), as of the recogniser; for --start.
     """
 
     frames: int = 12_000
@@ -282,8 +273,6 @@ class SegmentationRecipe:
     weight_decay: float = 0.01
     validation_share: float = 0.05
     seed: int = 0
-    patience: int = 0
-    interpolation: float = 1.0
 
     def __post_init__(self) -> None:
         _check(self, ("frames", "width", "epochs", "batch"), ("validation_share",))

@@ -27,7 +27,6 @@ from nextview.files import (
     sha256_of,
     write_record,
 )
-from nextview.segmentation.network import SegmentationCard
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import extras
@@ -39,7 +38,7 @@ with extras():
     import torch
     from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
     from lightning.fabric.utilities.rank_zero import rank_zero_only
-    from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+    from lightning.pytorch.callbacks import ModelCheckpoint
     from torch import Tensor, nn
     from torch.utils.data import DataLoader, IterableDataset
 
@@ -241,19 +240,6 @@ class Checkpoint(ModelCheckpoint):
         super().load_state_dict(state_dict | {"dirpath": self.dirpath})
 
 
-class Patience(EarlyStopping):
-    """Stops after some epochs without improvement; a resumed run stays stopped."""
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Stop a resumed run whose patience was exhausted before.
-
-        Args:
-            trainer: Lightning's trainer.
-            pl_module: the module.
-        """
-        trainer.should_stop = self.wait_count >= self.patience
-
-
 def fit(
     module: L.LightningModule,
     training: IterableDataset,
@@ -285,10 +271,6 @@ def fit(
         Checkpoint(out, "best", select, mode),
         Checkpoint(out, "last"),
     ]
-    if recipe.patience:
-        callbacks.append(
-            Patience(select, patience=recipe.patience, mode=mode, verbose=False)
-        )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         # Lightning's warnings concern intended behaviour: resuming, and datasets that create their
@@ -395,7 +377,7 @@ def new_run(
     recipe: Any,
     weights: Path | None,
     held_out: Sequence[str],
-    made: Iterable[ViewStore | Predictions | SegmentationCard],
+    made: Iterable[ViewStore | Predictions],
 ) -> Run:
     """Describe a run of the current command.
 
@@ -403,7 +385,7 @@ def new_run(
         recipe: of the training.
         weights: file or run with the initial weights; None for random ones.
         held_out: names of the validation objects.
-        made: stores, predictions and networks that the run uses.
+        made: stores and predictions that the run uses.
 
     Returns:
         The description.
