@@ -1,7 +1,6 @@
 """Network inputs of a whole store, computed once and stored next to it."""
 
 import os
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -99,11 +98,8 @@ def ready_inputs(
     Returns:
         Inputs, (N, V, C, size, size) uint8.
     """
-    # imported here, because the worker processes need no torch
-    from nextview_lab.training.runs import is_first
-
     target = inputs_path(path, size, kind)
-    if is_first() and not target.exists():
+    if not target.exists():
         with only_one(target):
             objects = int(ViewStore.open(path).done.sum())
             track(
@@ -111,8 +107,6 @@ def ready_inputs(
                 objects,
                 f"inputs of {path.name}",
             )
-    while not target.exists():
-        time.sleep(1)
     return load_inputs(path, size, kind)
 
 

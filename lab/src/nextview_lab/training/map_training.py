@@ -90,7 +90,7 @@ class Windows(OwnBatches):
             objects = np.repeat(self.objects, self.recipe.views_per_object)[:n]
             views = (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
-        for here in np.arange(n).reshape(-1, batch)[:, self.share]:
+        for here in np.arange(n).reshape(-1, batch):
             points = (
                 rng.permutation(1024)[: self.recipe.points]
                 if self.training
@@ -174,7 +174,6 @@ class MapModule(L.LightningModule):
             prog_bar=True,
             on_step=False,
             on_epoch=True,
-            sync_dist=True,
         )
 
         if self.recipe.extent == "sphere":
@@ -207,7 +206,6 @@ class MapModule(L.LightningModule):
             error,
             prog_bar=True,
             batch_size=len(batch[1]),
-            sync_dist=True,
         )
 
     def configure_optimizers(self) -> dict[str, Any]:

@@ -11,16 +11,13 @@ from nextview.checks import number, whole
 
 @dataclass(frozen=True)
 class Hardware:
-    """Devices and precision; see docs/training.md for several devices.
+    """Device and precision.
 
     Attributes:
-        devices: number of processes, each with its own GPU if available; every batch is divided
-            among them.
-        accelerator: "auto" uses GPUs if available.
+        accelerator: "auto" uses a GPU if available.
         precision: use 16-mixed on GPUs older than Ampere.
     """
 
-    devices: int = 1
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"
 

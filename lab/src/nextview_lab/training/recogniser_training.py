@@ -102,7 +102,7 @@ class Views(OwnBatches):
             turn * np.array([own.inputs.shape[1] for own in self.sources])[source]
         ).astype(int)
 
-        for batch in np.arange(n).reshape(-1, self.batch)[:, self.share]:
+        for batch in np.arange(n).reshape(-1, self.batch):
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
             drawn = [np.stack(images), self.labels[objects[batch]]]
             if self.sources[0].azimuth_bins is not None:
@@ -207,7 +207,6 @@ class RecogniserModule(L.LightningModule):
                 lost,
                 on_step=False,
                 on_epoch=True,
-                sync_dist=True,
                 batch_size=len(x),
             )
             loss = loss + self.recipe.azimuth_bins_weight * lost
@@ -218,7 +217,6 @@ class RecogniserModule(L.LightningModule):
             prog_bar=True,
             on_step=False,
             on_epoch=True,
-            sync_dist=True,
             batch_size=len(x),
         )
         return loss
@@ -243,12 +241,9 @@ class RecogniserModule(L.LightningModule):
         )
 
     def on_validation_epoch_end(self) -> None:
-        hits, seen, lost = (
-            self.trainer.strategy.reduce(x, reduce_op="sum")
-            for x in (self.hits, self.seen, self.lost)
-        )
-        self.log("class_accuracy", (hits / seen)[seen > 0].mean(), prog_bar=True)
-        self.log("validation_loss", lost.sum() / seen.sum())
+        shares = (self.hits / self.seen)[self.seen > 0]
+        self.log("class_accuracy", shares.mean(), prog_bar=True)
+        self.log("validation_loss", self.lost.sum() / self.seen.sum())
         for total in (self.hits, self.seen, self.lost):
             total.zero_()
 
@@ -275,7 +270,7 @@ class ValidationViews(OwnBatches):
         self.labels = labels
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
-        for k, i in list(enumerate(self.objects))[self.share]:
+        for k, i in enumerate(self.objects):
             views = self.inputs[i, k % 5 :: 5]
             yield (
                 torch.from_numpy(views),
@@ -304,7 +299,7 @@ def fit_recogniser(
         recipe: of the training.
         out: folder of the run.
         weights: file or run with the initial weights; None for random ones.
-        hardware: devices and precision.
+        hardware: device and precision.
         azimuths: number of azimuth bins; 0 for none.
 
     Returns:

@@ -7,7 +7,6 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from pickle import UnpicklingError  # raised by torch if it refuses to unpickle
@@ -37,7 +36,6 @@ with extras():
     import lightning as L
     import torch
     from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
-    from lightning.fabric.utilities.rank_zero import rank_zero_only
     from lightning.pytorch.callbacks import ModelCheckpoint
     from torch import Tensor, nn
     from torch.utils.data import DataLoader, IterableDataset
@@ -47,10 +45,9 @@ N = TypeVar("N", bound=nn.Module)
 
 
 class OwnBatches(IterableDataset):
-    """A dataset that creates its own batches from the epoch and the device's share."""
+    """A dataset that creates its own batches from the epoch."""
 
     epoch = 0
-    share = slice(None)
 
 
 class Batches(L.LightningDataModule):
@@ -60,13 +57,6 @@ class Batches(L.LightningDataModule):
         super().__init__()
         self.training = training
         self.validation = validation
-
-    def setup(self, stage: str) -> None:
-        self.training.share = self.validation.share = slice(
-            self.trainer.global_rank,
-            None,
-            self.trainer.world_size,
-        )
 
     def train_dataloader(self) -> DataLoader:
         self.training.epoch = self.trainer.current_epoch
@@ -86,7 +76,7 @@ def _loader(batches: IterableDataset) -> DataLoader:
 
 
 class StepSeed(L.Callback):
-    """Seeds torch by epoch, step and device, so that a resumed run uses the same random numbers."""
+    """Seeds torch by epoch and step, so that a resumed run uses the same random numbers."""
 
     def on_train_batch_start(
         self,
@@ -103,12 +93,8 @@ class StepSeed(L.Callback):
             batch: the batch.
             batch_idx: number of the batch in its epoch.
         """
-        step = [
-            pl_module.recipe.seed,
-            trainer.current_epoch,
-            batch_idx,
-            trainer.global_rank,
-        ]
+        # the last number is that of the device
+        step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, 0]
         torch.manual_seed(
             int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0])
         )
@@ -202,14 +188,13 @@ class Log(L.Callback):
         row["rate"] = trainer.optimizers[0].param_groups[0]["lr"]
         row["seconds"] = round(time.perf_counter() - self.began, 3)
         self.rows.append(row)
-        if trainer.is_global_zero:
-            with (
-                new_file(self.path, overwrite=True) as part,
-                part.open("w", newline="", encoding="utf-8") as file,
-            ):
-                table = csv.DictWriter(file, list(self.rows[0]))
-                table.writeheader()
-                table.writerows(self.rows)
+        with (
+            new_file(self.path, overwrite=True) as part,
+            part.open("w", newline="", encoding="utf-8") as file,
+        ):
+            table = csv.DictWriter(file, list(self.rows[0]))
+            table.writeheader()
+            table.writerows(self.rows)
 
     def state_dict(self) -> dict[str, Any]:
         return {"rows": self.rows}
@@ -258,7 +243,7 @@ def fit(
         out: folder of the run; an unfinished run in it is resumed.
         select: name of the score that selects the best epoch.
         mode: whether the lowest ("min") or the highest ("max") score is the best.
-        hardware: devices and precision.
+        hardware: device and precision.
 
     Returns:
         The module after its best epoch.
@@ -281,11 +266,7 @@ def fit(
             max_epochs=recipe.epochs,
             precision=hardware.precision,
             accelerator=hardware.accelerator,
-            devices=hardware.devices,
-            # Batch norm uses the whole batch, as on one device; torch supports this on GPUs only.
-            sync_batchnorm=hardware.devices > 1
-            and hardware.accelerator != "cpu"
-            and torch.cuda.is_available(),
+            devices=1,
             logger=False,
             callbacks=callbacks,
             plugins=[WholeCheckpoints()],
@@ -350,11 +331,6 @@ def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[st
         "optimizer": adam,
         "lr_scheduler": {"scheduler": stairs, "interval": "epoch"},
     }
-
-
-def is_first() -> bool:
-    """Return True if this is the process that writes files for all processes of a training."""
-    return rank_zero_only.rank == 0
 
 
 class Run(msgspec.Struct, frozen=True):
@@ -426,7 +402,7 @@ def new_run(
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
     """Train a network into the folder of a run unless it exists already.
 
-    Other processes are locked out, except those of the other devices of this run.
+    Other processes are locked out.
 
     Args:
         out: folder of the run.
@@ -437,7 +413,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
         ModelError: the folder contains a run with another recipe, other initial weights or other
             objects.
     """
-    with only_one(out) if is_first() else nullcontext():
+    with only_one(out):
         if (out / "run.json").exists():
             before = read_record(out / "run.json", Run, "a training run")
             recipe = msgspec.to_builtins(run.recipe)
@@ -459,7 +435,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
             if faults:
                 again = "give the same options to resume it, or another folder"
                 raise ModelError(f"{out}: holds a run of {faults[0]}; {again}")
-        elif is_first():
+        else:
             other = [
                 path.name
                 for path in (out.iterdir() if out.is_dir() else ())

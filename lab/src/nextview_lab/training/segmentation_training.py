@@ -70,9 +70,7 @@ class LabelledBatches(OwnBatches):
                             int(index),
                             np.random.default_rng(seed) if self.vary else None,
                         )
-                        for index, seed in zip(
-                            batch[self.share], seeds[self.share], strict=True
-                        )
+                        for index, seed in zip(batch, seeds, strict=True)
                     ]
                 )
 
@@ -141,7 +139,6 @@ class SegmentationModule(L.LightningModule):
             },
             on_step=False,
             on_epoch=True,
-            sync_dist=True,
             batch_size=len(output),
         )
         return loss
@@ -271,7 +268,7 @@ def fit_segmentation(
         files: training files, and validation files.
         recipe: of the training.
         out: folder of the run.
-        hardware: devices and precision.
+        hardware: device and precision.
 
     Returns:
         The network of the epoch with the lowest validation loss.
