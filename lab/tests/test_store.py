@@ -10,7 +10,7 @@ from pipeline import SPHERE
 from nextview.errors import DatasetError
 from nextview_lab.data.measures import measure
 from nextview_lab.data.rendering import RenderOptions, render
-from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore, check
+from nextview_lab.data.store import RENDERED_ARRAYS, ViewStore
 
 
 @pytest.fixture
@@ -39,13 +39,9 @@ def damage(file: Path, how: str) -> None:
             file.unlink()
 
 
-def found(views: Path) -> dict[str, str]:
-    return {name: problem for name, problem in check(views, workers=0) if problem}
-
-
 @pytest.mark.parametrize("name", [name for name in RENDERED_ARRAYS if name != "status"])
 @pytest.mark.parametrize("how", ["flipped", "cut", "lost"])
-def test_damage_is_named_by_every_read_and_by_check(store, name, how):
+def test_damage_is_named_by_every_read(store, name, how):
     ViewStore.open(store).note(unit="cm")
     damage(chunk(store, name, 1), how)
     wrong = "is missing" if how == "lost" else "cannot be read"
@@ -63,7 +59,6 @@ def test_damage_is_named_by_every_read_and_by_check(store, name, how):
             match=rf"{name} of chair_1 {wrong}.*remove the store and render",
         ):
             read()
-    assert list(found(store)) == ["chair_1"]
 
 
 def test_a_damaged_object_ends_the_command_that_reads_it(
@@ -81,9 +76,6 @@ def test_a_damaged_object_ends_the_command_that_reads_it(
     )
     assert f"{store}: depth of chair_1 is missing; remove the store" in said
     assert not (tmp_path / "out.npz").exists()
-    assert "1 of 18 objects are damaged" in refused(
-        capsys, "nextview-lab", "check", store, "--workers", 0
-    )
 
 
 def test_other_settings_and_meshes_are_refused_or_replace_the_store(
@@ -116,4 +108,3 @@ def test_other_settings_and_meshes_are_refused_or_replace_the_store(
     )
     assert ViewStore.open(store).image(0).shape == (40, 16, 16)
     assert (store / "notes.txt").read_text() == "mine"
-    assert found(store) == {}

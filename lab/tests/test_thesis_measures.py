@@ -19,7 +19,7 @@ from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview_lab.data.measures import find_measure, measure
 from nextview_lab.data.rendering import render
-from nextview_lab.data.store import ViewStore, check
+from nextview_lab.data.store import ViewStore
 from nextview_lab.data.surfaces import mesh_views, view_of
 from nextview_lab.errors import MeasureError
 from nextview_lab.thesis.measures import (
@@ -267,7 +267,6 @@ def test_all_measures_of_a_store_and_its_meshes(rendered):
         view_of(make_mesh(box.vertices, box.faces), top, 96)
     )
     assert store.measure("visible_area_ratio")[row, 0] == pytest.approx(own, abs=1e-3)
-    assert {problem for _, problem in check(rendered, workers=0)} == {None}
 
 
 def test_measures_take_the_meshes_that_were_rendered_and_no_others(rendered):

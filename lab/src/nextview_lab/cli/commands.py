@@ -194,11 +194,6 @@ COMMANDS = {
         "show the objects of a view store in the browser",
         example="explore views.zarr",
     ),
-    "check": Command(
-        f"{CLI}.stores:check",
-        "verify a view store",
-        example="check views.zarr",
-    ),
     "list": Command(
         f"{CLI}.listing:show",
         "list the view measures",

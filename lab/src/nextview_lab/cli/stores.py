@@ -1,4 +1,4 @@
-"""``nextview-lab render``, ``measure``, ``predict`` and ``check``: make and use view stores."""
+"""``nextview-lab render``, ``measure`` and ``predict``: make and use view stores."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,6 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.model_card import RECOGNISER, find_card, find_models
 from nextview_lab.data import measures as view_measures
 from nextview_lab.data import predicting, rendering
-from nextview_lab.data import store as view_store
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects
 from nextview_lab.data.store import ViewStore
@@ -139,42 +138,6 @@ def measure(
     )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)
-
-
-def check(
-    store: Path,
-    /,
-    workers: Workers = Workers(),
-) -> None:
-    """Verify the checksum of every object in a view store.
-
-    The exit status is 2 if an object is damaged.
-
-    Args:
-        store: view store made by nextview-lab render.
-    """
-    views = ViewStore.open(store)
-    done = int(views.done.sum())
-
-    damaged = track_all(
-        view_store.check(store, **vars(workers)),
-        done,
-        f"checking {store.name}",
-    )
-    for reason in views.attributes.failures.values():
-        console.print(f"left out: {reason}", style="yellow")
-
-    missing = len(views) - done - len(views.attributes.failures)
-    console.print(
-        f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not"
-        " rendered"
-    )
-
-    if damaged:
-        raise DatasetError(
-            f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render"
-            " again"
-        )
 
 
 def predict(

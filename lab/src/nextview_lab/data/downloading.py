@@ -4,7 +4,6 @@ import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from nextview.checks import one_line
 from nextview.errors import DatasetError
@@ -42,12 +41,7 @@ ARCHIVES = {
 }
 
 
-def download(
-    archive: Archive,
-    destination: Path,
-    timeout: float = 60,
-    bar: Any = False,
-) -> Path:
+def download(archive: Archive, destination: Path) -> Path:
     """Download and verify an archive and unpack it below a folder.
 
     Nothing is done if the unpacked folder already exists.
@@ -55,8 +49,6 @@ def download(
     Args:
         archive: the archive.
         destination: folder in which ``archive.folder`` is created.
-        timeout: of an inactive connection, seconds.
-        bar: whether to show progress.
 
     Returns:
         The unpacked folder.
@@ -76,15 +68,10 @@ def download(
             new_folder(folder) as part,
             tempfile.TemporaryDirectory(dir=folder.parent, prefix=".zip-") as place,
         ):
-            fetch = pooch.HTTPDownloader(progressbar=bar, timeout=timeout)
             pooch.get_logger().setLevel("ERROR")
             try:
                 file = pooch.retrieve(
-                    archive.url,
-                    f"sha256:{archive.sha256}",
-                    "archive.zip",
-                    place,
-                    downloader=fetch,
+                    archive.url, f"sha256:{archive.sha256}", "archive.zip", place
                 )
                 with zipfile.ZipFile(file) as content:
                     inside = [

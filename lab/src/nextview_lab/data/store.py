@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from nextview.data.folders import Entry
-from nextview.data.pool import WorkerDied, each
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import decode_record, new_folder, only_one
 from nextview.geometry.depth import CLOUD_POINTS
@@ -304,18 +303,6 @@ class ViewStore:
             / array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))
         )
 
-    def has(self, name: str, i: int) -> bool:
-        """Return whether an array holds values of an object.
-
-        Args:
-            name: of the array.
-            i: row of the object.
-
-        Returns:
-            True if the values are there.
-        """
-        return self._chunk(self.array(name), i).exists()
-
     def held(self, name: str) -> Mask:
         """Return which objects have values in an array, (N,)."""
         array = self.array(name)
@@ -499,49 +486,3 @@ def writing(path: Path) -> Iterator[None]:
                 " go on"
             )
             raise DatasetError(f"{path}: {reason}") from None
-
-
-def check(
-    path: Path,
-    workers: int | None = None,
-    scheduler: str | None = None,
-) -> Iterator[tuple[str, str | None]]:
-    """Read all arrays of all rendered objects and compare their checksums.
-
-    Args:
-        path: of the store.
-        workers: number of processes; None for one on each core, 0 for this process.
-        scheduler: address of a dask.distributed scheduler to use instead.
-
-    Yields:
-        The name of each object and None, or what is wrong with it.
-    """
-    store = ViewStore.open(path)
-    for name in RENDERED_ARRAYS:
-        store.array(name)  # raises an error if it is damaged
-    objects = np.flatnonzero(store.done).tolist()
-    for i, result in each(
-        partial(_check_object, path.absolute()),
-        objects,
-        workers,
-        scheduler,
-    ):
-        problem = (
-            f"{path}: {store.names[i]}: {result}"
-            if isinstance(result, WorkerDied)
-            else result
-        )
-        yield store.names[i], problem
-
-
-def _check_object(path: Path, i: int) -> str | None:
-    store = opened(path)
-    try:
-        for name in (
-            *RENDERED_ARRAYS,
-            *(name for name in store.added if store.has(name, i)),
-        ):
-            store.read(name, i)
-    except DatasetError as error:
-        return str(error)
-    return None
