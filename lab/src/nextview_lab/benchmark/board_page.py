@@ -1,12 +1,8 @@
 """Tables of text."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
-
-from nextview_lab.benchmark.comparison import Tables, values_of
 
 NONE = "\N{EN DASH}"
 
@@ -64,44 +60,6 @@ class Board:
     def narrow(self) -> dict[str, Column]:
         """Return the columns of the narrow tables, by their short headings."""
         return {column.short: column for column in self.columns if column.short}
-
-
-def written(
-    tables: Tables,
-    board: Board,
-    columns: Mapping[str, Column],
-    marked: Iterable[tuple[str, str, int]] = (),
-) -> WrittenTable:
-    """Return a board as text: a row for each policy that has all of its numbers.
-
-    Args:
-        tables: of the benchmark.
-        board: the table.
-        columns: of the table, by heading.
-        marked: policy, measure and views of the numbers marked with a star.
-    """
-    values = values_of(tables.measures)
-    stars = set(marked)
-
-    def shown(policy: str, measure: str, column: Column) -> str:
-        value = values[policy, measure, column.views][0]
-        star = "*" * ((policy, measure, column.views) in stars)
-        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
-
-    rows = tuple(
-        (
-            policy,
-            *(
-                ", ".join(shown(policy, m, c) for m in c.measures)
-                for c in columns.values()
-            ),
-        )
-        for policy in tables.policies()
-        if all(
-            (policy, m, c.views) in values for c in columns.values() for m in c.measures
-        )
-    )
-    return WrittenTable(board.title, board.about, ("policy", *columns), rows)
 
 
 def points(difference: float) -> str:

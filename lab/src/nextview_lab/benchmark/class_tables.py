@@ -9,7 +9,7 @@ import numpy as np
 from nextview.session.episode import Outcome
 from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import Board, Column, WrittenTable, written
+from nextview_lab.benchmark.board_page import Board, Column, WrittenTable
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -21,6 +21,7 @@ from nextview_lab.benchmark.comparison import (
     significant,
     too_few,
     values_of,
+    written,
 )
 from nextview_lab.benchmark.entries import is_oracle, knows_truth
 from nextview_lab.benchmark.published import published

@@ -4,7 +4,7 @@ A row of the table is what a policy had in one episode, after a number of views 
 benchmarks make such a table, and all measures are ratios of sums over the objects of its rows.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from nextview.types import Float, Index, Mask
 from nextview_lab.benchmark import statistics as st
+from nextview_lab.benchmark.board_page import Board, Column, WrittenTable
 from nextview_lab.extras import extras
 
 with extras():
@@ -283,3 +284,41 @@ def significant(tables: Tables) -> set[tuple[str, str, int]]:
     """
     some = tables.tests[tables.tests["p_holm"] < SIGNIFICANT]
     return set(zip(some["policy"], some["measure"], some["views"], strict=True))
+
+
+def written(
+    tables: Tables,
+    board: Board,
+    columns: Mapping[str, Column],
+    marked: Iterable[tuple[str, str, int]] = (),
+) -> WrittenTable:
+    """Return a board as text: a row for each policy that has all of its numbers.
+
+    Args:
+        tables: of the benchmark.
+        board: the table.
+        columns: of the table, by heading.
+        marked: policy, measure and views of the numbers marked with a star.
+    """
+    values = values_of(tables.measures)
+    stars = set(marked)
+
+    def shown(policy: str, measure: str, column: Column) -> str:
+        value = values[policy, measure, column.views][0]
+        star = "*" * ((policy, measure, column.views) in stars)
+        return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
+
+    rows = tuple(
+        (
+            policy,
+            *(
+                ", ".join(shown(policy, m, c) for m in c.measures)
+                for c in columns.values()
+            ),
+        )
+        for policy in tables.policies()
+        if all(
+            (policy, m, c.views) in values for c in columns.values() for m in c.measures
+        )
+    )
+    return WrittenTable(board.title, board.about, ("policy", *columns), rows)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from nextview.files import new_folder
-from nextview_lab.benchmark.board_page import Board, markdown, written
-from nextview_lab.benchmark.comparison import Tables, too_few
+from nextview_lab.benchmark.board_page import Board, markdown
+from nextview_lab.benchmark.comparison import Tables, too_few, written
 
 RECORD = "benchmark.json"
 

@@ -1,31 +1,17 @@
-"""Print the results of benchmarks and evaluations as tables in the terminal."""
+"""Print the results of benchmarks as tables in the terminal."""
 
-import sys
-from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from math import isfinite
 from typing import Any
 
-from rich import box
-from rich.cells import cell_len
-from rich.table import Table
-
-from nextview.checks import number_of
 from nextview.cli.progress import Terminal, console
 from nextview_lab.benchmark import class_tables as board
-from nextview_lab.benchmark.board_page import WrittenTable, points, written
-from nextview_lab.benchmark.bop import BopRun
+from nextview_lab.benchmark.board_page import WrittenTable, points
 from nextview_lab.benchmark.class_tables import ClassResults
-from nextview_lab.benchmark.comparison import SIGNIFICANT, significant
-from nextview_lab.benchmark.evaluation import Evaluation
-from nextview_lab.benchmark.page import Number, numbers
-from nextview_lab.benchmark.real import RealRun, real_table
+from nextview_lab.benchmark.comparison import SIGNIFICANT, significant, written
 from nextview_lab.benchmark.results import ComparedTables
 from nextview_lab.benchmark.standings import Leaderboard
+from nextview_lab.cli.printing import print_tables
 from nextview_lab.errors import EntryError
-
-MOST_WHOLE_COLUMNS = 7  # of a table with its intervals; the page has them all
-NAME_SHARE = 3  # the names of methods take this part of a line at most: a third
 
 
 def print_classes(results: ClassResults) -> None:
@@ -111,63 +97,6 @@ def print_compared(found: ComparedTables) -> None:
         terminal.print(sentence)
 
 
-def print_evaluation(found: Evaluation) -> None:
-    """Print the accuracy of the recogniser and the scores of each map.
-
-    The HTML page of the evaluation shows more.
-    """
-    terminal = Terminal()
-    right = numbers(found.accuracy, "n_views", "label", "measure")
-    views = int(found.accuracy["n_views"].max())
-    lines = {
-        "mean of objects": "accuracy",
-        "without duplicates": "clean_accuracy",
-        "size not known": "shape_accuracy",
-    }
-
-    rows = [
-        (heading, *(_cell(right[k, "", measure], 3) for k in (1, views)))
-        for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items()
-        if (1, "", measure) in right
-    ]
-    head = ("share of right answers", "one view", f"all {views} views")
-    tables = [WrittenTable("", "", head, tuple(rows))]
-
-    headings = {
-        "mse": "MSE",
-        "d0": "d = 0",
-        "d_le_1": "d <= 1",
-        "d_lt_2": "d < 2",
-        "regret": "regret",
-    }
-
-    maps = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")]
-    scores = numbers(maps, "map", "measure")
-    names = maps["map"].unique()
-    rows = [
-        (
-            heading,
-            *(_cell(scores[name, measure], 3 + (measure == "mse")) for name in names),
-        )
-        for measure, heading in headings.items()
-    ]
-    if len(names):
-        head = ("mean of objects", *(name.upper() for name in names))
-        tables.append(WrittenTable("", "", head, tuple(rows)))
-    print_tables(tables)
-
-    for name, why in found.left_out.items():
-        terminal.print(f"{name}: {why}")
-
-
-def _cell(number: Number, digits: int) -> str:
-    if not isfinite(number.value):
-        return "-"
-    low, high = (f"{end:.{digits}f}" for end in (number.low, number.high))
-    interval = f" ({low}-{high})" if number.high > number.low else ""
-    return f"{number.value:.{digits}f}{interval}"
-
-
 def print_standings(board: Leaderboard) -> None:
     """Print the tables of a leaderboard.
 
@@ -177,100 +106,3 @@ def print_standings(board: Leaderboard) -> None:
     print_tables(board.tables)
     for note in board.notes:
         console.print(note, soft_wrap=True)
-
-
-def print_tables(tables: Iterable[WrittenTable]) -> None:
-    """Print tables, those that are too wide in several parts.
-
-    Args:
-        tables: with headings and cells of text.
-    """
-    terminal = Terminal()
-    for one in tables:
-        for part in _parts(one, terminal):
-            terminal.print(part)
-
-
-def _parts(one: WrittenTable, terminal: Terminal) -> Iterator[Table]:
-    """Divide the columns of a table so that each part fits; the names stand in all of them."""
-    short = len(one.headings) > MOST_WHOLE_COLUMNS
-    names = [row[0] for row in one.rows]
-    columns = [
-        [cell.partition(" (")[0] if short else cell for cell in cells]
-        for cells in zip(*(row[1:] for row in one.rows), strict=True)
-    ]
-    longest = max(map(cell_len, [one.headings[0], *names]))
-    of_names = min(longest, max(1, terminal.width // NAME_SHARE))
-    # a heading breaks at its spaces, and a score nowhere
-    widths = [
-        max(map(cell_len, [*heading.split(), *cells]))
-        for heading, cells in zip(one.headings[1:], columns, strict=True)
-    ]
-
-    def part(first: int, last: int) -> Table:
-        table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
-        table.title = None if first else one.title
-        table.title_justify = "left"
-        table.add_column(one.headings[0], width=of_names, overflow="fold")
-        for column in range(first, last):
-            heading = one.headings[1 + column]
-            table.add_column(heading, justify="right", width=widths[column])
-        for row, name in enumerate(names):
-            table.add_row(name, *(cells[row] for cells in columns[first:last]))
-        return table
-
-    unlimited = terminal.options.update(max_width=sys.maxsize)
-    first = 0
-    while first < len(widths):
-        last = first + 1
-        while last < len(widths):
-            longer = terminal.measure(part(first, last + 1), options=unlimited)
-            if longer.maximum > terminal.width:
-                break
-            last += 1
-        yield part(first, last)
-        first = last
-
-
-def print_bop(run: BopRun) -> None:
-    """Print what was found, and what was left out.
-
-    Args:
-        run: what was found.
-    """
-    if run.not_known:
-        numbers = ", ".join(map(str, run.not_known))
-        console.print(
-            f"the memory does not know the models {numbers}, so they are never found",
-            style="yellow",
-            soft_wrap=True,
-        )
-    _print_left_out(run.left_out)
-    for name, count in run.others.items():
-        console.print(
-            f"{name}: is no model of the dataset, found {number_of(count, 'time')} and not written",
-            style="yellow",
-            soft_wrap=True,
-        )
-    terminal = Terminal()
-    terminal.print(
-        f"{number_of(run.poses, 'pose')} in {number_of(run.images, 'image')},"
-        f" {run.seconds:.2f} s an image",
-        soft_wrap=True,
-    )
-
-
-def print_real(run: RealRun) -> None:
-    """Print what was right in real frames, and what was left out.
-
-    Args:
-        run: what was said of them.
-    """
-    _print_left_out(run.left_out)
-    print_tables([real_table(run.rows)])
-
-
-def _print_left_out(left_out: Mapping[str, Exception]) -> None:
-    """Print why frames were left out, by their names."""
-    for name, reason in left_out.items():
-        console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)

@@ -130,7 +130,6 @@ COMMANDS = {
         "nextview_lab.benchmark.evaluation_page:write_evaluation",
         "evaluate a recogniser and its maps on every view",
         "tables and evaluate.html are in {out}",
-        f"{CLI}.benchmark_tables:print_evaluation",
         example="evaluate test.npz evaluation",
     ),
     "benchmark classes": Command(
@@ -158,14 +157,14 @@ COMMANDS = {
         "nextview_lab.benchmark.bop:look_for_models",
         "locate the models of a BOP dataset in its images",
         "wrote {out}; next: evaluate it with bop_toolkit",
-        f"{CLI}.benchmark_tables:print_bop",
+        f"{CLI}.printing:print_bop",
         example="bop lmo nextview_lmo-test.csv --models lmo_memory",
     ),
     "real": Command(
         "nextview_lab.benchmark.real:recognise_real",
         "compare what is said of real frames with the truth",
         "wrote {out}, a line for each thing",
-        f"{CLI}.benchmark_tables:print_real",
+        f"{CLI}.printing:print_real",
         example="real ycbv/test/000048 my_frames --out real.csv --models mine",
     ),
     "submit": Command(
