@@ -195,7 +195,6 @@ def stores_and_predictions() -> None:
         0,
         "--overwrite",
     )
-    assert "depth_entropy" in lab("list", "measures")
     said = lab("benchmark", "classes", "views.npz", "results", status=2)
     assert "pip install 'nextview-lab[benchmark]'" in said
     assert said.count("\n") == 1

@@ -193,12 +193,6 @@ COMMANDS = {
         "show the objects of a view store in the browser",
         example="explore views.zarr",
     ),
-    "list": Command(
-        f"{CLI}.listing:show",
-        "list the view measures",
-        example="list measures",
-        computes=False,
-    ),
     "completion": Command(
         f"{CLI}.completion:completion",
         "print a completion script for bash, zsh or fish",

@@ -74,17 +74,6 @@ def render(
     track_all(jobs, len(found.entries), f"rendering {store.name}", before)
     made = ViewStore.open(store)
     done = int(made.done.sum())
-    copies = made.duplicates
-    if copies:
-        console.print(
-            f"{sum(map(len, copies)) - len(copies)} meshes are byte-identical copies of another one"
-        )
-    for group in copies:
-        if len(set(made.labels[group])) > 1:
-            same = " = ".join(
-                f"{made.names[i]} ({made.classes[made.labels[i]]})" for i in group
-            )
-            console.print(f"one mesh, several labels: {same}", style="yellow")
     if not done:
         raise DatasetError(
             f"{store}: none of the {len(made)} meshes can be used; see the reasons above"
@@ -114,7 +103,7 @@ def measure(
 
     Args:
         store: view store made by nextview-lab render.
-        measures: names of measures (see nextview-lab list measures), or MODULE:FUNCTION for your
+        measures: names of measures (docs/measures.md), or MODULE:FUNCTION for your
             own; by default all that need only the depth or, with --meshes, all.
         meshes: dataset folder that the store was rendered from, for measures that need the meshes.
         max_faces: largest number of triangles in a mesh, as for nextview-lab render.

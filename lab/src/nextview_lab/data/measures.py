@@ -75,13 +75,11 @@ class Measure:
     Attributes:
         function: computes the measure of one ``MeasuredView``.
         needs: "depth" if the depth image is enough, or "mesh".
-        source: publication of the measure.
         good: whether high values (peak) or low values (valley) mark the better views.
     """
 
     function: Callable[[Any], float]
     needs: Literal["depth", "mesh"] = "depth"
-    source: str = "your own"
     good: Good = "peak"
 
     def __call__(self, view: MeasuredView) -> float:
@@ -93,9 +91,7 @@ MEASURES: dict[
     str,
     Measure,
 ] = {  # the others are entry points MEASURE_ENTRY_POINTS of installed packages
-    "depth_entropy": Measure(
-        lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
-    )
+    "depth_entropy": Measure(lambda view: depth_entropy(view.depth))
 }
 MEASURE_ENTRY_POINTS = "nextview.measures"
 

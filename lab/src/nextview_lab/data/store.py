@@ -428,14 +428,6 @@ class ViewStore:
             else self.rows("radius") * UNITS[unit]
         )
 
-    @property
-    def duplicates(self) -> list[list[int]]:
-        """Groups of objects with identical mesh files."""
-        groups: dict[str, list[int]] = {}
-        for i, sha256 in enumerate(self.attributes.sha256 or ()):
-            groups.setdefault(sha256, []).append(i)
-        return [group for group in groups.values() if len(group) > 1]
-
     def image(self, i: int) -> NDArray[np.uint8]:
         """Return all views of object i, (V, S, S) uint8."""
         return self.read("image", i)

@@ -50,10 +50,9 @@ BACKGROUND = np.float32(1e30)
 
 def rated(
     needs: Literal["depth", "mesh"],
-    source: str,
 ) -> Callable[[Callable[[Any], float]], Measure]:
     """What makes a measure of a function of a view."""
-    return lambda function: Measure(function, needs, source)
+    return lambda function: Measure(function, needs)
 
 
 def bits(shares: NDArray[np.floating]) -> float:
@@ -72,7 +71,7 @@ def _blur(cells: int, accuracy: float) -> NDArray[np.float64]:
     return blur / blur.sum()
 
 
-@rated("depth", "Dutagaci et al. 2010")
+@rated("depth")
 def view_area(view: MeasuredView) -> float:
     """Share of the image that shows the object: its projected area.
 
@@ -85,7 +84,7 @@ def view_area(view: MeasuredView) -> float:
     return len(view.depths) / view.depth.size
 
 
-@rated("mesh", "Polonsky et al. 2005")
+@rated("mesh")
 def visible_area_ratio(view: MeshView) -> float:
     """Area of the surface that is seen, over the area of the whole surface; what is hidden of a
     face does not count.
@@ -99,7 +98,7 @@ def visible_area_ratio(view: MeshView) -> float:
     return min(float(view.seen_area.sum() / view.surface.areas.sum()), 1.0)
 
 
-@rated("mesh", "Secord et al. 2011")
+@rated("mesh")
 def surface_visibility(view: MeshView) -> float:
     """Area of the faces of which anything is seen, over the area of all faces: the ratio of visible
     area by faces.
@@ -114,7 +113,7 @@ def surface_visibility(view: MeshView) -> float:
     return float(view.surface.areas[view.pixels[0]].sum() / view.surface.areas.sum())
 
 
-@rated("mesh", "Vázquez et al. 2001; eq. 3")
+@rated("mesh")
 def viewpoint_entropy(view: MeshView) -> float:
     """Shannon entropy of the shares that the faces have in the object's projected area.
 
@@ -129,7 +128,7 @@ def viewpoint_entropy(view: MeshView) -> float:
     return bits(pixels / pixels.sum()) if len(pixels) else 0.0
 
 
-@rated("mesh", "Polonsky et al. 2005; eq. 4")
+@rated("mesh")
 def curvature_entropy(view: MeshView) -> float:
     """Shannon entropy of the distribution of Gaussian curvature over the visible surface.
 
@@ -153,7 +152,7 @@ def curvature_entropy(view: MeshView) -> float:
     return bits(weight / weight.sum()) if weight.sum() > 0 else 0.0
 
 
-@rated("mesh", "Secord et al. 2011")
+@rated("mesh")
 def mean_curvature(view: MeshView) -> float:
     """Mean curvature, unsigned, integrated over the visible surface: how much it bends at its
     edges.
@@ -167,7 +166,7 @@ def mean_curvature(view: MeshView) -> float:
     return float((view.surface.mean_of_faces[view.pixels[0]] * view.seen_share).sum())
 
 
-@rated("mesh", "Secord et al. 2011")
+@rated("mesh")
 def gaussian_curvature(view: MeshView) -> float:
     """Gaussian curvature, unsigned, integrated over the visible surface: how much it bends at its
     corners.
@@ -183,7 +182,7 @@ def gaussian_curvature(view: MeshView) -> float:
     )
 
 
-@rated("depth", "Secord et al. 2011; eq. 5")
+@rated("depth")
 def depth_distribution(view: MeasuredView) -> float:
     """One minus the sum of the squared normalised depth histogram, over the pixels that show the
     object.
@@ -200,7 +199,7 @@ def depth_distribution(view: MeasuredView) -> float:
     return float(1 - (share**2).sum())
 
 
-@rated("depth", "Secord et al. 2011")
+@rated("depth")
 def max_depth(view: MeasuredView) -> float:
     """The largest depth at which the object is seen, measured from its nearest visible point.
 
@@ -212,7 +211,7 @@ def max_depth(view: MeasuredView) -> float:
     return float(np.ptp(view.depths)) if len(view.depths) else 0.0
 
 
-@rated("depth", "Ding et al.")
+@rated("depth")
 def fused_descriptor(view: MeasuredView) -> float:
     """Mean of variance, entropy and Vollath's autocorrelation of the depth image, each scaled to 0
     .. 1.
@@ -249,7 +248,7 @@ def fused_descriptor(view: MeasuredView) -> float:
     )
 
 
-@rated("depth", "Polonsky et al. 2005")
+@rated("depth")
 def silhouette_length(view: MeasuredView) -> float:
     """Length of the object's outline, holes included, in sides of the image.
 
@@ -272,7 +271,7 @@ def silhouette_length(view: MeasuredView) -> float:
     return float(np.pi / 8 * (straight + diagonal / np.sqrt(2)) / max(view.depth.shape))
 
 
-@rated("depth", "Polonsky et al. 2005")
+@rated("depth")
 def silhouette_entropy(view: MeasuredView) -> float:
     """Shannon entropy of the distribution of turns along the object's outline, holes included.
 
@@ -334,7 +333,7 @@ def _turns(
     return np.angle((ahead - places) * np.conj(places - behind))
 
 
-@rated("depth", "Secord et al. 2011")
+@rated("depth")
 def above_preference(view: MeasuredView) -> float:
     """How near the view is to the elevation that people choose: a normal curve about 22.5 degrees
     above the horizon.
@@ -353,7 +352,7 @@ def above_preference(view: MeasuredView) -> float:
     return float(np.exp(-(((elevation - LIKED) / SPREAD) ** 2) / 2))
 
 
-@rated("mesh", "Secord et al. 2011")
+@rated("mesh")
 def base_avoidance(view: MeshView) -> float:
     """Share of the visible pixels that do not show the object's base: the underside of its lowest
     part.
@@ -382,7 +381,7 @@ def base_avoidance(view: MeshView) -> float:
     return float(1 - pixels[base].sum() / pixels.sum())
 
 
-@rated("depth", "suggested in the thesis, chapter 8")
+@rated("depth")
 def gradient_entropy(view: MeasuredView) -> float:
     """What the view tells of the directions in which the surface faces, bits.
 
