@@ -141,7 +141,6 @@ LAB = (
     "fit",
     "evaluate",
     "benchmark",
-    "bop",
     "real",
     "submit",
     "leaderboard",
