@@ -15,11 +15,9 @@ from nextview.recognition.belief import PLAIN_SUM, Stopping
 from nextview.recognition.map_names import LEM
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_stopping import own_stopping
-from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import (
     ClassResults,
     ClassTables,
-    after_views_table,
     summarise,
 )
 from nextview_lab.benchmark.entries import default_entries
@@ -119,9 +117,6 @@ def benchmark_classes(
     }
 
     def more(part: Path) -> None:
-        if after := after_views_table(tables):
-            text = markdown(after.headings, after.rows)
-            (part / "views.md").write_text(text, encoding="utf-8")
         table.save(part / "predictions.npz")
 
     write_results(out, tables, made, more, overwrite, withdraw=True)

@@ -193,8 +193,6 @@ class ViewStore:
                 f"{path}: not a view store of format {STORE_FORMAT}; render it again"
             )
 
-        content.setdefault("rotated", content.get("turn", False))  # former name
-
         return cls(
             path,
             group,

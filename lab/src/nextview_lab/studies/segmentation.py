@@ -23,13 +23,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from rich.progress import track
 from scipy import ndimage
 
 from nextview.cli.exit_status import orderly_end
+from nextview.cli.progress import console
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
 from nextview_lab.data.real_frames import TrueThing, real_frames
-from nextview_lab.studies.shared import progress
 
 LEAST_PIXELS = 200  # of a thing that counts; of a segment half as many
 GOOD_IOU = 0.5
@@ -171,7 +172,7 @@ def main(
     """
     learned = LearnedSegmenter(network)
     counts = Counts()
-    for real in progress(real_frames(folder), "frames"):
+    for real in track(real_frames(folder), "frames", console=console):
         frame = real.read()
         begun = time.perf_counter()
         found = learned(frame).labels

@@ -16,15 +16,16 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from rich.progress import track
 
 import nextview
 from nextview.cli.exit_status import orderly_end
+from nextview.cli.progress import console
 from nextview.data.folders import list_dataset
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview_lab.benchmark.statistics import interval, resample
-from nextview_lab.studies.shared import progress
 
 BOOTSTRAP_SAMPLES = 1000
 MOST_UNKNOWN_CLASSES = 5
@@ -73,7 +74,7 @@ def episodes(
     rows = []
     labels = []
 
-    every = progress(entries, f"episodes of {meshes.name}")
+    every = track(entries, f"episodes of {meshes.name}", console=console)
     for number, entry in enumerate(every, 1):
         outcomes = []
         for draw in range(draws):

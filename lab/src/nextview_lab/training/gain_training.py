@@ -394,8 +394,6 @@ def train_gain(
     predictions: Path,
     out: Path,
     folds: int = 20,
-    travel_weight: float | None = None,
-    local: bool = False,
     sensed: tuple[Path, ...] = (),
     recipe: GainRecipe = GainRecipe(),
     overwrite: bool = False,
@@ -411,9 +409,6 @@ def train_gain(
         out: card to write (NAME.json); the networks are written next to it (NAME.onnx).
         folds: number of folds; one policy is trained without each fold and validated on it, and the
             result is the mean of all.
-        travel_weight: weight of a grid cell of travel; by default the lowest at which the policy
-            travels no farther than a random walk in the local window.
-        local: choose only views of the local window.
         sensed: predictions of the same objects through sensors (nextview-lab render --sensor mix),
             as additional training data.
         overwrite: replace existing files.
@@ -441,18 +436,12 @@ def train_gain(
             yield len(best)
 
     track(epochs(), recipe.epochs, "training")
-    chosen, value = best[-1]
-    policies = [
-        replace(policy, scope="local" if local else "global") for policy in chosen
-    ]
-    if travel_weight is None:
-        judged = list(zip(data.validated, policies, strict=True))
-        travel_weight = fit_travel_weight(
-            judged,
-            recipe.max_views,
-            recipe.objective,
-            recipe.seed,
-        )
+    policies, value = best[-1]
+    # the lowest weight at which the policy travels no farther than a random walk in the window
+    judged = list(zip(data.validated, policies, strict=True))
+    travel_weight = fit_travel_weight(
+        judged, recipe.max_views, recipe.objective, recipe.seed
+    )
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate(
         [walk(part, [policy], recipe, data.rng)[0] for part in data.validated]
