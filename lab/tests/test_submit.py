@@ -19,7 +19,7 @@ from nextview_lab.benchmark.frozen import FrozenArchive
 from nextview_lab.benchmark.methods import CommandMethod
 from nextview_lab.benchmark.standings import leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, run_episode, submit
-from nextview_lab.cli.benchmark_tables import print_standings
+from nextview_lab.cli.benchmark_tables import print_compared
 
 ROOT = Path(__file__).parents[2]
 BLIND = SubmitOptions("fixed", max_views=2)
@@ -68,23 +68,21 @@ def test_the_leaderboard_compares_with_the_best_blind_method(
 ):
     out = tmp_path / "board"
     main(["leaderboard", str(submitted), str(archive), str(out), "--samples", "100"])
-    page = (out / "leaderboard.html").read_text()
-    assert FrozenArchive(archive).sha256 in page
-    assert "nextview geometry" in capsys.readouterr().out
-    again = tmp_path / "again"
-    board = leaderboard_of(submitted, archive, again, samples=100)
-    assert page == (again / "leaderboard.html").read_text()
-    rows = {name: cells for name, *cells in board.tables[0].rows}
-    version = json.loads((submitted / "fixed.json").read_text())["version"]
-    ours = rows[f"nextview geometry ({version})"]
-    mug = rows["mug (1)"]
-    assert [cell.split()[0] for cell in ours[:5]] == ["1.000"] * 3 + ["0.000"] * 2
-    assert [cell.split()[0] for cell in mug[:5]] == ["0.500"] * 4 + ["0.000"]
-    assert float(ours[5].split()[0]) < 10  # mm
-    assert board.tables[1].title == "Differences to nextview fixed"
-    compared = {row[:2]: row[2] for row in board.tables[1].rows}
-    assert compared["mug", "2 views"].startswith("-50.0 (")
-    assert any("Too few to tell" in note for note in board.notes)
+    shown = capsys.readouterr().out
+    assert "Too few to tell" in shown
+    assert "The reference, nextview fixed, is the best blind method" in shown
+    made = json.loads((out / "benchmark.json").read_text())
+    assert made["archive_sha256"] == FrozenArchive(archive).sha256
+    text = (out / "tables.md").read_text()
+    rows = {
+        line.split(" | ")[0].strip("| "): line.strip("| ").split(" | ")[1:]
+        for line in text.split("### Differences")[0].splitlines()
+    }
+    assert rows["nextview geometry"][:5] == ["1.000"] * 3 + ["0.000"] * 2
+    assert rows["mug"][:5] == ["0.500"] * 4 + ["0.000"]
+    assert float(rows["nextview geometry"][5]) < 10  # mm
+    assert "### Differences to nextview fixed" in text
+    assert "| mug | right after 2 | -0.500 |" in text
 
 
 def test_an_interrupted_run_goes_on(own, tmp_path):
@@ -204,18 +202,16 @@ def test_a_file_of_results_that_is_not_valid_is_refused(
 NASTY = "<script>alert('a')</script> \x1b[31m|`rm` \u202e_*~$x$ [l](https://a.b)\n# two"
 
 
-def test_names_are_text_in_html_and_terminals(archive, submitted, tmp_path, capsys):
+def test_names_are_text_in_tables_and_terminals(archive, submitted, tmp_path, capsys):
     folder = shutil.copytree(submitted, tmp_path / "submitted")
     edited(folder / "fixed.json", lambda v: v.update(method=NASTY, version="<b>|"))
-    board = leaderboard_of(folder, archive, tmp_path / "board", samples=100)
-    print_standings(board)
+    print_compared(leaderboard_of(folder, archive, tmp_path / "board", samples=100))
     in_terminal = capsys.readouterr()
-    page = (tmp_path / "board/leaderboard.html").read_text(encoding="utf-8")
-    for text in (in_terminal.out, in_terminal.err, page):
+    tables = (tmp_path / "board/tables.md").read_text(encoding="utf-8")
+    for text in (in_terminal.out, in_terminal.err, tables):
         assert not set(text) & {"\x1b", "\u202e"}
         assert "# two" not in text.splitlines()
-    assert "<script" not in page
-    assert "<b>" not in page
+    assert "<script" not in tables
 
 
 def test_the_method_of_the_page_runs(archive, tmp_path):
@@ -229,5 +225,5 @@ def test_the_method_of_the_page_runs(archive, tmp_path):
     board = leaderboard_of(
         tmp_path / "results", archive, tmp_path / "board", samples=100
     )
-    assert board.reference is None
-    assert [cell.split()[0] for cell in board.tables[0].rows[0][1:4]] == ["0.500"] * 3
+    right = board.measures.query("measure == 'right'")
+    assert right["value"].tolist() == [0.5] * 3

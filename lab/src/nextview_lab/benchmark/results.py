@@ -89,16 +89,18 @@ def write_compared(
     out: Path,
     tables: ComparedTables,
     made: Mapping[str, Any],
+    overwrite: bool = True,
 ) -> None:
-    """Write tables to a folder, replacing earlier ones.
+    """Write tables to a folder.
 
     Args:
         out: the folder.
         tables: the results.
         made: settings, as JSON-compatible values.
+        overwrite: whether to replace earlier results.
     """
 
     def more(part: Path) -> None:
         (part / "tables.md").write_text(compared_markdown(tables), encoding="utf-8")
 
-    write_results(out, tables, made, more)
+    write_results(out, tables, made, more, overwrite)

@@ -1,11 +1,13 @@
-"""The leaderboard of a frozen archive: files of results are checked, compared and put on a page.
+"""The leaderboard of a frozen archive: files of results are checked and compared.
 
-Names of methods and of archives come from elsewhere: each is one line without control characters.
+Names of methods and of archives come from elsewhere: each is one line without control characters
+and without marks of HTML.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +17,22 @@ import numpy as np
 from nextview.checks import number_of, one_line, whole
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ResultsError, UsageError
-from nextview.files import check_new, new_folder, read_record
+from nextview.files import check_new, command, read_record
 from nextview.geometry.mesh import load_mesh
 from nextview.things.surface import Surface
 from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import NONE, WrittenTable, points
+from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
     Counted,
     corrected,
-    too_few,
-    values_of,
+    measures_of,
 )
 from nextview_lab.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview_lab.benchmark.methods import check_said
-from nextview_lab.benchmark.page import render
+from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.submit import (
     SUBMISSION_FORMAT,
     SaidAfterView,
@@ -45,16 +46,11 @@ with extras():
     import pandas as pd
 
 RIGHT = "right"
-CONFIDENT_RIGHT = "confident_right"
-CONFIDENT_WRONG = "confident_wrong"
-UNKNOWN_SAID = "unknown"
-SHARES = {
-    name: (name, ONE)
-    for name in (RIGHT, CONFIDENT_RIGHT, CONFIDENT_WRONG, UNKNOWN_SAID)
-}
+LAST = "confident and right", "confident and wrong", "unknown"  # after the last view
+SHARES = {name: (name, ONE) for name in (RIGHT, *LAST)}
+ADD_S = "ADD-S, mm, median"
 SURFACE_POINTS = 2_000
 MOST_SAMPLES = 100_000  # of the bootstrap
-PAGE_FILE = "leaderboard.html"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,31 +79,14 @@ class Scored:
             "threshold": np.nan,
             "object": np.arange(len(last)),
             ONE: 1.0,
-            CONFIDENT_RIGHT: sure & right,
-            CONFIDENT_WRONG: sure & ~right,
-            UNKNOWN_SAID: [one.name is None for one in last],
+            LAST[0]: sure & right,
+            LAST[1]: sure & ~right,
+            LAST[2]: [one.name is None for one in last],
         }
         after = enumerate(self.right.T, 1)
         return pd.concat(
             [pd.DataFrame({**columns, "views": k, RIGHT: own}) for k, own in after]
         )
-
-
-@dataclass(frozen=True)
-class Leaderboard:
-    """Methods that are compared on an archive.
-
-    Attributes:
-        archive: its name.
-        reference: the method with which the others are compared; None without a blind one.
-        tables: all of them, the most important first.
-        notes: what a reader has to know.
-    """
-
-    archive: str
-    reference: str | None
-    tables: tuple[WrittenTable, ...]
-    notes: tuple[str, ...]
 
 
 def leaderboard_of(
@@ -119,7 +98,7 @@ def leaderboard_of(
     seed: int = 0,
     overwrite: bool = False,
     track: TrackProgress = silently,
-) -> Leaderboard:
+) -> ComparedTables:
     """Compare the methods of a folder of results on their archive.
 
     Each file that nextview-lab submit wrote is checked: whether it belongs to this archive, answers
@@ -130,12 +109,13 @@ def leaderboard_of(
     Args:
         folder: with the result files of nextview-lab submit (.json).
         archive: folder of the archive, with its truth.
-        out: folder to write, with leaderboard.html.
+        out: folder to write, with tables.md, and every number with its interval in measures.csv
+            and tests.csv.
         reference: method with which the others are compared; by default the blind one that is right
             most often after the first view.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap.
-        overwrite: replace the page in OUT.
+        overwrite: replace the tables in OUT.
         track: follows the files.
 
     Returns:
@@ -168,11 +148,19 @@ def leaderboard_of(
     track(score(), len(read), "methods")
     scored.sort(key=lambda one: (-one.right[:, -1].mean(), one.submission.method))
 
-    board = _board(frozen, scored, list(truths.values()), reference, samples, seed)
-    with new_folder(Path(out), overwrite) as part:
-        page = render("leaderboard.html", board=board, sha256=frozen.sha256)
-        (part / PAGE_FILE).write_text(page, encoding="utf-8")
-    return board
+    tables = _compared(
+        frozen, scored, list(truths.values()), reference, (samples, seed)
+    )
+    made = {
+        "archive_sha256": frozen.sha256,
+        "versions": {each.method: each.version for each in read},
+        "reference": tables.reference,
+        "samples": samples,
+        "seed": seed,
+        "command": command(),
+    }
+    write_compared(Path(out), tables, made, overwrite)
+    return tables
 
 
 def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
@@ -196,7 +184,8 @@ def read_submissions(folder: Path, frozen: FrozenArchive) -> list[Submission]:
         # no episode has more: what was asked for beyond is no work
         longest = max(len(each.said) for each in one.episodes)
         named = {
-            name: one_line(getattr(one, name), 100) for name in ("method", "version")
+            name: escape(one_line(getattr(one, name), 100))
+            for name in ("method", "version")
         }
         one = msgspec.structs.replace(one, views=longest, **named)
         if one.method in read:
@@ -291,6 +280,56 @@ def _scored(
     return Scored(one, said, right, tuple(errors))
 
 
+def _compared(
+    frozen: FrozenArchive,
+    scored: Sequence[Scored],
+    truths: Sequence[EpisodeTruth],
+    reference: str | None,
+    weights: tuple[int, int],
+) -> ComparedTables:
+    """Compare the methods with each other; ``weights`` are the samples and the seed of them."""
+    things = [truth.thing for truth in truths]
+    families = np.unique(things, return_inverse=True)[1]
+    samples, seed = weights
+    drawn = st.resample_families(families, samples, np.random.default_rng(seed))
+    episodes = pd.concat([one.episodes() for one in scored])
+    counted = Counted.of(episodes, SHARES, {}, families)
+    views = scored[0].right.shape[1]
+    posed = [
+        (one.submission.method, None, views, ADD_S, np.median(one.errors or np.nan))
+        for one in scored
+    ]
+    errors = measures_of(ALL, [(*row, np.nan, np.nan) for row in posed])
+
+    blind = best_blind_method(scored)
+    chosen = ""
+    if reference is None and blind is not None:
+        chosen = (
+            f"The reference, {blind}, is the best blind method on these same episodes, which"
+            " favours it."
+        )
+    compared = reference or blind or scored[0].submission.method
+    tests = counted.tests(
+        ALL, drawn, compared, lambda key: key.measure == RIGHT and key.views > 1
+    )
+    columns = [
+        Column(f"right after {k + 1}", (RIGHT,), k + 1, short=f"right after {k + 1}")
+        for k in range(views)
+    ]
+    columns += [Column(name, (name,), views, short=name) for name in LAST]
+    columns.append(Column(ADD_S, (ADD_S,), views, 1, ADD_S))
+    about = (
+        f"{number_of(len(truths), 'episode')}, {number_of(len(set(things)), 'thing')}"
+    )
+    return ComparedTables(
+        pd.concat([counted.measures(ALL, drawn), errors], ignore_index=True),
+        corrected([tests]),
+        compared,
+        (Board(one_line(frozen.manifest.name), tuple(columns), about),),
+        chosen,
+    )
+
+
 def best_blind_method(scored: Sequence[Scored]) -> str | None:
     """Return the blind method that is right most often after the views that it chose.
 
@@ -308,117 +347,3 @@ def best_blind_method(scored: Sequence[Scored]) -> str | None:
         key=lambda one: float(one.right[:, min(1, one.right.shape[1] - 1) :].mean()),
     )
     return best.submission.method
-
-
-def _board(
-    frozen: FrozenArchive,
-    scored: Sequence[Scored],
-    truths: Sequence[EpisodeTruth],
-    reference: str | None,
-    samples: int,
-    seed: int,
-) -> Leaderboard:
-    """Compare the methods with each other, and put them into tables."""
-    things = [truth.thing for truth in truths]
-    order = {name: row for row, name in enumerate(dict.fromkeys(things))}
-    families = np.array([order[name] for name in things])
-    weights = st.resample_families(families, samples, np.random.default_rng(seed))
-    episodes = pd.concat([one.episodes() for one in scored])
-    counted = Counted.of(episodes, SHARES, {}, families)
-    shares = counted.measures(ALL, weights)
-
-    compared = best_blind_method(scored) if reference is None else reference
-    tables = [_main_table(scored, shares, len(order))]
-    notes = [
-        f"{len(truths)} episodes with {number_of(len(order), 'thing')}; episodes with one thing are"
-        " resampled together.",
-        "All of it is simulated, with true masks. Poses are compared in the world, with the error"
-        " of the reported poses of the cameras.",
-    ]
-    if compared is not None and len(scored) > 1:
-        tests = counted.tests(
-            ALL, weights, compared, lambda key: key.measure == RIGHT and key.views > 1
-        )
-        if len(tests):
-            tables.append(_differences_table(corrected([tests]), compared))
-            notes += filter(None, [too_few(tests)])
-            if reference is None:
-                notes.append(
-                    f"The reference, {compared}, is the best blind method on these same episodes,"
-                    " which favours it."
-                )
-    name = one_line(frozen.manifest.name)
-    return Leaderboard(name, compared, tuple(tables), tuple(notes))
-
-
-def _main_table(
-    scored: Sequence[Scored],
-    shares: "pd.DataFrame",
-    things: int,
-) -> WrittenTable:
-    """Return the table of all methods."""
-    views = scored[0].right.shape[1]
-    columns = [
-        *(
-            (f"right after {number_of(k + 1, 'view')}", RIGHT, k + 1)
-            for k in range(views)
-        ),
-        ("confident and right", CONFIDENT_RIGHT, views),
-        ("confident and wrong", CONFIDENT_WRONG, views),
-        ("unknown", UNKNOWN_SAID, views),
-    ]
-
-    numbers = values_of(shares)
-    rows = []
-    for one in scored:
-        name = one.submission.method
-        cells = [
-            _with_interval(numbers[name, measure, at], things)
-            for _, measure, at in columns
-        ]
-        off = f"{np.median(one.errors):.1f}" if one.errors else NONE
-        rows.append((f"{name} ({one.submission.version})", *cells, off))
-
-    return WrittenTable(
-        "Methods",
-        f"Confident, unknown and poses are those after {number_of(views, 'view')}; poses are those"
-        " of things that are named right. In brackets: 95 % bootstrap intervals; Wilson's, with as"
-        " many samples as things, where all episodes agree.",
-        (
-            "method",
-            *(heading for heading, _, _ in columns),
-            "ADD-S, mm, median",
-        ),
-        tuple(rows),
-    )
-
-
-def _with_interval(number: tuple[float, float, float], things: int) -> str:
-    """Format a share with its interval.
-
-    Where all episodes agree, a bootstrap tells nothing: Wilson's interval for so many things.
-    """
-    value, low, high = number
-    if value in (0, 1):
-        low, high = st.wilson(int(value) * things, things)
-    return f"{value:.3f} ({low:.3f} to {high:.3f})"
-
-
-def _differences_table(tests: "pd.DataFrame", reference: str) -> WrittenTable:
-    """Return the table of differences to the reference."""
-    rows = []
-    for policy, views, *numbers in tests[
-        ["policy", "views", "difference", "low", "high", "p", "p_holm"]
-    ].itertuples(index=False):
-        apart, low, high = map(points, numbers[:3])
-        p = (f"{number:.3g}" for number in numbers[3:])
-        rows.append(
-            (policy, number_of(views, "view"), f"{apart} ({low} to {high})", *p)
-        )
-    return WrittenTable(
-        f"Differences to {reference}",
-        "Share that is right, percentage points, on the same episodes; p-values of sign flips over"
-        " the things, as they are and after Holm's correction over all rows.",
-        ("method", "after", "difference", "p", "p, corrected"),
-        tuple(rows),
-    )

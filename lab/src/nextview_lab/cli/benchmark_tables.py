@@ -3,13 +3,12 @@
 from dataclasses import replace
 from typing import Any
 
-from nextview.cli.progress import Terminal, console
+from nextview.cli.progress import Terminal
 from nextview_lab.benchmark import class_tables as board
 from nextview_lab.benchmark.board_page import WrittenTable, points
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant, written
 from nextview_lab.benchmark.results import ComparedTables
-from nextview_lab.benchmark.standings import Leaderboard
 from nextview_lab.cli.printing import print_tables
 from nextview_lab.errors import EntryError
 
@@ -95,14 +94,3 @@ def print_compared(found: ComparedTables) -> None:
     )
     for sentence in found.sentences():
         terminal.print(sentence)
-
-
-def print_standings(board: Leaderboard) -> None:
-    """Print the tables of a leaderboard.
-
-    Args:
-        board: the leaderboard.
-    """
-    print_tables(board.tables)
-    for note in board.notes:
-        console.print(note, soft_wrap=True)

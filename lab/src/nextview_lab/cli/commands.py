@@ -169,8 +169,8 @@ COMMANDS = {
     "leaderboard": Command(
         "nextview_lab.benchmark.standings:leaderboard_of",
         "compare methods on a frozen archive of episodes",
-        "the page is {out}/leaderboard.html",
-        f"{CLI}.benchmark_tables:print_standings",
+        "the tables are in {out}",
+        f"{CLI}.benchmark_tables:print_compared",
         computes=False,
         example="leaderboard results nextview-bench-1.0 board",
     ),
