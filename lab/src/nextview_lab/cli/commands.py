@@ -63,7 +63,7 @@ COMMANDS = {
     "train gain": Command(
         f"{TRAINING}.gain_training:train_gain",
         "train the policy that predicts the gain of a view",
-        "learned from {found.objects} objects; on those of other folds the {recipe.objective} after"
+        "on objects of other folds the {recipe.objective} after"
         " 2, 3, ... views is {found.value} at travel weight 0; travel weight"
         " {found.travel_weight:g}: {found.card}; in {found.states} states its answers differ from"
         " the networks' by {found.difference:.1g} at most",

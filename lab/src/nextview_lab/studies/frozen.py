@@ -206,33 +206,19 @@ def detected(depth: NDArray[np.uint16], mask: NDArray[np.bool_], pose: Float) ->
     return rounded(pose[:3, :3] @ points.mean(1) + pose[:3, 3])
 
 
-@dataclass(frozen=True, eq=False)
-class ShownScene:
-    """A scene whose thing the first view shows.
-
-    Attributes:
-        model: MuJoCo's.
-        data: MuJoCo's, with all things at rest.
-        aim: of the cameras, (3,), metres.
-        depth: of the first view, (H, W), steps.
-        mask: pixels of the thing in it, (H, W).
-    """
-
-    model: Any
-    data: Any
-    aim: Float
-    depth: NDArray[np.uint16]
-    mask: NDArray[np.bool_]
-
-
 def scene_before(
     views: CandidateViews,
     place: Place,
     scans: Path,
     name: str,
     rng: np.random.Generator,
-) -> ShownScene | None:
-    """A scene whose thing the first of drawn views shows; None if it cannot be shown there."""
+) -> tuple[Any, Any, Float, NDArray[np.uint16], NDArray[np.bool_]] | None:
+    """A scene whose thing the first of drawn views shows; None if it cannot be shown there.
+
+    Returns:
+        MuJoCo's model and data with all things at rest, the aim of the cameras, (3,), metres, and
+        of the first view the depth, (H, W), steps, and the pixels of the thing, (H, W).
+    """
     scan = scan_of(str(scans), name)
     camera = views.poses[views.first]
     for _ in range(SCENES_TRIED):
@@ -249,7 +235,7 @@ def scene_before(
         aim = detected(depth, mask, pose) + rng.normal(0, AIM_ERROR, 3)
         depth, mask = looked(*scene, moved(camera, aim), rng)
         if shown_pixels(depth, mask) >= ENOUGH_PIXELS:
-            return ShownScene(*scene, aim, depth, mask)
+            return *scene, aim, depth, mask
     return None
 
 
@@ -267,15 +253,16 @@ def make_episode(
     scene = scene_before(views, place, scans, name, rng)
     if scene is None:
         return None
+    model, data, aim, depth, mask = scene
+    first = depth, mask
 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     pixels = []
     for number, pose in enumerate(views.poses):
-        depth, mask = scene.depth, scene.mask
+        depth, mask = first
         if number != views.first:
-            there = moved(pose, scene.aim)
-            depth, mask = looked(scene.model, scene.data, there, rng)
+            depth, mask = looked(model, data, moved(pose, aim), rng)
         depth[depth > how.farthest * STEPS_PER_METRE] = 0
         pixels.append(shown_pixels(depth, mask))
         place_of = folder / f"{number:03d}"
@@ -291,7 +278,7 @@ def make_episode(
         poses=tuple(map(as_matrix, views.told)),
     )
     write_record(folder / EPISODE_FILE, episode)
-    true = rounded(views.world @ moved(true_pose(scene.data), -scene.aim))
+    true = rounded(views.world @ moved(true_pose(data), -aim))
     cameras = tuple(as_matrix(rounded(views.world @ pose)) for pose in views.poses)
     return EpisodeTruth(name, place, as_matrix(true), cameras, tuple(pixels))
 

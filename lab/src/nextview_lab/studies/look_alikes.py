@@ -272,36 +272,21 @@ def body_of(path: Path, scan: bool) -> trimesh.Trimesh | None:
     return body
 
 
-@dataclass(frozen=True, eq=False)
-class Made:
-    """One pair.
-
-    Attributes:
-        body: name of the body.
-        change: name of the change.
-        names: of the two things.
-        share: of the 40 views in which they differ.
-        meshes: of the two things.
-    """
-
-    body: str
-    change: str
-    names: tuple[str, str]
-    share: float
-    meshes: Pair
-
-
 def make_pairs(
     scans: list[Path],
     models: list[Path],
     count: int,
     seed: int,
-) -> list[Made]:
-    """Draw bodies, changes and places until there are enough pairs."""
+) -> list[tuple[tuple[str, str, str, str, str], Pair]]:
+    """Draw bodies, changes and places until there are enough pairs.
+
+    Returns:
+        A row of the table, and the meshes, of each.
+    """
     rng = np.random.default_rng(seed)
     scans = [scans[k] for k in rng.permutation(len(scans))]
     models = [models[k] for k in rng.permutation(len(models))]
-    made: list[Made] = []
+    made: list[tuple[tuple[str, str, str, str, str], Pair]] = []
     while len(made) < count:
         number = len(made)
         scan = not models or number % 2 == 0
@@ -327,7 +312,7 @@ def make_pairs(
         pair, share = found
         endings = NAMES.get(change, ("plain", change.replace(" ", "_")))
         first, second = (f"{number:02d}_{path.stem}_{ending}" for ending in endings)
-        made.append(Made(path.stem, change, (first, second), share, pair))
+        made.append(((path.stem, change, first, second, f"{share:.3f}"), pair))
     return made
 
 
@@ -374,9 +359,9 @@ def look_alikes(
     with (out / "pairs.csv").open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(("body", "change", "first", "second", "telling_share"))
-        for pair in made:
-            table.writerow((pair.body, pair.change, *pair.names, f"{pair.share:.3f}"))
-            for name, mesh in zip(pair.names, pair.meshes, strict=True):
+        for row, pair in made:
+            table.writerow(row)
+            for name, mesh in zip(row[2:4], pair, strict=True):
                 mesh.export(out / f"{name}.ply")
     print((out / "pairs.csv").read_text())
 

@@ -375,7 +375,6 @@ class TrainedGain:
 
     Attributes:
         card: path of its card.
-        objects: number of training objects.
         value: mean objective after 2, 3, ... views at travel weight 0, (views - 1,).
         travel_weight: the chosen weight of travel.
         states: number of states in which the exported file was compared with the networks.
@@ -383,7 +382,6 @@ class TrainedGain:
     """
 
     card: Path
-    objects: int
     value: Float
     travel_weight: float
     states: int
@@ -424,32 +422,29 @@ def train_gain(
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
-    data = _load(predictions, sensed, recipe, folds)
+    learned, validated, about, rng = _load(predictions, sensed, recipe, folds)
     best: list[Best] = []
 
     def epochs() -> Iterator[int]:
-        trainings = [
-            train(part, recipe, fold) for fold, part in enumerate(data.learned)
-        ]
-        for policies in best_epoch(trainings, data.validated, recipe):
+        trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
+        for policies in best_epoch(trainings, validated, recipe):
             best.append(policies)
             yield len(best)
 
     track(epochs(), recipe.epochs, "training")
     policies, value = best[-1]
     # the lowest weight at which the policy travels no farther than a random walk in the window
-    judged = list(zip(data.validated, policies, strict=True))
+    judged = list(zip(validated, policies, strict=True))
     travel_weight = fit_travel_weight(
         judged, recipe.max_views, recipe.objective, recipe.seed
     )
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate(
-        [walk(part, [policy], recipe, data.rng)[0] for part in data.validated]
+        [walk(part, [policy], recipe, rng)[0] for part in validated]
     )
-    difference = write_gain(out, policy, data.about, states)
+    difference = write_gain(out, policy, about, states)
     return TrainedGain(
         out,
-        data.objects,
         value.mean,
         travel_weight,
         len(states),
@@ -457,27 +452,13 @@ def train_gain(
     )
 
 
-@dataclass(frozen=True)
-class _Data:
-    """Training and validation data, as parallel lists with one pair for each fold.
-
-    Attributes:
-        about: card of a policy trained on it, without its table.
-    """
-
-    learned: list[Predictions]
-    validated: list[Predictions]
-    objects: int
-    about: PolicyCard
-    rng: np.random.Generator
-
-
 def _load(
     predictions: Path,
     sensed: Sequence[Path],
     recipe: GainRecipe,
     folds: int,
-) -> _Data:
+) -> tuple[list[Predictions], list[Predictions], PolicyCard, np.random.Generator]:
+    """Return what each fold learns from and is validated on, a card without its table, and rng."""
     table = Predictions.load(predictions).deduplicate()
     variants = load_sensed(sensed, table)
     sources = [(predictions, table), *zip(sensed, variants, strict=True)]
@@ -516,7 +497,7 @@ def _load(
             )
         ),
     )
-    return _Data(learned, validated, objects, about, rng)
+    return learned, validated, about, rng
 
 
 def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
