@@ -13,13 +13,11 @@ class WrittenTable:
 
     Attributes:
         title: above it.
-        about: what it shows, a sentence or two; "" for nothing.
         headings: of the columns.
         rows: cells, as many as headings in each.
     """
 
     title: str
-    about: str
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 

@@ -321,4 +321,4 @@ def written(
             (policy, m, c.views) in values for c in columns.values() for m in c.measures
         )
     )
-    return WrittenTable(board.title, board.about, ("policy", *columns), rows)
+    return WrittenTable(board.title, ("policy", *columns), rows)

@@ -307,7 +307,6 @@ def real_table(rows: Sequence[RealThing]) -> WrittenTable:
     columns = [_figures(group) for group in groups]
     return WrittenTable(
         "in brackets: 95 % intervals (Wilson)",
-        "",
         ("each frame alone", *headings),
         tuple((name, *(column[name] for column in columns)) for name in columns[0]),
     )

@@ -72,7 +72,6 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> WrittenTable
         )
     return WrittenTable(
         f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}",
-        "",
         ("policy", "accuracy", "class mean", "views", "travel, cells", "over", "p"),
         tuple(texts),
     )

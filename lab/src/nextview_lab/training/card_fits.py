@@ -528,12 +528,10 @@ class FittedValleys:
 
     Attributes:
         classes: for which the valley is the better view.
-        gains: of the valley over the peak, for each class.
         objects: number of objects in the fit.
     """
 
     classes: tuple[str, ...]
-    gains: dict[str, float]
     objects: int
 
 
@@ -574,7 +572,7 @@ def fit_valleys(
 
         about = f"{len(kept)} objects of the training split, judged by {judge}"
         write("valleys", about, [table], valley_classes=classes, valley_gain=gains)
-    return FittedValleys(classes, gains, len(kept))
+    return FittedValleys(classes, len(kept))
 
 
 def valley_gains(
