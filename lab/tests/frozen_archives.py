@@ -76,7 +76,7 @@ def write_episode(folder: Path, number: str, name: str, mesh) -> None:
     intrinsics[:2, 2] -= 0.5  # to the centre of the first pixel at 0
     write_record(
         episode / "episode.json",
-        FrozenEpisode(0, 1 / STEPS_IN_METRE, as_matrix(intrinsics), tuple(told)),
+        FrozenEpisode(False, 0, 1 / STEPS_IN_METRE, as_matrix(intrinsics), tuple(told)),
     )
     shown = EpisodeTruth(
         name, "alone", as_matrix(camera.truth[name]), tuple(told), tuple(pixels)

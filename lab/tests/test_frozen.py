@@ -25,7 +25,7 @@ OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
 SURROUNDINGS = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
-def make(scans, out):
+def make(scans, out, options=OPTIONS, **surroundings):
     return subprocess.run(
         [
             sys.executable,
@@ -33,10 +33,10 @@ def make(scans, out):
             "nextview_lab.studies.frozen",
             scans,
             out,
-            *OPTIONS.split(),
+            *options.split(),
         ],
         cwd=ROOT,
-        env=SURROUNDINGS,
+        env=SURROUNDINGS | surroundings,
         capture_output=True,
         text=True,
     )

@@ -32,7 +32,7 @@ EPISODES_FOLDER = "episodes"
 TRUTH_FOLDER = "truth"
 SCANS_FOLDER = "scans"
 EPISODE_FILE = "episode.json"
-FROZEN_FORMAT = 4
+FROZEN_FORMAT = 3
 LARGEST_FROZEN_VIEWS = 400  # of an episode
 
 Matrix = tuple[tuple[float, ...], ...]
@@ -48,6 +48,7 @@ class FrozenManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         made_with: versions of the libraries by name, with which it can be made again.
         files: SHA-256 of every other file, by its path in the archive; of a PNG that of its pixels
             (``pixels_sha256``).
+        sealed: None: the truth of all episodes is in the archive.
     """
 
     format: int
@@ -55,6 +56,7 @@ class FrozenManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int
     made_with: dict[str, str]
     files: dict[str, HashText]
+    sealed: None = None
 
 
 class FrozenThing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,6 +79,7 @@ class FrozenEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a method knows of an episode before it looks.
 
     Attributes:
+        held: whether a gripper holds the thing, so that it need not lie on anything.
         first: number of the first view.
         metres_per_unit: of the depth images.
         intrinsics: pinhole matrix, (3, 3), pixels, the centre of the first pixel at 0.
@@ -84,6 +87,7 @@ class FrozenEpisode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             metres, in a world with z up.
     """
 
+    held: bool
     first: int
     metres_per_unit: float
     intrinsics: Matrix

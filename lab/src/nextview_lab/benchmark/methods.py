@@ -63,6 +63,7 @@ class FrozenLook(msgspec.Struct, frozen=True):
         poses: reported camera-to-world poses of all candidate views, (V, 4, 4), OpenCV axes,
             metres; z is up in the world. That of this view is ``poses[view]``.
         free: numbers of the views that may come next; empty after the last one.
+        held: whether a gripper holds the thing.
         things: names that may be right.
     """
 
@@ -76,6 +77,7 @@ class FrozenLook(msgspec.Struct, frozen=True):
     intrinsics: Matrix
     poses: tuple[Matrix, ...]
     free: tuple[int, ...]
+    held: bool
     things: tuple[str, ...]
 
 
@@ -198,7 +200,7 @@ class NextviewMethod:
         session = system.session(
             start=look.view,
             seed=int(self._rng.integers(2**62)),
-            object=ObservedObject(WORLD_UP),
+            object=ObservedObject(WORLD_UP, support=not look.held),
             distance=float(np.median(np.linalg.norm(away, axis=1))),
         )
         session.limits = Limits.none()

@@ -277,6 +277,7 @@ def run_episode(
             intrinsics=told.intrinsics,
             poses=told.poses,
             free=tuple(left) if step < views else (),
+            held=told.held,
             things=things,
         )
         answer = method.answer(look)

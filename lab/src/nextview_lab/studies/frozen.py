@@ -3,7 +3,7 @@
     python -m nextview_lab.studies.frozen SCANS nextview-bench-1.0
     python -m nextview_lab.studies.frozen SCANS part --things 4 --draws 1 --grid 3 4
 
-Each thing lies in some of the places of ``staged_things``, by its physics, and a stereo
+Each thing lies in some of the seven places of ``staged_things``, by its physics, and a stereo
 camera takes all candidate views of it: a grid of azimuths and elevations over where a camera can
 stand. Nothing of nextview's own simulation is used. docs/submit.md describes the files and how
 methods are compared on them.
@@ -97,7 +97,7 @@ CARD = """\
 - **What**: depth of 640 x 480 pixels in steps of 0.1 mm (`NNN.png`), the pixels of the thing
   (`NNN-mask.png`), what an arm says of the camera's pose, and which view comes first. `truth/`
   holds names, poses of the things and true poses of the cameras: only `nextview-lab leaderboard`
-  reads it. A method is not shown it.
+  reads it. A method is not shown it. The truth of 0 sealed episodes is not in the archive.
 - **How**: things fall by the physics of MuJoCo and are seen along its rays. Noise is that of a
   stereo camera with a base of 55 mm: disparities with a deviation of 0.08 pixels, correlated over
   two pixels, in steps of 1/16 pixel; mixed depths and holes at edges; holes at grazing angles and
@@ -272,6 +272,7 @@ def make_episode(
             )
 
     episode = FrozenEpisode(
+        held=place == "held",
         first=views.first,
         metres_per_unit=1 / STEPS_PER_METRE,
         intrinsics=as_matrix(CAMERA_MATRIX),
@@ -371,8 +372,8 @@ def main(
     """Make an archive, or go on with one that was stopped.
 
     Args:
-        scans: folder of the scans of all things that may be shown, NAME.ply, in metres; five or
-            more, as a bin holds five.
+        scans: folder of the scans of all things that may be shown, NAME.ply, in metres; with those
+            of the YCB set that a stack and a bowl need.
         out: folder of the archive; its name is the archive's, such as nextview-bench-1.0.
         how: what it depends on.
     """

@@ -10,7 +10,7 @@ there, and physics makes millimetres of them: what MuJoCo is given, and what it 
 ``rounded``, and ties are broken by rounded values. OpenGL is not used: its drivers differ by more.
 
 Convex things collide as their hulls, others as the hulls of up to 20 pieces of their surface, so
-that a thing on a spoon touches what is seen. All lengths are in metres. The floor is
+that a thing on a spoon or in a bowl touches what is seen. All lengths are in metres. The floor is
 level, a table of uneven planks has its top near a height of 0, and things are near the z axis.
 """
 
@@ -35,7 +35,7 @@ with extras():
 
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Place = Literal["alone", "shelf", "bin"]
+Place = Literal["alone", "shelf", "stack", "bin", "bowl", "leaning", "held"]
 PLACES: tuple[Place, ...] = get_args(Place)
 
 FOCAL = 610.0  # pixels
@@ -48,14 +48,31 @@ DECIMALS = 7  # of what is rounded, metres and parts of directions
 COLLIDES = 3  # group of the geoms that are not seen
 STAGINGS_TRIED = 12  # of a thing in a place
 ENOUGH_PIXELS = 350  # of a thing, below which a view is not judged
-MOST_PIECES = 20  # of a scan
 CONVEX_SHARE = 0.7  # of the hull that a scan fills, above which the hull is its shape
 FLOOR_DEPTH = 0.72  # metres from the table's top to the floor
+CARRIED = 0.02  # least share of the weight that carries what leans
+# whose tops are flat when they lie on their largest side
+FLAT_TOPS = (
+    "cracker_box",
+    "foam_brick",
+    "gelatin_box",
+    "master_chef_can",
+    "potted_meat_can",
+    "pudding_box",
+    "rubiks_cube",
+    "sugar_box",
+    "tuna_fish_can",
+    "wood_block",
+)
 # degrees: azimuths from the +x axis, elevations
 WHERE_CAMERAS_STAND: dict[Place, tuple[float, float, float, float]] = {
     "alone": (-180, 180, 25, 65),
     "shelf": (-40, 40, 5, 30),
+    "stack": (-180, 180, 20, 60),
     "bin": (-180, 180, 50, 80),
+    "bowl": (-180, 180, 35, 75),
+    "leaning": (-65, 65, 10, 55),
+    "held": (-180, 180, -10, 50),
 }
 
 
@@ -83,7 +100,7 @@ class Staging:
 
     spec: Any
     starts: dict[str, tuple[Float, Float]]
-    stays: Callable[[Any], bool]
+    stays: Callable[[Any, Any], bool]
 
 
 @cache
@@ -102,7 +119,7 @@ def hull_or_none(points: Float) -> trimesh.Trimesh | None:
 
 
 @cache
-def pieces_of(folder: str, name: str) -> tuple[Float, ...]:
+def pieces_of(folder: str, name: str, most: int = 20) -> tuple[Float, ...]:
     """Corners of convex pieces that cover a scan, (N, 3) each, metres."""
     scan = scan_of(folder, name)
     hull = scan.convex_hull
@@ -112,7 +129,7 @@ def pieces_of(folder: str, name: str) -> tuple[Float, ...]:
     middles = scan.triangles_center
     open_parts = [(hull, np.arange(len(scan.faces)))]
     whole: list[tuple[trimesh.Trimesh, NDArray[np.int64]]] = []
-    while open_parts and len(open_parts) + len(whole) < MOST_PIECES:
+    while open_parts and len(open_parts) + len(whole) < most:
         open_parts.sort(key=lambda part: round(part[0].volume, 15))
         hull, faces = open_parts.pop()
         axis = int(np.ptp(middles[faces], axis=0).argmax())
@@ -126,24 +143,34 @@ def pieces_of(folder: str, name: str) -> tuple[Float, ...]:
     return tuple(np.asarray(hull.vertices) for hull, _ in [*open_parts, *whole])
 
 
-def add_scan(spec: Any, body_name: str, folder: str, name: str) -> None:
-    """Add a scan to a scene, free to fall."""
-    scan = scan_of(folder, name)
+def add_scan(
+    spec: Any,
+    body_name: str,
+    pieces: Sequence[Float],
+    scan: trimesh.Trimesh,
+    pose: tuple[Float, Float] | None = None,
+    scale: float = 1.0,
+) -> None:
+    """Add a scan to a scene, free to fall unless its place and rotation are given."""
     body = spec.worldbody.add_body(name=body_name)
-    body.add_freejoint()
+    if pose is None:
+        body.add_freejoint()
+    else:
+        body.pos = rounded(pose[0])
+        body.quat = quaternion(pose[1])
 
     shell = spec.add_mesh(name=f"{body_name} seen")
     shell.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    shell.uservert = scan.vertices.ravel()
+    shell.uservert = (scale * scan.vertices).ravel()
     shell.userface = scan.faces.ravel()
     seen = body.add_geom(name=f"{body_name} seen", meshname=shell.name, mass=0)
     seen.type = mujoco.mjtGeom.mjGEOM_MESH
     seen.contype = seen.conaffinity = 0
 
-    for number, corners in enumerate(pieces_of(folder, name)):
+    for number, corners in enumerate(pieces):
         piece = spec.add_mesh(name=f"{body_name} {number}")
         piece.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        piece.uservert = corners.ravel()
+        piece.uservert = (scale * corners).ravel()
         solid = body.add_geom(meshname=piece.name, density=400, group=COLLIDES)
         solid.type = mujoco.mjtGeom.mjGEOM_MESH
 
@@ -193,11 +220,12 @@ def placed(
     turn: Float,
     spot: Float,
     lowest: float,
+    scale: float = 1.0,
 ) -> tuple[Float, Float]:
     """Place and rotation with the middle of a turned scan at a spot, (2,), and its lowest point at
     a height.
     """
-    points = scan.vertices @ turn.T
+    points = scale * scan.vertices @ turn.T
     middle = (points.min(0) + points.max(0)) / 2
     return np.array([*spot, lowest]) - (*middle[:2], points[:, 2].min()), turn
 
@@ -207,22 +235,87 @@ def turned(rng: np.random.Generator) -> Float:
     return Rotation.random(rng=rng).as_matrix()
 
 
+def with_up(up: Float, rng: np.random.Generator) -> Float:
+    """A random rotation that turns a direction, (3,), upwards."""
+    tilt, _ = Rotation.align_vectors([[0, 0, 1.0]], [up])
+    spin = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+    return (spin * tilt).as_matrix()
+
+
+def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
+    """Directions that are upwards when a scan rests on a side of its hull, (N, 3), none within 10
+    degrees of another, and the areas of these sides, (N,), square metres, largest first.
+    """
+    hull = scan.convex_hull
+    normals = hull.face_normals
+    heights = ((hull.triangles[:, 0] - hull.center_mass) * normals).sum(1)
+    feet = hull.center_mass + heights[:, None] * normals
+    weights = trimesh.triangles.points_to_barycentric(hull.triangles, feet)
+    stable = (weights >= 0).all(1)
+    level = normals[stable] @ normals.T > np.cos(np.radians(2))
+    areas = level @ hull.area_faces
+    kept: list[int] = []
+    for one in np.argsort(-np.round(areas, 12), kind="stable"):
+        others = normals[stable][kept]
+        if not (others @ normals[stable][one] > np.cos(np.radians(10))).any():
+            kept.append(int(one))
+    return -normals[stable][kept], areas[kept]
+
+
+def touching(model: Any, data: Any) -> dict[str, float]:
+    """What the thing touches, by names of bodies, and the normal force of each, newtons."""
+    forces: dict[str, float] = {}
+    for number, contact in enumerate(data.contact):
+        names = [
+            model.body(model.geom_bodyid[geom]).name
+            for geom in (contact.geom1, contact.geom2)
+        ]
+        if "thing" in names:
+            other = names[1 - names.index("thing")]
+            force = np.zeros(6)
+            mujoco.mj_contactForce(model, data, number, force)
+            forces[other] = forces.get(other, 0) + float(force[0])
+    return forces
+
+
 def near(data: Any, *reach: float) -> bool:
     """Whether the thing's centre of mass is within so many metres of 0 along x, y and z."""
     return bool((np.abs(data.body("thing").xipos) < reach).all())
 
 
-def alone(folder: str, name: str, rng: np.random.Generator) -> Staging:
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """The thing of an episode.
+
+    Attributes:
+        folder: of the scans.
+        name: of the thing.
+        tries: how often it was staged in vain.
+    """
+
+    folder: str
+    name: str
+    tries: int
+
+    @property
+    def scan(self) -> trimesh.Trimesh:
+        """Its scan, metres."""
+        return scan_of(self.folder, self.name)
+
+    def enters(self, spec: Any, pose: tuple[Float, Float] | None = None) -> None:
+        """Join a scene."""
+        add_scan(spec, "thing", pieces_of(self.folder, self.name), self.scan, pose)
+
+
+def alone(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls on a table."""
     spec = room(rng)
-    add_scan(spec, "thing", folder, name)
-    begin = placed(
-        scan_of(folder, name), turned(rng), rng.uniform(-0.04, 0.04, 2), 0.03
-    )
-    return Staging(spec, {"thing": begin}, lambda data: near(data, 0.35, 0.3, 0.4))
+    actor.enters(spec)
+    begin = placed(actor.scan, turned(rng), rng.uniform(-0.04, 0.04, 2), 0.03)
+    return Staging(spec, {"thing": begin}, lambda m, d: near(d, 0.35, 0.3, 0.4))
 
 
-def shelf(folder: str, name: str, rng: np.random.Generator) -> Staging:
+def shelf(actor: Actor, rng: np.random.Generator) -> Staging:
     """As it falls in a compartment of 36 x 70 x 42 cm that is open towards +x."""
     spec = room(rng, table=False)
     world = spec.worldbody
@@ -234,13 +327,34 @@ def shelf(folder: str, name: str, rng: np.random.Generator) -> Staging:
         ((-0.18, 0.35, 0), (0.18, 0.37, 0.42)),
     ):
         add_box(world, low, high)
-    add_scan(spec, "thing", folder, name)
+    actor.enters(spec)
     spot = rng.uniform((-0.05, -0.15), (0.05, 0.15))
-    begin = placed(scan_of(folder, name), turned(rng), spot, 0.02)
-    return Staging(spec, {"thing": begin}, lambda data: near(data, 0.18, 0.35, 0.42))
+    begin = placed(actor.scan, turned(rng), spot, 0.02)
+    return Staging(spec, {"thing": begin}, lambda m, d: near(d, 0.18, 0.35, 0.42))
 
 
-def in_a_bin(folder: str, name: str, rng: np.random.Generator) -> Staging:
+def stack(actor: Actor, rng: np.random.Generator) -> Staging:
+    """On another thing that lies on its largest side, and touching nothing else."""
+    spec = room(rng)
+    actor.enters(spec)
+    name = str(rng.choice([each for each in FLAT_TOPS if each != actor.name]))
+    under = Actor(actor.folder, name, 0).scan
+    add_scan(spec, "under", pieces_of(actor.folder, name), under)
+    flat = with_up(stable_ups(under)[0][0], rng)
+    if actor.tries < 3:
+        turn = turned(rng)
+    else:  # on any side of its hull that it can rest on
+        ups = stable_ups(actor.scan)[0]
+        turn = with_up(ups[rng.integers(len(ups))], rng)
+    above = 0.008 + np.ptp(under.vertices @ flat[2])
+    starts = {
+        "under": placed(under, flat, np.zeros(2), 0.003),
+        "thing": placed(actor.scan, turn, rng.uniform(-0.01, 0.01, 2), above),
+    }
+    return Staging(spec, starts, lambda m, d: set(touching(m, d)) == {"under"})
+
+
+def in_a_bin(actor: Actor, rng: np.random.Generator) -> Staging:
     """In a box of 40 x 30 x 10 cm, with four other things, poured in any order."""
     spec = room(rng)
     box = spec.worldbody.add_body(name="bin")
@@ -253,31 +367,121 @@ def in_a_bin(folder: str, name: str, rng: np.random.Generator) -> Staging:
     ):
         add_box(box, low, high)
 
-    all_names = sorted(path.stem for path in Path(folder).glob("*.ply"))
-    scans = {each: scan_of(folder, each) for each in all_names}
-    small = [each for each in all_names if scans[each].extents.max() < 0.2]
-    others = rng.choice([each for each in small if each != name], 4, replace=False)
-    add_scan(spec, "thing", folder, name)
-    names = {"thing": name}
-    for number, each in enumerate(map(str, others)):
-        names[f"other {number}"] = each
-        add_scan(spec, f"other {number}", folder, each)
+    all_names = sorted(path.stem for path in Path(actor.folder).glob("*.ply"))
+    scans = {name: scan_of(actor.folder, name) for name in all_names}
+    small = [name for name in all_names if scans[name].extents.max() < 0.2]
+    small = [name for name in small if name != actor.name]
+    others = rng.choice(small, 4, replace=False)
+    actor.enters(spec)
+    names = {"thing": actor.name}
+    for number, name in enumerate(map(str, others)):
+        names[f"other {number}"] = name
+        pieces = pieces_of(actor.folder, name)
+        add_scan(spec, f"other {number}", pieces, scans[name])
 
     starts = {}
     above = 0.03
-    for body_name in map(str, rng.permutation(list(names))):
-        scan = scans[names[body_name]]
+    for body_name in rng.permutation(list(names)):
+        scan = scans[names[str(body_name)]]
         turn = turned(rng)
         spot = rng.uniform((-0.08, -0.05), (0.08, 0.05))
-        starts[body_name] = placed(scan, turn, spot, above)
+        starts[str(body_name)] = placed(scan, turn, spot, above)
         above += np.ptp(scan.vertices @ turn[2]) + 0.01
-    return Staging(spec, starts, lambda data: near(data, 0.2, 0.15, 0.2))
+    return Staging(
+        spec,
+        starts,
+        lambda m, d: near(d, 0.2, 0.15, 0.2) and "world" not in touching(m, d),
+    )
 
 
-STAGES: dict[Place, Callable[[str, str, np.random.Generator], Staging]] = {
+def in_a_bowl(actor: Actor, rng: np.random.Generator) -> Staging:
+    """In the YCB bowl, 16 cm wide, or one that is 1.45 times as wide as the thing is long."""
+    spec = room(rng)
+    actor.enters(spec)
+    bowl = scan_of(actor.folder, "bowl")
+    scale = max(1.0, 1.45 * actor.scan.extents.max() / 0.16)
+    upright = placed(bowl, np.eye(3), np.zeros(2), 0.003, scale)
+    pieces = pieces_of(actor.folder, "bowl", 48)
+    add_scan(spec, "bowl", pieces, bowl, upright, scale)
+    begin = placed(actor.scan, turned(rng), rng.uniform(-0.01, 0.01, 2), 0.06 * scale)
+    return Staging(spec, {"thing": begin}, lambda m, d: set(touching(m, d)) == {"bowl"})
+
+
+def leaning(actor: Actor, rng: np.random.Generator) -> Staging:
+    """Its long axis tilted against a wall or a box that carries a part of its weight."""
+    spec = room(rng)
+    actor.enters(spec)
+    wall = spec.worldbody.add_body(name="wall")
+    half, top = ((0.4, 0.5), (0.14, 0.18))[rng.integers(2)]
+    add_box(wall, (-0.25, -half, 0.003), (-0.1, half, top))
+
+    points = actor.scan.vertices - actor.scan.vertices.mean(0)
+    long_axis = np.linalg.svd(points, full_matrices=False)[2][0]
+    long_axis *= np.sign(long_axis[np.abs(long_axis).argmax()])
+    upright = with_up(long_axis * rng.choice([-1, 1]), rng)
+    tilt = Rotation.from_euler("y", -rng.uniform(8, 35), degrees=True)
+    turn = tilt.as_matrix() @ upright
+    spot = np.array([0, rng.uniform(-0.04, 0.04)])
+    place, _ = placed(actor.scan, turn, spot, 0.004)
+    place[0] = -0.098 - (actor.scan.vertices @ turn[0]).min()
+
+    def carried(model: Any, data: Any) -> bool:
+        forces = touching(model, data)
+        weight = 9.81 * model.body("thing").mass[0]
+        return forces.get("wall", 0) > CARRIED * weight and "world" in forces
+
+    return Staging(spec, {"thing": (place, turn)}, carried)
+
+
+def held(actor: Actor, rng: np.random.Generator) -> Staging:
+    """Between two fingers where it is narrow enough, or at a suction cup."""
+    spec = room(rng)
+    turn = turned(rng)
+    place = np.array([0, 0, 0.35]) - turn @ actor.scan.bounds.mean(0)
+    actor.enters(spec, (place, turn))
+    points = actor.scan.vertices @ turn.T + place
+
+    gripper = spec.worldbody.add_body(name="gripper")
+    for _ in range(60):
+        # rows: across the fingers, along their width, out to the arm
+        axes = turned(rng)
+        along = points @ axes.T
+        end = along[:, 2].max()
+        tip = along[along[:, 2].argmax()]
+        pinched = along[
+            (np.abs(along[:, 1] - tip[1]) < 0.01) & (along[:, 2] > end - 0.03)
+        ]
+        low, high = pinched[:, 0].min(), pinched[:, 0].max()
+        if axes[2, 2] > -0.2 and high - low < 0.08:
+            break
+    else:
+        low = high = tip[0]
+    middle = (low + high) / 2
+    boxes = [
+        ((-0.05, -0.03, 0.02), (0.05, 0.03, 0.1)),
+        ((-0.03, -0.03, 0.1), (0.03, 0.03, 0.3)),
+    ]
+    if low < high:
+        half = (high - low) / 2
+        boxes.append(((-half - 0.008, -0.01, -0.03), (-half, 0.01, 0.02)))
+        boxes.append(((half, -0.01, -0.03), (half + 0.008, 0.01, 0.02)))
+    else:
+        boxes.append(((-0.012, -0.012, 0), (0.012, 0.012, 0.02)))
+    gripper.pos = rounded(axes.T @ (middle, tip[1], end))
+    gripper.quat = quaternion(axes.T)
+    for corners in boxes:
+        add_box(gripper, *corners)
+    return Staging(spec, {}, lambda m, d: True)
+
+
+STAGES: dict[Place, Callable[[Actor, np.random.Generator], Staging]] = {
     "alone": alone,
     "shelf": shelf,
+    "stack": stack,
     "bin": in_a_bin,
+    "bowl": in_a_bowl,
+    "leaning": leaning,
+    "held": held,
 }
 
 
@@ -292,7 +496,7 @@ def at_rest(staging: Staging) -> tuple[Any, Any] | None:
     mujoco.mj_forward(model, data)
 
     calm = 0
-    while calm < 2:
+    while staging.starts and calm < 2:
         mujoco.mj_step(model, data, 100)
         speed = np.abs(data.qvel).reshape(-1, 6).max(0)
         still = speed[:3].max() < 0.004 and speed[3:].max() < 0.05
@@ -306,10 +510,10 @@ def staged(
     place: Place, folder: str, name: str, rng: np.random.Generator
 ) -> tuple[Any, Any] | None:
     """A thing at rest where it should be: MuJoCo's model and data; None after tries in vain."""
-    for _ in range(STAGINGS_TRIED):
-        staging = STAGES[place](folder, name, rng)
+    for tries in range(STAGINGS_TRIED):
+        staging = STAGES[place](Actor(folder, name, tries), rng)
         scene = at_rest(staging)
-        if scene is not None and staging.stays(scene[1]):
+        if scene is not None and staging.stays(*scene):
             model, data = scene
             data.qpos[:] = rounded(data.qpos)
             mujoco.mj_kinematics(model, data)
