@@ -80,7 +80,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"benchmarks\.gate|studies\.(segmentation|confidence|distances)|^nextview-lab real": (
         "needs scans and real frames, which are not here: lab/tests/test_real.py writes some"
     ),
-    r"^nextview-lab benchmark tables": (
+    r"^nextview-lab benchmark tables|studies\.tracking": (
         "needs scans of all things that the bundled memory knows"
     ),
     r"^python3 -m venv": ".ci/base_installation makes such an environment, and uses it",

@@ -25,7 +25,7 @@ OPTIONS = "--places alone --things 2 --draws 1 --grid 1 3 --seed 3"
 SURROUNDINGS = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
-def make(scans, out, options=OPTIONS, **surroundings):
+def make(scans, out):
     return subprocess.run(
         [
             sys.executable,
@@ -33,10 +33,10 @@ def make(scans, out, options=OPTIONS, **surroundings):
             "nextview_lab.studies.frozen",
             scans,
             out,
-            *options.split(),
+            *OPTIONS.split(),
         ],
         cwd=ROOT,
-        env=SURROUNDINGS | surroundings,
+        env=SURROUNDINGS,
         capture_output=True,
         text=True,
     )

@@ -7,7 +7,6 @@ Each folder FRAMES/SENSOR-DISTANCE has a frame of each thing as it may come to r
 degrees above, by each sensor from the same side at each distance, with its pixels and its pose.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,9 @@ from rich.progress import track
 
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
-from nextview.geometry.mesh import load_mesh
 from nextview.simulation.sensor import SENSORS
 from nextview_lab.data.real_frames import Shot, Told, write_frames
-from nextview_lab.studies.shared import scans_in
+from nextview_lab.studies.shared import mesh_of, scans_in
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 
 ELEVATION = np.radians(40.0)  # of the camera above the table
@@ -47,8 +45,7 @@ def main(
     paths = [*scans_in(scans).values()][::every]
     for number, path in enumerate(track(paths, "things", console=console)):
         rng = np.random.default_rng([seed, number])
-        mesh = replace(load_mesh(path, unit="m"), name=path.stem)
-        table = SimulatedTable.draw([mesh], rng, 0.0)
+        table = SimulatedTable.draw([mesh_of(path)], rng, 0.0)
         placed = table.things[0].placed
         middle = (placed.min(0) + placed.max(0)) / 2
         azimuth = rng.uniform(0, 2 * np.pi, 1)

@@ -1,10 +1,11 @@
-"""What studies share: scans."""
+"""What studies share: scans and their meshes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from nextview.errors import UsageError
-from nextview.geometry.mesh import FORMATS
+from nextview.geometry.mesh import FORMATS, Mesh, load_mesh
 
 
 def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
@@ -25,3 +26,8 @@ def scans_in(folder: Path, formats: Sequence[str] = FORMATS) -> dict[str, Path]:
     if not files:
         raise UsageError(f"{folder}: holds no scan, NAME{formats[0]}")
     return dict(sorted(files.items()))
+
+
+def mesh_of(scan: Path) -> Mesh:
+    """A scan in metres, called as its file."""
+    return replace(load_mesh(scan, unit="m"), name=scan.stem)
