@@ -93,7 +93,7 @@ $(THINGS)/alike_%/memory.json: $(THINGS)/look_alikes_%/pairs.csv
 
 .venv-test/installed: pyproject.toml lab/pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[bags,cluster,explore,record,teach,dev,workflow,docs]' -e 'lab[arm,benchmark,train]'
+	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[bags,cluster,explore,record,teach,dev,workflow,docs]' -e 'lab[arm,benchmark,envs,train]'
 	touch $@
 
 .venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/*/*)

@@ -22,6 +22,7 @@ from nextview.geometry.resting import resting_poses
 EXTRAS = (
     "torch",
     "pandas",
+    "gymnasium",
     "viser",
     "rerun",
     "distributed",

@@ -113,6 +113,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"look_alikes|(benchmark things|studies\.strangers) (YCB|HALF_SCANS)": (
         "needs the YCB scans, and minutes"
     ),
+    r"agent_on_things": (
+        "needs things that were taught; lab/tests/test_thing_environment.py lets it learn"
+    ),
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"--ensemble runs/second": "needs the run of the line before",
 }

@@ -9,6 +9,7 @@ PROJECT = "nextview-lab"
 EXTRAS = {  # packages by the optional part, as in pyproject.toml, that brings them
     "arm": ("gymnasium_robotics", "mink", "mujoco"),
     "benchmark": ("jinja2", "pandas"),
+    "envs": ("gymnasium",),
     "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
 

@@ -13,11 +13,14 @@ from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
 from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
-from nextview.types import Float
+from nextview.types import Float, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.training.card_fits import calibration_of
 from nextview_lab.training.fitting_set import for_fitting
+
+# belief in the truth, its logarithm, or whether the answer is right
+OBJECTIVES = ("belief", "log-belief", "right")
 
 
 def for_replay(
@@ -133,15 +136,32 @@ def value_after(
         data: of the N objects.
         total: sums of the log-evidence of each object, (N, ..., D).
         n_views: number of views in the sums, (N, ...).
-        kind: "belief" in the truth, its logarithm "log-belief", or "right", of the answer.
+        kind: one of OBJECTIVES.
 
     Returns:
         Values, (N, ...) float64.
     """
-    logs = data.calibration.log_belief(total, n_views, len(data.classes))
+    return value_of(
+        data.calibration.log_belief(total, n_views, len(data.classes)),
+        data.labels,
+        kind,
+    )
+
+
+def value_of(logs: Float, labels: Index, kind: str) -> Float:
+    """Return the value of log-beliefs.
+
+    Args:
+        logs: log-beliefs up to a constant, (N, ..., C).
+        labels: true classes, (N,) int64.
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, ...) float64.
+    """
     if kind == "right":
-        return np.equal(logs.argmax(-1).T, data.labels).T.astype(np.float64)
-    of_truth = of_true_class(logs, data.labels)
+        return np.equal(logs.argmax(-1).T, labels).T.astype(np.float64)
+    of_truth = of_true_class(logs, labels)
     return of_truth if kind == "log-belief" else np.exp(of_truth)
 
 
@@ -151,7 +171,7 @@ def candidate_values(data: Predictions, moment: DecisionState, kind: str) -> Flo
     Args:
         data: of the N objects.
         moment: the state of the episodes.
-        kind: see ``value_after``.
+        kind: one of OBJECTIVES.
 
     Returns:
         Values, (N, V) float64.
@@ -193,7 +213,7 @@ def judge(
         data: of the objects.
         policy: the policy.
         n_views: views of each episode.
-        kind: see ``value_after``.
+        kind: one of OBJECTIVES.
         rng: source of all random numbers.
         rounds: episodes with each object.
 
@@ -249,7 +269,7 @@ def judge_all(
     Args:
         judged: predictions, each with its own policy.
         n_views: views of each episode.
-        kind: see ``value_after``.
+        kind: one of OBJECTIVES.
         seed: of the random numbers.
         rounds: episodes with each object.
 
@@ -276,7 +296,7 @@ def fit_travel_weight(
     Args:
         judged: predictions, each with its own policy.
         n_views: views of each episode.
-        kind: see ``value_after``.
+        kind: one of OBJECTIVES.
         seed: of the random numbers.
 
     Returns:
