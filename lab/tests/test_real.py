@@ -115,7 +115,7 @@ def said(poses, **shifts):
         pose[0, 3] += shifts.get(name, 0.0)
         flat = tuple(pose.ravel().tolist())
         found.append(FoundObject(name, 0.99, True, True, flat))
-    return FrameAnswer(tuple(found), 0.4)
+    return FrameAnswer(tuple(found), 0.5, 0.4)
 
 
 def test_frames_without_poses_are_read_from_one_folder(seen, tmp_path):
@@ -168,7 +168,7 @@ def test_the_pose_error_and_the_stranger_that_gets_a_name(labelled, seen, clouds
     pose = seen[3]["mug"].copy()
     pose[:3, 3] += (middles["banana"] - middles["mug"])[:3]
     one = FoundObject("mug", 0.6, True, False, tuple(pose.ravel().tolist()))
-    rows = compared(frame, FrameAnswer((one,), 0.4), clouds)
+    rows = compared(frame, FrameAnswer((one,), 0.5, 0.4), clouds)
     on = next(row for row in rows if row.name)
     assert (on.number, on.thing, on.taught, on.right) == (3, "", False, False)
 

@@ -1,32 +1,24 @@
 """What is said of real frames, each alone, against what is known of the things in them."""
 
-import csv
-import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from nextview.captured.check import evenly_spread
-from nextview.checks import whole
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, NextviewError, ObservationError, UsageError
-from nextview.files import (
-    check_new,
-    new_file,
-    only_one,
-    read_record,
-    unfinished,
-    write_record,
-)
-from nextview.recognition.model_card import find_models
+from nextview.errors import DatasetError, NextviewError
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
-from nextview.things.memory import open_memory
 from nextview.types import Float, Mask
 from nextview_lab.benchmark.board_page import WrittenTable
-from nextview_lab.benchmark.frame_answers import FrameAnswer, answer_to
+from nextview_lab.benchmark.frame_answers import (
+    FrameAnswer,
+    check_table,
+    evenly,
+    looked_at,
+    write_table,
+)
 from nextview_lab.benchmark.statistics import wilson
 from nextview_lab.data.metrics import add_s
 from nextview_lab.data.real_frames import RealFrame, TrueThing, real_frames
@@ -124,58 +116,29 @@ def recognise_real(
         ResultsError: ``out`` exists, or cannot be written.
         UsageError: an option makes no sense.
     """
-    check_new(out, overwrite)
-    if out.suffix.lower() != ".csv":
-        raise UsageError(f"{out}: the name ends in .csv")
+    check_table(out, overwrite)
     system = load(models)
-    there: list[RealFrame] = []
-    for each in (folder, *more):
-        found = real_frames(each, intrinsics, depth_scale, first_label)
-        most = (
-            len(found) if frames is None else whole(frames, "the number of frames", 1)
+    there = [
+        frame
+        for each in (folder, *more)
+        for frame in evenly(
+            real_frames(each, intrinsics, depth_scale, first_label), frames
         )
-        there += [found[row] for row in evenly_spread(len(found), most)]
-
-    card, _ = open_memory(find_models(models).recogniser)
-    depends = str((card.sha256, intrinsics, depth_scale, Path.cwd()))
-    left_out: dict[str, NextviewError] = {}
-    rows: list[RealThing] = []
-    with (
-        only_one(out),
-        unfinished(out, hashlib.sha256(depends.encode()).hexdigest()) as parts,
-    ):
-        names = [f"{frame.folder}: {frame.name}" for frame in there]
-        hashes = [hashlib.sha256(name.encode()).hexdigest() for name in names]
-        files = [parts / f"{each}.json" for each in hashes]
-
-        def look() -> Iterator[int]:
-            for done, frame in enumerate(there, 1):
-                if not files[done - 1].exists():
-                    try:
-                        write_record(files[done - 1], answer_to(frame, system))
-                    except (DatasetError, ObservationError) as error:
-                        left_out[names[done - 1]] = error
-                yield done
-
-        track(look(), len(there), "frames")
+    ]
+    how = intrinsics, depth_scale
+    with looked_at(out, models, system, there, how, track) as answers:
         clouds = surface_points(system)
-        for frame, name, file in zip(there, names, files, strict=True):
-            if file.exists():
-                answer = read_record(file, FrameAnswer, "what was found", DatasetError)
-                rows += compared(frame, answer, clouds)
-            elif isinstance(left_out[name], ObservationError):
-                rows += compared(frame, None, clouds)
+        rows = [
+            row
+            for frame in there
+            if (answer := answers.of(frame)) is not None or answers.refused(frame)
+            for row in compared(frame, answer, clouds)
+        ]
         if not rows:
-            why = next((f": {error}" for error in left_out.values()), "")
-            raise DatasetError(f"{folder}: no frame can be looked at{why}")
-        with (
-            new_file(out, overwrite) as part,
-            part.open("w", newline="", encoding="utf-8") as written,
-        ):
-            table = csv.DictWriter(written, asdict(rows[0]), lineterminator="\n")
-            table.writeheader()
-            table.writerows(map(asdict, rows))
-    return RealRun(tuple(rows), left_out)
+            raise DatasetError(f"{folder}: no frame can be looked at{answers.why()}")
+        head = (field.name for field in fields(RealThing))
+        write_table(out, overwrite, head, map(astuple, rows))
+    return RealRun(tuple(rows), answers.left_out)
 
 
 def surface_points(system: System) -> dict[str, Float]:
