@@ -11,6 +11,7 @@ import kept_results
 import numpy as np
 import pipeline
 import pytest
+from bop_datasets import write_dataset
 from frozen_archives import write_archive
 
 from nextview_lab.benchmark import tables
@@ -39,6 +40,12 @@ def kept_operators():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(ONNXRegistry, "from_torchlib", kept)
         yield
+
+
+@pytest.fixture(scope="session")
+def bop(shared) -> Path:
+    """A dataset of two images in the layout of BOP."""
+    return shared("bop", write_dataset)
 
 
 @pytest.fixture(scope="session")

@@ -109,6 +109,7 @@ NOWHERE = {
     "benchmark classes": ("benchmark classes none.npz {}",),
     "benchmark things": ("benchmark things none {}",),
     "benchmark tables": ("benchmark tables none none {}",),
+    "bop": ("bop none {}.csv",),
     "real": ("real none --out {}.csv",),
     "check": ("check none --figure {}.png",),
     "submit": ("submit none {}.json",),

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from bop_datasets import pose_as
 from factories import camera_over, meshes_of, view
 from lab_programs import main, refused
 from PIL import Image
@@ -77,11 +78,7 @@ def posed(seen, tmp_path):
     camera = {"cam_K": matrix.ravel().tolist(), "depth_scale": 1.0}
     (folder / "scene_camera.json").write_text(json.dumps({7: camera}))
     objects = [
-        {
-            "obj_id": NAMES.index(name),
-            "cam_R_m2c": pose[:3, :3].ravel().tolist(),
-            "cam_t_m2c": (1000 * pose[:3, 3]).tolist(),
-        }
+        {"obj_id": NAMES.index(name), **pose_as(pose, "m", "c")}
         for name, pose in poses.items()
     ]
     (folder / "scene_gt.json").write_text(json.dumps({7: objects}))

@@ -141,6 +141,7 @@ LAB = (
     "fit",
     "evaluate",
     "benchmark",
+    "bop",
     "real",
     "submit",
     "leaderboard",

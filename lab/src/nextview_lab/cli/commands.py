@@ -153,6 +153,13 @@ COMMANDS = {
         f"{CLI}.benchmark_tables:print_compared",
         example="benchmark tables scans strangers tables --tables 10",
     ),
+    "bop": Command(
+        "nextview_lab.benchmark.bop:look_for_models",
+        "locate the models of a BOP dataset in its images",
+        "wrote {out}; next: evaluate it with bop_toolkit",
+        f"{CLI}.printing:print_bop",
+        example="bop lmo nextview_lmo-test.csv --models lmo_memory",
+    ),
     "real": Command(
         "nextview_lab.benchmark.real:recognise_real",
         "compare what is said of real frames with the truth",
@@ -213,6 +220,7 @@ LABORATORY = Program(
         "train recogniser",
         "train map",
         "train segmentation",
+        "bop",
         "real",
         "submit",
         "benchmark things",
