@@ -12,7 +12,6 @@ from lab_programs import refused
 from pipeline import benchmark
 
 from nextview_lab.benchmark.classes import load
-from nextview_lab.benchmark.replay import Grid, make_specs, run_grid
 from nextview_lab.data.metrics import calibration_error
 from nextview_lab.data.predictions import Predictions
 
@@ -22,29 +21,11 @@ def predictions(results):
     return Predictions.load(results / "p.npz")
 
 
-@pytest.fixture(scope="module")
-def rows(results, predictions):
-    """Every episode that the benchmark ran."""
-    specs = make_specs(predictions, runs=3, seed=0)
-    grid = Grid(specs, 3, (0.7, 0.9), 5, 0)
-    list(run_grid(grid, load(results / "out").settings["policies"]))
-    names = {"object": predictions.names, "label": predictions.classes}
-    parts = []
-    for policy, threshold, ends in grid.cells():
-        number = {"object": specs.objects, "label": specs.labels}
-        columns = {name: np.array(names[name])[number[name]] for name in names}
-        columns |= {name: getattr(ends, name) for name in ends.__dataclass_fields__}
-        columns["views"] = [views[views >= 0] for views in ends.views]
-        columns["answer"] = np.array(predictions.classes)[ends.answer]
-        fixed = grid.paths[policy].fixed
-        at = np.nan if threshold is None else threshold
-        parts.append(
-            pd.DataFrame(columns).assign(policy=policy, threshold=at, fixed=fixed)
-        )
-    return pd.concat(parts, ignore_index=True)
-
-
-def test_every_episode_is_what_it_says(rows, predictions):
+def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
+    assert (
+        len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
+    )
     row_of = {name: i for i, name in enumerate(predictions.names)}
     for row in rows.sample(200, random_state=0).itertuples():
         i, views = row_of[row.object], list(row.views)
@@ -62,10 +43,11 @@ def test_every_episode_is_what_it_says(rows, predictions):
             sum(predictions.sphere.arc[leg] for leg in legs)
         )
         if np.isnan(row.threshold):
-            assert row.fixed
-            assert not row.confident
+            assert row.stop == "fixed views"
         else:
-            assert row.confident == (belief.max() >= row.threshold)
+            assert row.stop == (
+                "confident" if belief.max() >= row.threshold else "views ran out"
+            )
             before = [
                 np.exp(predictions.logits[i, views[:k]].astype(float).sum(0))
                 for k in range(1, len(views))
@@ -73,16 +55,19 @@ def test_every_episode_is_what_it_says(rows, predictions):
             assert all((b / b.sum()).max() < row.threshold for b in before)
 
 
-def test_the_summary_is_what_pandas_makes_of_the_episodes(results, rows, predictions):
-    conflicting = np.array(predictions.names)[predictions.conflicting]
-    rows = rows.assign(
-        right=rows["answer"] == rows["label"], clean=~rows["object"].isin(conflicting)
+def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
+    rows = pd.read_parquet(results / "out" / "episodes.parquet")
+    rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
+    rows["clean"] = ~rows["object"].isin(
+        np.array(predictions.names)[predictions.conflicting]
     )
     measures = pd.read_csv(results / "out" / "measures.csv").query("set == 'all'")
     summary = measures.set_index(["policy", "threshold", "measure"])["value"]
-    for (policy, threshold), cell in rows.groupby(["policy", "threshold"]):
-        moved, sure = cell[cell.n_views > 1], cell[cell.confident]
-        by_class = cell.groupby("label")
+    for (policy, threshold), cell in rows.groupby(
+        ["policy", "threshold"], observed=True
+    ):
+        moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
+        by_class = cell.groupby("label", observed=True)
         wanted = {
             "accuracy": cell.right.mean(),
             "clean_accuracy": cell.right[cell.clean].mean(),
@@ -90,7 +75,9 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, rows, predict
             "n_views": cell.n_views.mean(),
             "travel_all": cell.travel.mean(),
             "travel_moved": moved.travel.mean(),
-            "class_travel_moved": moved.groupby("label").travel.mean().mean(),
+            "class_travel_moved": moved.groupby("label", observed=True)
+            .travel.mean()
+            .mean(),
             "arc_all": cell.arc.mean(),
             "confident": len(sure) / len(cell),
             "confident_accuracy": sure.right.mean(),

@@ -199,7 +199,9 @@ def test_a_file_of_results_that_is_not_valid_is_refused(
     assert not (tmp_path / "board").exists()
 
 
-NASTY = "<script>alert('a')</script> \x1b[31m|`rm` \u202e_*~$x$ [l](https://a.b)\n# two"
+NASTY = (
+    "<script>alert('a')</script> \x1b[31m|`rm` \u202e_*~$\\x$ [l](https://a.b)\n# two"
+)
 
 
 def test_names_are_text_in_tables_and_terminals(archive, submitted, tmp_path, capsys):

@@ -35,7 +35,7 @@ def test_things_on_a_table_are_named_and_everything_is_written(looked):
     out, found = looked
     recall = found.measures.query("measure == 'recall'")
     assert recall["value"].item() > 0.4
-    for name in ("measures.csv", "tests.csv", "tables.md"):
+    for name in ("measures.csv", "tests.csv", "tables.md", "accuracy.png"):
         assert (out / name).stat().st_size > 50
     assert "### After 1 frame" in (out / "tables.md").read_text()
 

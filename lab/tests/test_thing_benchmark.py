@@ -81,7 +81,7 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
     assert "All things: share named right after views; 3 things" in shown
     text = (results / "tables.md").read_text()
     assert text.count("| geometry | ") == 1 + 2  # one table, two tests
-    for name in ("measures.csv", "tests.csv"):
+    for name in ("measures.csv", "tests.csv", "accuracy.png"):
         assert (results / name).stat().st_size > 100
 
 

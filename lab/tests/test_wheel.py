@@ -25,6 +25,7 @@ HOLES = {
     "lightning": ["2.6.2", "2.6.3"],  # uploaded by someone else than its makers
     "onnx": ["1.20.1"],
     "pillow": ["11.3.0", "12.1.1"],
+    "pyarrow": ["23.0.0"],  # CVE-2026-25087
     "pytest": ["9.0.2"],  # CVE-2025-71176
     "requests": ["2.32.5"],  # CVE-2026-25645
     "setuptools": ["78.1.0"],  # CVE-2025-47273

@@ -8,7 +8,7 @@ from nextview.cli import exit_status
 PROJECT = "nextview-lab"
 EXTRAS = {  # packages by the optional part, as in pyproject.toml, that brings them
     "arm": ("gymnasium_robotics", "mink", "mujoco"),
-    "benchmark": ("jinja2", "pandas"),
+    "benchmark": ("jinja2", "pandas", "pyarrow"),
     "envs": ("gymnasium",),
     "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
 }

@@ -1,5 +1,7 @@
 """Common style of all figures: narrow, so that they can be read on a phone."""
 
+import re
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from nextview.types import Floats
 INK = "#1f2933"
 GREY = "#8a949e"
 FAINT = "#d5dbe1"
-# colours of all figures
+# colours of all figures; for policies see ``figures.POLICY_COLOURS``
 BLUE = "#0b5fa5"
 LIGHT_BLUE = "#38a0d9"
 ACCENT = "#d1495b"
@@ -120,6 +122,21 @@ def heat(values: Floats) -> NDArray[np.uint8]:
         np.uint8
     )
     return np.where(known[..., None], colours, np.array(UNKNOWN_COLOUR, np.uint8))
+
+
+def to_svg(figure: Figure) -> str:
+    """Return a figure as reproducible SVG text."""
+    text = StringIO()
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure.savefig(
+            text,
+            format="svg",
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None},
+        )
+    # characters that XML does not allow
+    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())
 
 
 def to_png(figure: Figure, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from nextview_lab.extras import extras
 
 with extras():
     import pandas as pd
+    import pyarrow.parquet as pq
 
 Cell = tuple[str, float | None, Outcome]
 Both = tuple["pd.DataFrame", "pd.DataFrame"]  # measures and tests
@@ -77,17 +79,34 @@ class ClassTables(Tables):
 
 @dataclass(frozen=True)
 class ClassResults:
-    """The results in a folder: settings, predictions and tables.
+    """A folder of results: settings, predictions and tables.
 
     Attributes:
+        folder: with the results.
         settings: of the benchmark.
         predictions: that were replayed.
         tables: the results.
     """
 
+    folder: Path
     settings: dict[str, Any]
     predictions: Predictions
     tables: ClassTables
+
+    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
+        """Read the episodes of a policy at a threshold.
+
+        Args:
+            policy: name of the policy.
+            threshold: of the belief; None for fixed views.
+
+        Returns:
+            One episode per row, run by run, with the objects in the order of the predictions.
+        """
+        cell = [("policy", "==", policy)] + (
+            [] if threshold is None else [("threshold", "==", threshold)]
+        )
+        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
 
 
 def class_set(label: str) -> str:

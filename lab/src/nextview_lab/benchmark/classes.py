@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from nextview_lab.extras import extras
 
 with extras():
     import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def benchmark_classes(
 ) -> ClassResults:
     """Run all policies at all thresholds from the same first views, and compare them.
 
-    It writes tables and significance tests; nextview-lab report makes an HTML page of
+    It writes episodes, tables and significance tests; nextview-lab report makes an HTML page of
     them. If a policy fails, the settings of the results give the reason.
 
     Args:
@@ -117,6 +119,7 @@ def benchmark_classes(
     }
 
     def more(part: Path) -> None:
+        _write_episodes(part / "episodes.parquet", grid)
         table.save(part / "predictions.npz")
 
     write_results(out, tables, made, more, overwrite, withdraw=True)
@@ -200,16 +203,63 @@ def load(folder: Path) -> ClassResults:
             name: pd.read_csv(folder / f"{name}.csv") for name in ("measures", "tests")
         }
         tables = ClassTables(reference=settings["reference"], **frames)
+        pq.read_schema(folder / "episodes.parquet")
     except (FileNotFoundError, NotADirectoryError):
         raise ResultsError(
             f"{folder}: holds no benchmark results; make some with nextview-lab benchmark classes"
         ) from None
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, pa.ArrowInvalid) as error:
         raise ResultsError(
             f"{folder}: these benchmark results are damaged ({error})"
         ) from None
     return ClassResults(
+        folder,
         settings,
         Predictions.load(folder / "predictions.npz"),
         tables,
     )
+
+
+STOPS = ("views ran out", "confident", "fixed views")
+
+
+def _write_episodes(path: Path, grid: Grid) -> None:
+    p = grid.specs.predictions
+    n = len(grid.specs.objects)
+
+    def words(codes: Any, names: tuple[str, ...]) -> pa.DictionaryArray:
+        return pa.DictionaryArray.from_arrays(
+            pa.array(codes, pa.int32()),
+            pa.array(names),
+        )
+
+    names = words(grid.specs.objects, p.names)
+    labels = words(grid.specs.labels, p.classes)
+    run = pa.array(np.repeat(np.arange(grid.runs, dtype=np.int32), len(p)))
+    writer = None
+    for policy, threshold, ends in grid.cells():
+        paths = grid.paths[policy]
+        taken = ends.views[ends.views >= 0].astype(np.int16)
+        begins = np.concatenate([[0], np.cumsum(ends.n_views)]).astype(np.int32)
+        table = pa.table(
+            {
+                "object": names,
+                "label": labels,
+                "run": run,
+                "policy": words(np.zeros(n), (policy,)),
+                "threshold": pa.array(
+                    np.full(n, np.nan if threshold is None else threshold)
+                ),
+                "views": pa.ListArray.from_arrays(pa.array(begins), pa.array(taken)),
+                "stop": words(np.where(paths.fixed, 2, ends.confident), STOPS),
+                "answer": words(ends.answer, p.classes),
+                "confidence": pa.array(ends.confidence),
+                "n_views": pa.array(ends.n_views, pa.int32()),
+                "travel": pa.array(ends.travel),
+                "arc": pa.array(ends.arc),
+            }
+        )
+        writer = writer or pq.ParquetWriter(path, table.schema, compression="zstd")
+        writer.write_table(table)
+    if writer is not None:
+        writer.close()

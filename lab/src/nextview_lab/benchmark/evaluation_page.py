@@ -11,9 +11,10 @@ from msgspec.structs import replace
 from nextview.errors import ModelError
 from nextview.files import check_new, new_folder, only_one, sha256_of
 from nextview.recognition.model_card import find_card, read_card, write_card
+from nextview_lab.benchmark import figures as draw
 from nextview_lab.benchmark.classes import chosen_split
 from nextview_lab.benchmark.evaluation import Evaluation, evaluate, scores_for_card
-from nextview_lab.benchmark.page import numbers, origin, render
+from nextview_lab.benchmark.page import numbers, origin, picture, render
 from nextview_lab.benchmark.published import published_recognisers
 from nextview_lab.data.predictions import Predictions
 
@@ -144,7 +145,12 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
             for kind, rows in e.maps.groupby("map", sort=False)
         },
         baselines=[by for by in e.maps["by"].unique() if by != "network"],
-        answers=e.confusion.set_index(["n_views", "label", "answer"])["answers"],
+        figures={
+            "confusion_one_view": picture(draw.confusion_matrix(e, 1, p.classes)),
+            "confusion_all_views": picture(
+                draw.confusion_matrix(e, len(p.sphere), p.classes)
+            ),
+        },
         left_out=e.left_out,
         made=made,
     )

@@ -1,8 +1,9 @@
 """Run the episodes of a benchmark as parallel, resumable jobs, each with its own record.
 
 A folder of results contains ``runs``, a small file with the runs of all policies in each episode;
-``episodes.json``, the conditions of the episodes; ``benchmark.json``, the settings; and the
-tables, which every run rewrites. Workers import this module, so it does not import pandas.
+``episodes.json``, the conditions of the episodes; ``benchmark.json``, the settings; and the tables
+and figures, which every run rewrites. Workers import this module, so it imports neither pandas nor
+matplotlib.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,10 +1,13 @@
 """Format numbers and fill templates for the HTML pages of benchmarks and evaluations."""
 
+import base64
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from nextview.figures.style import to_svg
 from nextview.recognition.map_names import measure_of
 from nextview_lab.benchmark.board_page import NONE, points
 from nextview_lab.benchmark.entries import knows_truth
@@ -74,6 +77,11 @@ def render(template: str, **given: Any) -> str:
     }
 
     return pages.get_template(template).render(given)
+
+
+def picture(figure: Figure) -> str:
+    """Return a figure as a data URI."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(to_svg(figure).encode()).decode()}"
 
 
 def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:

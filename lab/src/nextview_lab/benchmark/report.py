@@ -4,15 +4,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nextview.errors import ResultsError
 from nextview.files import check_new, new_file
 from nextview.policies.registry import DEFAULT_POLICY
 from nextview_lab.benchmark import class_tables as board
+from nextview_lab.benchmark import figures as draw
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.classes import load
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview_lab.benchmark.entries import is_oracle
-from nextview_lab.benchmark.page import numbers, origin, render
+from nextview_lab.benchmark.page import numbers, origin, picture, render
+from nextview_lab.extras import extras
+
+with extras():
+    import pandas as pd
 
 
 def report(
@@ -21,7 +28,7 @@ def report(
     /,
     overwrite: bool = False,
 ) -> Path:
-    """Write one self-contained HTML page: all policies, their differences, and promised risks.
+    """Write one self-contained HTML page: tables, differences, and the worst failures.
 
     Args:
         results: folder of nextview-lab benchmark classes.
@@ -81,8 +88,13 @@ def page(results: ClassResults) -> str:
     found = numbers(whole, "policy", "threshold", "measure")
     policies = t.choosing()
     best = headline_policy(results, at)
-    by_policy = board.accuracy_tests(t, at).set_index("policy").to_dict("index")
+    tests = board.accuracy_tests(t, at)
+    by_policy = tests.set_index("policy").to_dict("index")
     wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, "oracle-gain"))
+    figures = {}
+    if len(tests):
+        drawn = draw.differences(t, tests, "accuracy")
+        figures["differences"] = picture(drawn)
     return render(
         "report.html",
         title=_title(by_policy.get(best), best, reference, at),
@@ -91,6 +103,7 @@ def page(results: ClassResults) -> str:
         at=at,
         best=best,
         reference=reference,
+        significant=SIGNIFICANT,
         found=found,
         policies=policies,
         shown=[name for name in wanted if name in policies],
@@ -98,6 +111,8 @@ def page(results: ClassResults) -> str:
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few_objects(t, at, len(p)),
         risks=board.promised_risks(t, s["risks"]),
+        figures=figures,
+        failures=_failures(results, best, at),
         made={
             **origin(p, s),
             "valley classes": ", ".join(s["valley_classes"]) or "none",
@@ -124,3 +139,50 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
         )
     more = "more" if test["difference"] > 0 else "less"
     return f"{best} is {100 * abs(test['difference']):.1f} points {more} accurate than {reference}"
+
+
+def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
+    """Return the objects that a policy gets wrong most often.
+
+    Args:
+        episodes: of the policy.
+        most: number of objects.
+
+    Returns:
+        Object, number of wrong episodes, mean confidence, and the run of the most confident one.
+    """
+    wrong = episodes[episodes["answer"].astype(str) != episodes["label"].astype(str)]
+    wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values(
+        "confidence",
+        ascending=False,
+        kind="stable",
+    )
+
+    groups = wrong.groupby("object", sort=False)
+    table = groups.agg(
+        wrong=("run", "size"),
+        confidence=("confidence", "mean"),
+        run=("run", "first"),
+    ).reset_index()
+    return table.sort_values(
+        ["wrong", "confidence"],
+        ascending=False,
+        kind="stable",
+    ).head(most)
+
+
+def _failures(results: ClassResults, best: str, at: float) -> list[dict[Any, Any]]:
+    """Return the worst failures of a policy, each with its most confident episode."""
+    p = results.predictions
+    episodes = results.episodes(best, at)
+    names = np.asarray(episodes["object"].astype(str))
+    found = []
+    for failure in worst_failures(episodes).to_dict("records"):
+        name = failure["object"]
+        mine = (names == name) & (episodes["run"] == failure["run"])
+        episode = episodes[mine].iloc[0]
+        views = [int(v) for v in episode["views"]]
+        conflicting = bool(p.conflicting[p.names.index(name)])
+        shown = {"answer": episode["answer"], "views": views}
+        found.append(failure | shown | {"conflicting": conflicting})
+    return found

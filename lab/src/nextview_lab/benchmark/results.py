@@ -1,4 +1,4 @@
-"""Write a folder of results: tables as CSV and Markdown, and settings."""
+"""Write a folder of results: tables as CSV and Markdown, figures, and settings."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from nextview.figures.style import to_png
 from nextview.files import new_folder
 from nextview_lab.benchmark.board_page import Board, markdown
 from nextview_lab.benchmark.comparison import Tables, too_few, written
+from nextview_lab.benchmark.figures import differences, views_curve
 
 RECORD = "benchmark.json"
 
@@ -89,18 +91,28 @@ def write_compared(
     out: Path,
     tables: ComparedTables,
     made: Mapping[str, Any],
+    measure: str,
+    what: str,
     overwrite: bool = True,
 ) -> None:
-    """Write tables to a folder.
+    """Write tables and figures to a folder.
 
     Args:
         out: the folder.
         tables: the results.
         made: settings, as JSON-compatible values.
+        measure: the share shown in the figures, after numbers of views.
+        what: description of that share.
         overwrite: whether to replace earlier results.
     """
 
     def more(part: Path) -> None:
         (part / "tables.md").write_text(compared_markdown(tables), encoding="utf-8")
+        to_png(views_curve(tables, measure, what), part / "accuracy.png")
+        tests = tables.tests[tables.tests["measure"] == measure]
+        if len(tests):
+            k = tests["views"].min()
+            drawn = differences(tables, tests[tests["views"] == k], f"{what} after {k}")
+            to_png(drawn, part / "differences.png")
 
     write_results(out, tables, made, more, overwrite)

@@ -109,8 +109,8 @@ def leaderboard_of(
     Args:
         folder: with the result files of nextview-lab submit (.json).
         archive: folder of the archive, with its truth.
-        out: folder to write, with tables.md, and every number with its interval in measures.csv
-            and tests.csv.
+        out: folder to write, with tables.md, two figures, and every number with its interval in
+            measures.csv and tests.csv.
         reference: method with which the others are compared; by default the blind one that is right
             most often after the first view.
         samples: number of bootstrap samples.
@@ -159,7 +159,7 @@ def leaderboard_of(
         "seed": seed,
         "command": command(),
     }
-    write_compared(Path(out), tables, made, overwrite)
+    write_compared(Path(out), tables, made, RIGHT, "named right", overwrite)
     return tables
 
 

@@ -452,7 +452,7 @@ def benchmark_tables(
             "scans": str(scans),
             "strangers": str(strangers),
         }
-        write_compared(out, tables, made)
+        write_compared(out, tables, made, "recall", "found and named right")
     return tables
 
 

@@ -303,7 +303,7 @@ def benchmark_things(
             "command": command(),
             "scans": str(scans),
         }
-        write_compared(out, tables, made)
+        write_compared(out, tables, made, "accuracy", "named right")
     return tables
 
 
