@@ -812,6 +812,7 @@ NOT_DRAWN = {  # pictures that no command of PICTURES makes, and why
     "measures.png": "drawn by an earlier version of nextview_lab.thesis.measure_study",
     "picking.gif": "drawn by an earlier version, whose script is gone",
     "real_frame.webp": "needs a real frame, which is not here: workflow/film.py",
+    "segmentation_worst.png": "its labelled frames are not among the data",
 }
 
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from nextview.sensing.frame import Frame
-from nextview_lab.studies.segmentation import Counts
+from nextview_lab.studies.segmentation import Counts, draw_worst
 
 SHAPE = (240, 320)
 CAMERA = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
@@ -56,3 +57,13 @@ def test_a_frame_without_segments_has_things_of_no_overlap():
     (thing,) = counts.things
     assert (thing.overlap, thing.joined, thing.cut) == (0, 0, 0)
     assert counts.segments == 0
+
+
+def test_the_worst_thing_of_each_frame_is_drawn(counted, tmp_path):
+    draw_worst(counted.things, tmp_path / "worst.png")
+    with Image.open(tmp_path / "worst.png") as drawn:
+        pixels = np.asarray(drawn.convert("RGB")).astype(int)
+    # blue is the narrow one of the joined things, and nothing else
+    blue = pixels[..., 2] - pixels[..., 0] > 40
+    high, wide = (np.ptp(at) + 1 for at in np.nonzero(blue))
+    assert wide / high == pytest.approx(20 / 50, rel=0.1)

@@ -140,8 +140,12 @@ pytest.importorskip("lightning")
 from nextview_lab.training import segmentation_training as training
 from nextview_lab.training.architectures import SegmentationNet
 from nextview_lab.training.recipes import Hardware, SegmentationRecipe
-from nextview_lab.training.runs import load_run
-from nextview_lab.training.segmentation_training import fit_segmentation
+from nextview_lab.training.runs import load_run, read_run
+from nextview_lab.training.segmentation_training import (
+    LabelledBatches,
+    fit_segmentation,
+    start_from_export,
+)
 
 RECIPE = SegmentationRecipe(
     frames=8, width=4, epochs=6, batch=2, lr=0.01, validation_share=0.25, seed=3
@@ -154,7 +158,7 @@ def losses(run: Path):
         return [float(row["loss"]) for row in csv.DictReader(file)]
 
 
-def trained(out):
+def trained(out, *more, **changed):
     """A run of a few steps, as the command line starts it."""
     torch.set_num_threads(1)  # sums of several threads depend on how many there are
     options = {
@@ -167,11 +171,11 @@ def trained(out):
         "seed": RECIPE.seed,
         "workers": 0,
         "precision": EXACT.precision,
-    }
+    } | changed
     words = [
         word for name, value in options.items() for word in (f"--{name}", str(value))
     ]
-    main(["train", "segmentation", str(out), *words])
+    main(["train", "segmentation", str(out), *words, *more])
     return out
 
 
@@ -220,3 +224,31 @@ def test_the_file_answers_as_the_network(run, exported, shape):
     assert answer.shape == (15, *shape)
     assert answer.dtype == np.float32
     assert np.abs(answer - expected[:, : shape[0], : shape[1]]).max() < 0.01
+
+
+def test_a_network_starts_as_the_exported_one_with_norms_of_the_frames(run, exported):
+    network = SegmentationNet(RECIPE.width)
+    (seen, *_) = next(
+        iter(LabelledBatches(training.files_of(run, RECIPE)[0], RECIPE, True))
+    )
+    start_from_export(network, load_network(exported), seen)
+    with torch.no_grad():
+        by_what_is_kept = network.eval()(seen)
+        by_the_batch = network.train()(seen)
+    assert torch.allclose(by_the_batch, by_what_is_kept, atol=1e-3)
+    expected = [load_network(exported)(one) for one in seen.numpy()]
+    assert np.abs(by_what_is_kept.numpy() - expected).max() < 1e-3
+
+
+def test_a_training_from_an_exported_network_begins_with_its_weights(
+    tmp_path, run, exported
+):
+    further = trained(tmp_path / "further", "--start", str(exported), epochs=1, lr=0)
+    one, other = (
+        load_run(SegmentationNet(RECIPE.width), folder).o.weight
+        for folder in (run, further)
+    )
+    assert torch.allclose(one, other, atol=1e-3)
+    assert read_run(further).weights == load_network(exported).card.sha256
+    with pytest.raises(SystemExit):
+        trained(tmp_path / "wide", "--start", str(exported), epochs=1, width=8)

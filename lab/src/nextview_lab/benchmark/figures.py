@@ -104,7 +104,11 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
         # offset, so that the bars do not overlap
         x = np.array(views) + (row - len(policies) / 2) * 0.05
         look = look_of(policy, tables)
-        mark = {"marker": "o", "markersize": 3.5, "label": as_text(policy)}
+        mark: dict[str, Any] = {
+            "marker": "o",
+            "markersize": 3.5,
+            "label": as_text(policy),
+        }
         axes.plot(x, shares[:, 0], **mark, **look)
         bars = {"color": look["color"], "linewidth": 0.8, "alpha": 0.55}
         axes.vlines(x, shares[:, 1], shares[:, 2], **bars)

@@ -1,6 +1,6 @@
 """Which pixels are one thing: the segmentation against the truth, on real frames.
 
-    python -m nextview_lab.studies.segmentation FOLDER [--network CARD]
+    python -m nextview_lab.studies.segmentation FOLDER [--network CARD] [--picture PNG]
 
 FOLDER holds frames with images of labels, as ``nextview_lab.data.real_frames`` reads them. No pose
 is known, so neither is gravity.
@@ -11,8 +11,8 @@ over union (IoU) of each with the segment that fits it best, the shares with mor
 most of two things (merges), and things of which two segments hold a fifth each (splits); and the
 seconds a frame takes. A table has the IoU, how many things are joined with another and how many are
 cut, by what is around a thing, by how many things its frame shows, and by its distance.
-``--network`` names the card of a network of ``nextview-lab train segmentation``; without it the
-bundled one is asked.
+``--picture`` draws the things that fit worst, at most one of a frame. ``--network`` names the card
+of a network of ``nextview-lab train segmentation``; without it the bundled one is asked.
 """
 
 import time
@@ -23,11 +23,15 @@ from pathlib import Path
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from PIL import Image
 from rich.progress import track
 from scipy import ndimage
 
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
+from nextview.figures.style import ACCENT, BLUE, PlainFigure
+from nextview.files import new_file
+from nextview.scene.figure import grey_picture
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
 from nextview_lab.data.real_frames import TrueThing, real_frames
@@ -49,6 +53,8 @@ GROUPS = {  # of things: an attribute of ``Parted``, its least and its largest v
     "0.8 to 1 m": ("distance", 0.8, 1.0),
     "farther": ("distance", 1.0, np.inf),
 }
+PICTURES = 5, 4  # of the things that fit worst: rows and columns
+FEWEST_ROWS = 130  # of the image in a picture
 
 Labels = NDArray[np.int64]
 
@@ -58,6 +64,9 @@ class Parted:
     """How well a thing is parted from what is around it.
 
     Attributes:
+        frame: that shows it.
+        mask: its pixels, (H, W).
+        found: the segment of each pixel, 0 for none, (H, W).
         overlap: IoU with the segment that fits it best.
         joined: of how many others the segment that holds most of it holds most, too.
         cut: how many segments hold a fifth of it each.
@@ -67,6 +76,9 @@ class Parted:
         pieces: into how many, a fifth of it each, what is before it parts it.
     """
 
+    frame: Frame
+    mask: NDArray[np.bool_]
+    found: Labels
     overlap: float
     joined: int
     cut: int
@@ -118,6 +130,9 @@ class Counts:
             pieces = np.bincount(ndimage.label(mask, np.ones((3, 3)))[0][mask])
             self.things.append(
                 Parted(
+                    frame,
+                    mask,
+                    found,
                     overlap=float(overlap[row].max(initial=0)),
                     joined=int((most.sum(0) - 1)[most[row]].max(initial=0)),
                     cut=int((share[row] > PART_OF_THING).sum()),
@@ -151,6 +166,46 @@ class Counts:
                 )
 
 
+def draw_worst(things: Sequence[Parted], out: Path) -> None:
+    """Draw of each frame the thing that fits worst, and the outlines of the segments there.
+
+    Args:
+        things: of all frames.
+        out: PNG file.
+    """
+    of_frames = {
+        id(thing.frame): thing for thing in sorted(things, key=lambda one: -one.overlap)
+    }
+    worst = sorted(of_frames.values(), key=lambda one: one.overlap)
+    figure = PlainFigure((9.0, 10.0), layout="constrained")
+    for place, thing in enumerate(worst[: PICTURES[0] * PICTURES[1]], 1):
+        axis = figure.add_subplot(*PICTURES, place)
+        axis.imshow(grey_picture(thing.frame), cmap="gray", vmin=0, vmax=1)
+        axis.contourf(thing.mask, [0.5, 2], colors=[BLUE], alpha=0.35)
+        for number in np.setdiff1d(thing.found, [0]):
+            axis.contour(thing.found == number, [0.5], colors=[ACCENT], linewidths=1.3)
+        high, wide = (np.array([at.min(), at.max()]) for at in np.nonzero(thing.mask))
+        half = 0.75 * max(np.ptp(high), np.ptp(wide) * 0.75, FEWEST_ROWS)
+        middle = np.clip(high.mean(), half, len(thing.mask) - half)
+        axis.set(
+            xlim=wide.mean() + np.array([-1, 1]) * half / 0.75,
+            ylim=middle + np.array([1, -1]) * half,
+        )
+        axis.set_axis_off()
+        axis.set_title(
+            f"IoU {thing.overlap:.2f}"
+            + f", joined with {thing.joined}" * (thing.joined > 0)
+            + f", cut in {thing.cut}" * (thing.cut > 1),
+            fontsize=8.5,
+            pad=3,
+        )
+    figure.suptitle("blue: the thing; red: outlines of the segments", fontsize=9.5)
+    with new_file(out, overwrite=True) as part:
+        figure.savefig(part, format="png", dpi=110, facecolor="white")
+        # fewer colours make a smaller file
+        Image.open(part).convert("RGB").quantize(256).save(part, "png", optimize=True)
+
+
 def labels_of(frame: Frame, things: Sequence[TrueThing]) -> Labels:
     """The number of the thing of each pixel with depth, 0 for none, (H, W)."""
     labels = np.zeros(frame.shape, np.int64)
@@ -163,12 +218,14 @@ def labels_of(frame: Frame, things: Sequence[TrueThing]) -> Labels:
 def main(
     folder: tyro.conf.Positional[Path],
     network: Path | None = None,
+    picture: Path | None = None,
 ) -> None:
     """Compare segments with the truth.
 
     Args:
         folder: of the frames.
         network: card of a segmentation network; None for the bundled one.
+        picture: PNG file of the things that fit worst; None for none.
     """
     learned = LearnedSegmenter(network)
     counts = Counts()
@@ -179,6 +236,8 @@ def main(
         counts.seconds += time.perf_counter() - begun
         counts.add(frame, labels_of(frame, real.things()), found)
     counts.print_out()
+    if picture is not None:
+        draw_worst(counts.things, picture)
 
 
 if __name__ == "__main__":

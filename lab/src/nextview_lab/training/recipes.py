@@ -260,6 +260,8 @@ class SegmentationRecipe:
         validation_share: share of the meshes that is held out for validation, and number of
             validation frames relative to --frames.
         seed: seed of all random numbers, including those of the frames.
+        interpolation: position of the final weights between the initial (0) and the trained ones
+            (1), as of the recogniser; for --start.
     """
 
     frames: int = 12_000
@@ -270,6 +272,7 @@ class SegmentationRecipe:
     weight_decay: float = 0.01
     validation_share: float = 0.05
     seed: int = 0
+    interpolation: float = 1.0
 
     def __post_init__(self) -> None:
         _check(self, ("frames", "width", "epochs", "batch"), ("validation_share",))

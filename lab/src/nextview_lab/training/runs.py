@@ -26,6 +26,7 @@ from nextview.files import (
     sha256_of,
     write_record,
 )
+from nextview.segmentation.network import SegmentationCard
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import extras
@@ -353,7 +354,7 @@ def new_run(
     recipe: Any,
     weights: Path | None,
     held_out: Sequence[str],
-    made: Iterable[ViewStore | Predictions],
+    made: Iterable[ViewStore | Predictions | SegmentationCard],
 ) -> Run:
     """Describe a run of the current command.
 
@@ -361,7 +362,7 @@ def new_run(
         recipe: of the training.
         weights: file or run with the initial weights; None for random ones.
         held_out: names of the validation objects.
-        made: stores and predictions that the run uses.
+        made: stores, predictions and networks that the run uses.
 
     Returns:
         The description.

@@ -2,14 +2,22 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nextview.data.progress import TrackProgress, silently
-from nextview.segmentation.network import AFFINITY_OUTPUTS, OUTPUT_CLASSES
+from nextview.errors import ModelError
+from nextview.segmentation.network import (
+    AFFINITY_OUTPUTS,
+    OUTPUT_CLASSES,
+    SegmentationNetwork,
+    load_network,
+)
 from nextview_lab.data.labelled_frames import (
     UNKNOWN_CLASS,
     Example,
@@ -22,10 +30,11 @@ from nextview_lab.data.labelled_frames import (
 from nextview_lab.extras import extras
 from nextview_lab.training.architectures import SegmentationNet
 from nextview_lab.training.recipes import Hardware, SegmentationRecipe
-from nextview_lab.training.runs import OwnBatches, fit, new_run, train_once
+from nextview_lab.training.runs import OwnBatches, fit, interpolate, new_run, train_once
 
 with extras():
     import lightning as L
+    import onnx
     import torch
     from torch import Tensor, nn
     from torch.nn import functional as F
@@ -36,6 +45,7 @@ LAST_RATE = 0.01  # last learning rate, relative to the peak
 CLASS_WEIGHT = 2.0  # of the class loss, relative to that of pairs
 BORDER_WEIGHT = 4.0  # of pairs of different objects, which are rare
 LARGEST_GRADIENT = 5.0
+BATCHES_NORMED = 16  # whose statistics the batch norms of an exported network get
 
 
 class LabelledBatches(OwnBatches):
@@ -192,6 +202,51 @@ def rate_at(steps: int, step: int) -> float:
     return min(1.0, (step + 1) / rise) * (LAST_RATE + (1 - LAST_RATE) * fall)
 
 
+def start_from_export(
+    network: SegmentationNet, exported: SegmentationNetwork, features: Tensor
+) -> None:
+    """Load the weights of an exported network, whose batch norms are folded into convolutions.
+
+    Each batch norm gets the statistics of its input, and undoes them: the outputs are the same.
+
+    Args:
+        network: the network, which is changed.
+        exported: an exported network of the same width.
+        features: of some frames, (B, C, h, w).
+
+    Raises:
+        ModelError: the exported network has another width.
+    """
+
+    def undo(norm: nn.BatchNorm2d, inputs: tuple[Tensor, ...]) -> None:
+        var, mean = torch.var_mean(inputs[0], (0, 2, 3), correction=0)
+        norm.running_var, norm.running_mean = var, mean
+        norm.weight.data = (var + norm.eps).sqrt()
+        norm.bias.data += mean
+
+    stored = {
+        weight.name.removesuffix("_small"): onnx.numpy_helper.to_array(weight)
+        for weight in onnx.load(exported.path).graph.initializer
+    }
+    for name, value in network.named_parameters():
+        if name.endswith(".1.weight"):
+            continue  # the scale of a batch norm
+        values = stored[
+            name.replace(".0.weight", ".weight").replace(".1.bias", ".bias")
+        ]
+        if values.shape != value.shape:
+            raise ModelError(f"{exported.path}: has another width; give its --width")
+        value.data.copy_(torch.from_numpy(values.astype(np.float32)))
+
+    norms = [one for one in network.modules() if isinstance(one, nn.BatchNorm2d)]
+    hooks = [norm.register_forward_pre_hook(undo) for norm in norms]
+    with torch.no_grad():
+        network.eval()(features)
+    for hook in hooks:
+        hook.remove()
+    network.train()
+
+
 def files_of(run: Path, recipe: SegmentationRecipe) -> list[list[FrameFile]]:
     """Return the files of training frames, and of validation frames.
 
@@ -212,6 +267,7 @@ def train_segmentation(
     out: Path,
     meshes: Path | None = None,
     furniture: Path | None = None,
+    start: Path | None = None,
     workers: int | None = None,
     recipe: SegmentationRecipe = SegmentationRecipe(),
     hardware: Hardware = Hardware(),
@@ -228,6 +284,8 @@ def train_segmentation(
         meshes: folder of further objects, of any size; if it has splits, the training split is
             used.
         furniture: folder of furniture with ModelNet10 classes, for rooms and backgrounds.
+        start: card of an exported network whose weights are the initial ones, with the same
+            --validation-share and --seed, so that its validation meshes remain unseen.
         workers: number of processes that generate frames; by default one per core.
 
     Raises:
@@ -237,7 +295,13 @@ def train_segmentation(
     used, held_out = WorldMeshes.of(meshes, furniture).divided(
         recipe.validation_share, recipe.seed
     )
-    run = new_run(recipe, None, held_out.names, [])
+    exported = None if start is None else load_network(start)
+    run = new_run(
+        recipe,
+        None if exported is None else exported.path,
+        held_out.names,
+        [] if exported is None else [exported.card],
+    )
 
     def trained() -> nn.Module:
         files = files_of(out, recipe)
@@ -250,7 +314,7 @@ def train_segmentation(
                 len(part),
                 f"drawing files of frames for {what}",
             )
-        return fit_segmentation(files, recipe, out, hardware)
+        return fit_segmentation(files, recipe, out, hardware, exported)
 
     train_once(out, run, trained)
     return out
@@ -261,6 +325,7 @@ def fit_segmentation(
     recipe: SegmentationRecipe,
     out: Path,
     hardware: Hardware = Hardware(),
+    exported: SegmentationNetwork | None = None,
 ) -> SegmentationNet:
     """Train a network on generated frames.
 
@@ -269,6 +334,7 @@ def fit_segmentation(
         recipe: of the training.
         out: folder of the run.
         hardware: device and precision.
+        exported: network whose weights are the initial ones; None for random ones.
 
     Returns:
         The network of the epoch with the lowest validation loss.
@@ -279,5 +345,10 @@ def fit_segmentation(
     )
     torch.manual_seed(recipe.seed)
     module = SegmentationModule(recipe, recipe.epochs * training.steps)
+    if exported is not None:
+        some = [batch[0] for batch in islice(training, BATCHES_NORMED)]
+        start_from_export(module.net, exported, torch.cat(some))
+    start = deepcopy(module.net.state_dict())
     best = fit(module, training, validation, out, "validation_loss", "min", hardware)
+    interpolate(best.net, start, recipe.interpolation)
     return best.net.eval()
