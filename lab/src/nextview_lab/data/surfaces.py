@@ -22,6 +22,12 @@ from nextview_lab.data.measures import MeasuredView, MeasuredViews
 from nextview_lab.data.rendering import deformed
 from nextview_lab.data.store import DEPTH_UNIT, ViewStore
 
+APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
+# what stands no farther before a face is not told from it, object radii: two steps of a store's
+# depth
+LEVEL = 2e-4
+
+
 SAME = 1e-6
 """Vertices no farther apart than this, object radii, are one: many files hold each triangle with
 corners of its own.
@@ -339,15 +345,58 @@ class FaceCamera:
     ) -> NDArray[np.int32]:
         """Which face of the mesh each pixel shows, (H, W) int32, -1 for none; arguments as of
         ``view``.
+
+        Where two pixels of a row show one face, so does all between them, unless the depth tells
+        that something stands before it: half of the rays are saved.
         """
         pose = checked_pose(pose)
-        found = np.full(depth.shape, -1, np.int32)
-        seen = depth > 0
-        if seen.any():
-            rays = self._rays[seen.ravel()] @ pose[:3, :3].astype(np.float32).T
-            origins = np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1))
-            found[seen] = self._scene.run(origins, rays)
+        z = depth.astype(np.float32, copy=False)
+        found = np.full(z.shape, -1, np.int32)
+        seen = z > 0
+        self._cast(pose, seen, found, slice(0, None, APART))
+        for step in (APART >> k for k in range(1, APART.bit_length())):
+            _fill(found, z, step)
+            self._cast(pose, seen & (found < 0), found, slice(step, None, 2 * step))
         return found
+
+    def _cast(
+        self,
+        pose: NDArray[np.float64],
+        where: NDArray[np.bool_],
+        found: NDArray[np.int32],
+        columns: slice,
+    ) -> None:
+        """Look what some pixels show, of some columns; the nearest face alone: distances and
+        normals cost more.
+        """
+        chosen = np.zeros(where.shape, bool)
+        chosen[:, columns] = where[:, columns]
+        pixels = np.flatnonzero(chosen)
+        if len(pixels):
+            rays = self._rays.take(pixels, 0)  # by a mask it takes four times as long
+            rays = rays @ np.ascontiguousarray(pose[:3, :3].astype(np.float32).T)
+            origins = np.tile(pose[:3, 3].astype(np.float32), len(rays)).reshape(-1, 3)
+            found.reshape(-1)[pixels] = self._scene.run(origins, rays)
+
+
+def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
+    """Fill every other of the columns that are ``step`` apart, where both neighbours show one face
+    and it does, too.
+
+    The inverse depth of a plane changes evenly over the picture.
+    """
+    # the last column that was asked
+    reach = (found.shape[1] - 1) // (2 * step) * 2 * step
+    left, middle, right = (
+        slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step)
+    )
+    one = found[:, left]
+    before = z[:, left]
+    after = z[:, right]
+    both = before + after
+    off = np.abs(z[:, middle] * both - 2 * before * after)
+    same = (one == found[:, right]) & (one >= 0) & (off < LEVEL * both)
+    np.copyto(found[:, middle], one, where=same)
 
 
 def view_of(
