@@ -13,8 +13,9 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
 from nextview.sensing.view import LEVEL, View
 from nextview.things.library import Hypotheses, Library
+from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import normal_equations
-from nextview.things.score import BLOCK, score
+from nextview.things.score import score
 from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float
 
@@ -101,7 +102,7 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     if found.seen == 0:
         return Followed(expected, None, 0.0, visible)
     _, volume = np.linalg.slogdet(np.eye(6) + expected.pose_covariance @ told)
-    evidence = found.total / BLOCK**2
+    evidence = found.total / PIXELS_ALIKE
     evidence -= 0.5 * float(motion @ information @ motion) + 0.5 * float(volume)
     anywhere = np.diag(np.repeat([1.0, 1 / radius**2], 3))
     return Followed(
