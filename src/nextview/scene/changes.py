@@ -19,9 +19,8 @@ from nextview.scene.followed import SURPRISE
 from nextview.sensing.frame import Frame
 from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View, stride_of
 from nextview.things.library import Hypotheses, Library
-from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import register
-from nextview.things.score import OUTLIER, STEEPEST, Score, score, total
+from nextview.things.score import BLOCK, OUTLIER, STEEPEST, Score, score, total
 from nextview.things.surface import Surface
 from nextview.things.visible_points import ALL_AROUND
 from nextview.things.world import (
@@ -303,7 +302,7 @@ def _compared(
                 and other.total > NEW_OBJECT + STRANGER_GAIN * other.seen
             ):
                 gained = stays[0][k] + other.total - before - found.total
-                if min(gained / PIXELS_ALIKE, apart[best]) > SURPRISE:
+                if min(gained / BLOCK**2, apart[best]) > SURPRISE:
                     now = "moved"
                     cells = _explained(other)
         compared.append(_Compared(one, now, tried[best : best + 1], cells))

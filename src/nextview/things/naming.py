@@ -14,12 +14,12 @@ from nextview.things.score import PIXEL_GAIN
 from nextview.things.world import STRANGER_GAIN, Thing, World
 from nextview.types import Float, Index
 
-PIXELS_ALIKE = 25.0  # pixels of the grid whose errors are alike: their nats count once
-TOTAL_ERROR = 0.01  # of what a hypothesis explains: error by its pose and scan
+PIXELS_ALIKE = 6.0  # pixels of the grid whose errors are alike: their nats count once
+TOTAL_ERROR = 0.015  # of what a hypothesis explains: error by its pose and scan
 # log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
 # explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -11.8, 12.3, 0.5, 32.8
-LARGEST_LEAD = 0.1  # of what it explains: a larger lead counts as much
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -13.0, 13.0, 0.65, 17.4
+LARGEST_LEAD = 0.2  # of what it explains: a larger lead counts as much
 CONFIDENT = 0.97  # belief from which on a name is confident
 LIKELY = 0.5  # belief below which an object is unknown
 OUTLINE_PIXELS = 2.0  # of the grid, within which an outline is where it is measured

@@ -52,6 +52,7 @@ MOVED_SHARE = (
     0.3  # the same of what the thing explains: errors of scan and pose are alike
 )
 MOST_VIEWS = 6  # that are kept
+SETTLED_VIEWS = 3  # views after which poses are not refined, and names not searched
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 _Rows = tuple[tuple[Score | None, ...], ...]
@@ -166,7 +167,8 @@ class World:
         """Return the world with names for what the last view shows unexplained.
 
         What an earlier view from the same place has shown alike was searched before. A stranger
-        that an earlier view has shown is neither joined to others nor cut again.
+        that an earlier view has shown is neither joined to others nor cut again, and after some
+        views it is not searched any more.
 
         Args:
             among: things that may be there, (T,) bool.
@@ -181,6 +183,8 @@ class World:
             last = row[-1]
             if last is not None and any(row[:-1]):
                 strange.ravel()[last.cells] = True
+                if _settled(row):
+                    before.ravel()[last.cells] = True
 
         for segments, share, known in (
             (view.instances, SURE_SHARE, before),
@@ -239,11 +243,12 @@ class World:
         return self.with_hypotheses(other).chosen()
 
     def _doubtful(self) -> Index:
-        """Return the rows of things that are new, or that explain less than is sure."""
+        """Return the rows of things that are new, or that explain too little in few views."""
         rows = [
             one.row
             for one in self.things
             if one.row >= 0
+            and not _settled(one.scores)
             and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
         ]
         return np.array(rows, np.int64)
@@ -578,7 +583,13 @@ def _cost(given: View, believed: View, error: tuple[float, float]) -> float:
     return float((angle / error[0]) ** 2 + (shift / error[1]) ** 2) / 2
 
 
-SETTLED_VIEWS = 3  # views after which poses are not refined
+def _settled(row: Sequence[Score | None]) -> bool:
+    """Whether enough views have shown a thing or a stranger before, half as large or larger."""
+    last = row[-1]
+    if last is None:
+        return True
+    before = [one for one in row[:-1] if one is not None and 2 * one.seen > last.seen]
+    return len(before) >= SETTLED_VIEWS
 
 
 def _since_it_stands(row: Sequence[Score | None]) -> tuple[Score | None, ...]:
