@@ -179,7 +179,7 @@ def _object(
     if found.right < LIKELY:
         return replace(one, beliefs=found.beliefs(world), candidates=candidates)
 
-    doubt = "" if found.right >= CONFIDENT else why_in_doubt(world, thing, found)
+    doubt = "" if found.right >= CONFIDENT else why_in_doubt(world, found)
     for warning in tops[max(pixels)].warnings if pixels else ():
         doubt = warning.message if warning.holds else doubt
     return replace(

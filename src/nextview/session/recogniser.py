@@ -175,7 +175,7 @@ class VerifiedRecogniser(NetworkRecogniser):
             poses=pose_candidates(world, found, self.labels),
             camera_error=1000 * self.library.camera[1] if moves else 0.0,
             p_value=found.right,
-            doubt=why_in_doubt(world, thing, found) if found.right < 0.5 else "",
+            doubt=why_in_doubt(world, found) if found.right < 0.5 else "",
             found=(world, thing, found.beliefs(world)),
         )
 

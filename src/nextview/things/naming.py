@@ -35,15 +35,19 @@ class Named:
         rows: hypotheses of its place, the likeliest first, (N,) int64.
         probabilities: of each, (N,) float64; the rest of 1 is that of a stranger.
         right: probability that the likeliest name is right.
-        lead: over the likeliest other name, nats.
-        share: of what the likeliest hypothesis could explain.
+        gain: what the likeliest hypothesis explains and nothing else does, nats.
+        lead: over the likeliest other name or size, as a share of what it explains.
+        share: of what it could explain.
+        most: probability that no other name or size explains the views; ``right`` is no higher.
     """
 
     rows: Index
     probabilities: Float
     right: float
+    gain: float
     lead: float
     share: float
+    most: float
 
     def beliefs(self, world: World) -> dict[str, float]:
         """Return the belief in each name, the likeliest first; their sum is 1 at most."""
@@ -87,38 +91,38 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     beliefs = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))
     probabilities, alike = beliefs[:-2], beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
-    lead = float(totals[0] - totals[others].max(initial=resized))
+    lead = float(1 - totals[others].max(initial=resized) / max(totals[0], 1.0))
     # what other things and planes explain as well does not speak for it
     gain = float(totals[0] - of_row.max() + thing.gain)
     share = gain / max(1.0, PIXEL_GAIN * seen)
     odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(gain, 1.0))
-    odds += OF_LEAD * min(lead / max(totals[0], 1.0), LARGEST_LEAD)
+    odds += OF_LEAD * min(lead, LARGEST_LEAD)
     # of two that explain the views alike, neither is sure
     alike += probabilities[others].sum()
-    most = 1 - alike / beliefs[:-1].sum()
-    return Named(rows, probabilities, float(min(expit(odds), most)), lead, share)
+    most = float(1 - alike / beliefs[:-1].sum())
+    right = min(float(expit(odds)), most)
+    return Named(rows, probabilities, right, gain, lead, share, most)
 
 
-def why_in_doubt(world: World, thing: Thing, found: Named) -> str:
+def why_in_doubt(world: World, found: Named) -> str:
     """Return the main reason why a name is not confident, in words.
 
     Args:
         world: the world.
-        thing: one of its things.
-        found: what is believed of it.
+        found: what is believed of one of its things.
     """
     things = world.hypotheses.things[found.rows]
     terms = {
         f"it explains its pixels by {100 * found.share:.0f} %, as well as it could be": (
             OF_SHARE * (found.share - 0.7)
         ),
-        "few pixels show it": OF_GAIN * (np.log(max(thing.gain, 1.0)) - np.log(1000)),
+        "few pixels show it": OF_GAIN * (np.log(max(found.gain, 1.0)) - np.log(1000)),
     }
     rival = things[things != things[0]]
     if len(rival):
         name = world.library.names[int(rival[0])]
         terms[f"{name} explains the views nearly as well"] = OF_LEAD * (
-            min(found.lead / max(thing.gain, 1.0), LARGEST_LEAD) - LARGEST_LEAD
+            min(found.lead, LARGEST_LEAD) - LARGEST_LEAD
         )
     return min(terms, key=lambda one: terms[one])
 

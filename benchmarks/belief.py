@@ -1,0 +1,174 @@
+"""Fit the belief in a name to drawn frames and real ones: what each term of it should weigh.
+
+    python -m benchmarks.belief [DATA] [--strangers 5]
+
+DATA is that of ``benchmarks.gate``. Its tables, hidden and moved things are shown to scenes, and each
+of its real frames to a scene of its own. Of each name that a scene considers this keeps its
+evidence (``nextview.things.naming.Named``), and whether it is right.
+
+It prints how often names are right by their present belief, and the weights that give most
+confident names that are right. Allowed are no confident wrong name in drawn frames, one on the
+taught things of real frames, and ``--strangers`` on real things that nobody taught. Frames that
+were fitted do not judge the fit: ``nextview-lab benchmark tables`` does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+
+import nextview
+from benchmarks import gate
+from benchmarks.gate_frames import Case, middle, moved
+from nextview.things import naming
+from nextview.things.naming import CONFIDENT, named
+from nextview_lab.benchmark.real import pixels_met
+
+INTERVALS = 0, 0.5, 0.7, 0.85, 0.95, 0.97, 0.99, 1.001
+WEIGHTS = {  # that are tried
+    "OF_SHARE": (10.0, 12.5, 15.0, 20.0),
+    "OF_GAIN": (0.25, 0.5, 0.75, 1.0),
+    "OF_LEAD": (10.0, 20.0, 30.0),
+    "LARGEST_LEAD": (0.1, 0.15, 0.2, 0.3),
+}
+
+
+class Evidence(NamedTuple):
+    """What speaks for a name, and whether it is right."""
+
+    where: str
+    share: float
+    gain: float
+    lead: float
+    most: float
+    belief: float
+    right: bool
+
+
+def of_scene(
+    scene: nextview.Scene, shapes: gate.Shapes
+) -> Iterator[tuple[naming.Named, str, gate.Float]]:
+    """The best name of each thing of a scene, and points on it in its pose."""
+    world = scene._state.world
+    for thing in world.things:
+        found = None if thing.row < 0 else named(world, thing, ())
+        if found is not None:
+            row = int(found.rows[0])
+            name = world.library.names[int(world.hypotheses.things[row])]
+            pose = world.hypotheses.pose(row, world.library)
+            yield found, name, moved(shapes[name][0], pose)
+
+
+def drawn(
+    part: str,
+    cases: Iterator[tuple[str, Case]],
+    system: nextview.System,
+    shapes: gate.Shapes,
+) -> Iterator[Evidence]:
+    """Evidence of drawn frames."""
+    for _, seen in cases:
+        scene = nextview.Scene(system)
+        for frame in range(len(seen.depth)):
+            gate.updated(scene, gate.frame_of(seen, frame))
+            placed = map(moved, seen.points, seen.poses[frame])
+            true = dict(zip(seen.names.tolist(), placed, strict=True))
+            for found, name, points in of_scene(scene, shapes):
+                off = middle(points) - middle(true.get(name, np.full((1, 3), np.inf)))
+                yield row_of(part, found, bool(np.linalg.norm(off) < gate.NEAR))
+
+
+def real(
+    bench: gate.Bench, system: nextview.System, shapes: gate.Shapes
+) -> Iterator[Evidence]:
+    """Evidence of all real frames."""
+    for folder, (group, camera, _) in gate.REAL.items():
+        for seen in gate.real_frames(bench.data / folder, camera):
+            scene = nextview.Scene(system, up=None)
+            gate.updated(scene, seen.read())
+            masks = {one.name: one.pixels for one in seen.things()}
+            for found, name, points in of_scene(scene, shapes):
+                mask = masks.get(name)
+                met = mask is not None and pixels_met(
+                    points, seen.captured.intrinsics, mask
+                )
+                yield row_of(group, found, bool(met))
+
+
+def row_of(where: str, found: naming.Named, right: bool) -> Evidence:
+    """One name as a row."""
+    return Evidence(
+        where, found.share, found.gain, found.lead, found.most, found.right, right
+    )
+
+
+def fitted(rows: Sequence[Evidence], strangers: int) -> tuple[int, dict[str, float]]:
+    """The weights that give most confident right names, and their number."""
+    _, share, gain, lead, most, _, right = map(np.array, zip(*rows, strict=True))
+    where = np.array([row.where for row in rows])
+    allowed = dict.fromkeys(set(where.tolist()), 0)
+    allowed |= {"none taught": strangers, "taught": 1, "labelled": 0}
+    best: tuple[int, dict[str, float]] = (0, {})
+    for values in itertools.product(*WEIGHTS.values()):
+        of_share, of_gain, of_lead, largest = values
+        odds = of_share * share + of_gain * np.log(np.maximum(gain, 1))
+        odds += of_lead * np.minimum(lead, largest)
+        odds = np.where(most > CONFIDENT, odds, -np.inf)
+        # the most convincing wrong name that is not allowed
+        limits = [
+            np.sort(np.append(odds[(where == name) & ~right], [-np.inf] * (count + 1)))[
+                -1 - count
+            ]
+            for name, count in allowed.items()
+        ]
+        limit = max(limits)
+        count = int((right & (odds > limit)).sum())
+        if count > best[0]:
+            constant = np.log(CONFIDENT / (1 - CONFIDENT)) - limit
+            weights = dict(zip(WEIGHTS, values, strict=True))
+            best = count, {"CONSTANT": round(float(constant), 2), **weights}
+    return best
+
+
+def main(
+    data: tyro.conf.Positional[Path] = Path(os.environ.get("NEXTVIEW_DATA", "data")),
+    strangers: int = 5,
+    frames: Path = Path("~/.cache/nextview/gate"),
+) -> None:
+    """Fit the belief in a name.
+
+    Args:
+        data: folder of the gate's data.
+        strangers: real things without a name that may get a confident one.
+        frames: folder of the drawn frames.
+    """
+    bench = gate.Bench(data, frames.expanduser(), 1)
+    system, shapes = bench.taught()
+    rows = [
+        row
+        for part in ("tables", "places", "moves")
+        for row in drawn(part, bench.cases(part), system, shapes)
+    ]
+    rows += real(bench, system, shapes)
+    print("where, belief, names, right")
+    for where in dict.fromkeys(row.where for row in rows):
+        for low, high in itertools.pairwise(INTERVALS):
+            some = [
+                r.right for r in rows if r.where == where and low <= r.belief < high
+            ]
+            if some:
+                print(
+                    f"{where}, {low:.2f} to {min(high, 1):.2f}, {len(some)}, {sum(some)}"
+                )
+    count, weights = fitted(rows, strangers)
+    now = sum(row.right and row.belief >= CONFIDENT for row in rows)
+    print(f"confident and right: {now} now, {count} with {weights}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
