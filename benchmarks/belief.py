@@ -2,14 +2,14 @@
 
     python -m benchmarks.belief [DATA] [--strangers 5]
 
-DATA is that of ``benchmarks.gate``. Its tables, hidden and moved things are shown to scenes, and each
-of its real frames to a scene of its own. Of each name that a scene considers this keeps its
+DATA is that of ``benchmarks.gate``. Its tables, hidden and moved things are shown to scenes, and
+each of its real frames to a scene of its own. Of each name that a scene considers this keeps its
 evidence (``nextview.things.naming.Named``), and whether it is right.
 
 It prints how often names are right by their present belief, and the weights that give most
-confident names that are right. Allowed are no confident wrong name in drawn frames, one on the
-taught things of real frames, and ``--strangers`` on real things that nobody taught. Frames that
-were fitted do not judge the fit: ``nextview-lab benchmark tables`` does.
+confident names that are right. Allowed are confident wrong names of three in a hundred of a drawn
+part, one on the taught things of real frames, and ``--strangers`` on real things that nobody
+taught. Frames that were fitted do not judge the fit: ``nextview-lab benchmark tables`` does.
 """
 
 from __future__ import annotations
@@ -111,7 +111,9 @@ def fitted(rows: Sequence[Evidence], strangers: int) -> tuple[int, dict[str, flo
     """The weights that give most confident right names, and their number."""
     _, share, gain, lead, most, _, right = map(np.array, zip(*rows, strict=True))
     where = np.array([row.where for row in rows])
-    allowed = dict.fromkeys(set(where.tolist()), 0)
+    names, counts = np.unique(where, return_counts=True)
+    shares = ((1 - CONFIDENT) * counts).astype(int)
+    allowed = dict(zip(names.tolist(), shares.tolist(), strict=True))
     allowed |= {"none taught": strangers, "taught": 1, "labelled": 0}
     best: tuple[int, dict[str, float]] = (0, {})
     for values in itertools.product(*WEIGHTS.values()):
@@ -120,12 +122,10 @@ def fitted(rows: Sequence[Evidence], strangers: int) -> tuple[int, dict[str, flo
         odds += of_lead * np.minimum(lead, largest)
         odds = np.where(most > CONFIDENT, odds, -np.inf)
         # the most convincing wrong name that is not allowed
-        limits = [
-            np.sort(np.append(odds[(where == name) & ~right], [-np.inf] * (count + 1)))[
-                -1 - count
-            ]
-            for name, count in allowed.items()
-        ]
+        limits = []
+        for name, number in allowed.items():
+            wrong = np.append(odds[(where == name) & ~right], [-np.inf] * (number + 1))
+            limits.append(np.sort(wrong)[-1 - number])
         limit = max(limits)
         count = int((right & (odds > limit)).sum())
         if count > best[0]:
