@@ -29,6 +29,7 @@ from benchmarks.gate_frames import Case, middle, moved
 from nextview.things import naming
 from nextview.things.naming import CONFIDENT, named
 from nextview_lab.benchmark.real import pixels_met
+from nextview_lab.data.real_frames import real_frames
 
 INTERVALS = 0, 0.5, 0.7, 0.85, 0.95, 0.97, 0.99, 1.001
 WEIGHTS = {  # that are tried
@@ -40,7 +41,17 @@ WEIGHTS = {  # that are tried
 
 
 class Evidence(NamedTuple):
-    """What speaks for a name, and whether it is right."""
+    """What speaks for a name, and whether it is right.
+
+    Attributes:
+        where: part of the gate, or kind of real frames.
+        share: of what it could explain; this and the next three as in ``Named``.
+        gain: nats.
+        lead: share of what it explains.
+        most: probability that nothing else explains the views.
+        belief: in the name, with the present weights.
+        right: whether the name is.
+    """
 
     where: str
     share: float
@@ -54,7 +65,12 @@ class Evidence(NamedTuple):
 def of_scene(
     scene: nextview.Scene, shapes: gate.Shapes
 ) -> Iterator[tuple[naming.Named, str, gate.Float]]:
-    """The best name of each thing of a scene, and points on it in its pose."""
+    """The best name of each thing of a scene, and points on it in its pose.
+
+    Args:
+        scene: after a frame.
+        shapes: points on the scans by their names.
+    """
     world = scene._state.world
     for thing in world.things:
         found = None if thing.row < 0 else named(world, thing, ())
@@ -71,7 +87,14 @@ def drawn(
     system: nextview.System,
     shapes: gate.Shapes,
 ) -> Iterator[Evidence]:
-    """Evidence of drawn frames."""
+    """Evidence of drawn frames.
+
+    Args:
+        part: of the gate.
+        cases: of the part, each with its name.
+        system: that knows the things.
+        shapes: points on the scans by their names.
+    """
     for _, seen in cases:
         scene = nextview.Scene(system)
         for frame in range(len(seen.depth)):
@@ -86,9 +109,15 @@ def drawn(
 def real(
     bench: gate.Bench, system: nextview.System, shapes: gate.Shapes
 ) -> Iterator[Evidence]:
-    """Evidence of all real frames."""
+    """Evidence of all real frames.
+
+    Args:
+        bench: with the folders.
+        system: that knows the things.
+        shapes: points on the scans by their names.
+    """
     for folder, (group, camera, _) in gate.REAL.items():
-        for seen in gate.real_frames(bench.data / folder, camera):
+        for seen in real_frames(bench.data / folder, camera):
             scene = nextview.Scene(system, up=None)
             gate.updated(scene, seen.read())
             masks = {one.name: one.pixels for one in seen.things()}
@@ -101,14 +130,25 @@ def real(
 
 
 def row_of(where: str, found: naming.Named, right: bool) -> Evidence:
-    """One name as a row."""
+    """One name as a row.
+
+    Args:
+        where: part of the gate, or kind of real frames.
+        found: what is believed.
+        right: whether the name is.
+    """
     return Evidence(
         where, found.share, found.gain, found.lead, found.most, found.right, right
     )
 
 
 def fitted(rows: Sequence[Evidence], strangers: int) -> tuple[int, dict[str, float]]:
-    """The weights that give most confident right names, and their number."""
+    """The weights that give most confident right names, and the number of these.
+
+    Args:
+        rows: all names.
+        strangers: real strangers that may get a confident name.
+    """
     _, share, gain, lead, most, _, right = map(np.array, zip(*rows, strict=True))
     where = np.array([row.where for row in rows])
     names, counts = np.unique(where, return_counts=True)
@@ -155,6 +195,7 @@ def main(
         for row in drawn(part, bench.cases(part), system, shapes)
     ]
     rows += real(bench, system, shapes)
+
     print("where, belief, names, right")
     for where in dict.fromkeys(row.where for row in rows):
         for low, high in itertools.pairwise(INTERVALS):
@@ -165,6 +206,7 @@ def main(
                 print(
                     f"{where}, {low:.2f} to {min(high, 1):.2f}, {len(some)}, {sum(some)}"
                 )
+
     count, weights = fitted(rows, strangers)
     now = sum(row.right and row.belief >= CONFIDENT for row in rows)
     print(f"confident and right: {now} now, {count} with {weights}")

@@ -118,6 +118,7 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     views = _views(recogniser, thing, sensor, rng)
     truth = int(recogniser.labels[thing])
     enough = Stopping.of(recogniser.calibration)
+
     found = []
     for count in VIEWS_SHOWN[: len(views)]:
         total = np.zeros(len(recogniser.classes))
@@ -182,6 +183,7 @@ def summary(shown: Sequence[Shown], unseen: Sequence[str]) -> ShownThings:
         right = [one.named == one.truth for one in shown if one.views == count]
         if right:
             accuracy.append(float(np.mean(right)))
+
     twice = [one for one in shown if one.views == 2]
     pairs = Counter((one.truth, one.named) for one in twice if one.named != one.truth)
     of_class = Counter(one.truth for one in twice)

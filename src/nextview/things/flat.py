@@ -119,7 +119,11 @@ def _fitted(
 ) -> Float:
     """Return the plane n of most pixels, n . (x, y, 1) = 1 / depth, (3,) float64."""
     few = rng.permutation(len(depth))[:400]
-    rays, z, error = slopes[few], depth[few].astype(np.float64), sigma[few]
+    rays = slopes[few]
+    z = depth[few].astype(np.float64)
+    error = sigma[few]
+
+    # planes through three points each, and one that faces the camera
     triples = rng.integers(0, len(few), (TRIPLES, 3))
     corners = rays[triples]
     usable = np.abs(np.linalg.det(corners)) > 1e-9
@@ -129,6 +133,8 @@ def _fitted(
     normals = np.concatenate([normals, [[0.0, 0.0, 1 / np.median(z)]]])
     off = np.abs(1 / np.maximum(normals @ rays.T, 1e-3) - z)
     normal = normals[np.count_nonzero(off < 2 * error, axis=1).argmax()]
+
+    # the best one, drawn to the points near it
     for _ in range(3):
         off = np.abs(1 / np.maximum(rays @ normal, 1e-3) - z)
         weight = np.where(off < 3 * error, z**2 / error, 0)

@@ -80,16 +80,19 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     # the same thing in another size is something that was not taught
     taught = world.hypotheses.taught[rows]
     resized = totals[kept & ~taught].max(initial=0.0)
-    rows, totals = rows[kept & taught], totals[kept & taught]
+    rows = rows[kept & taught]
+    totals = totals[kept & taught]
     if not len(rows):
         return None
     order = np.argsort(-totals, kind="stable")
-    rows, totals = rows[order], totals[order]
+    rows = rows[order]
+    totals = totals[order]
 
     seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
     every = np.append(totals, [resized, STRANGER_GAIN * seen])
     beliefs = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))
-    probabilities, alike = beliefs[:-2], beliefs[-2]
+    probabilities = beliefs[:-2]
+    alike = beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
     lead = float(1 - totals[others].max(initial=resized) / max(totals[0], 1.0))
     # what other things and planes explain as well does not speak for it

@@ -584,7 +584,7 @@ def _cost(given: View, believed: View, error: tuple[float, float]) -> float:
 
 
 def _settled(row: Sequence[Score | None]) -> bool:
-    """Whether enough views have shown a thing or a stranger before, half as large or larger."""
+    """Whether enough earlier views have shown at least half as much of something as the last."""
     last = row[-1]
     if last is None:
         return True
