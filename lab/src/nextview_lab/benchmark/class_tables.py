@@ -10,7 +10,6 @@ import numpy as np
 from nextview.session.episode import Outcome
 from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import Board, Column, WrittenTable
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -27,6 +26,7 @@ from nextview_lab.benchmark.comparison import (
 from nextview_lab.benchmark.entries import is_oracle, knows_truth
 from nextview_lab.benchmark.published import published
 from nextview_lab.benchmark.replay import Grid
+from nextview_lab.benchmark.text_tables import Board, Column, WrittenTable
 from nextview_lab.data import metrics
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.extras import extras

@@ -12,7 +12,7 @@ import numpy as np
 
 from nextview.types import Float, Index, Mask
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import Board, Column, WrittenTable
+from nextview_lab.benchmark.text_tables import Board, Column, WrittenTable
 from nextview_lab.extras import extras
 
 with extras():

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from nextview.figures.style import to_svg
 from nextview.recognition.map_names import measure_of
-from nextview_lab.benchmark.board_page import NONE, points
 from nextview_lab.benchmark.entries import knows_truth
+from nextview_lab.benchmark.text_tables import NONE, points
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.extras import extras
 

@@ -11,7 +11,6 @@ from nextview.errors import DatasetError, NextviewError
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
-from nextview_lab.benchmark.board_page import WrittenTable
 from nextview_lab.benchmark.frame_answers import (
     FrameAnswer,
     check_table,
@@ -20,6 +19,7 @@ from nextview_lab.benchmark.frame_answers import (
     write_table,
 )
 from nextview_lab.benchmark.statistics import wilson
+from nextview_lab.benchmark.text_tables import WrittenTable
 from nextview_lab.data.metrics import add_s
 from nextview_lab.data.real_frames import RealFrame, TrueThing, real_frames
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from nextview.figures.style import to_png
 from nextview.files import new_folder
-from nextview_lab.benchmark.board_page import Board, markdown
 from nextview_lab.benchmark.comparison import Tables, too_few, written
 from nextview_lab.benchmark.figures import differences, views_curve
+from nextview_lab.benchmark.text_tables import Board, markdown
 
 RECORD = "benchmark.json"
 

@@ -22,7 +22,6 @@ from nextview.geometry.mesh import load_mesh
 from nextview.things.surface import Surface
 from nextview.types import Float
 from nextview_lab.benchmark import statistics as st
-from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -39,6 +38,7 @@ from nextview_lab.benchmark.submit import (
     Submission,
     SubmittedEpisode,
 )
+from nextview_lab.benchmark.text_tables import Board, Column
 from nextview_lab.data.metrics import add_s
 from nextview_lab.extras import extras
 
@@ -285,12 +285,12 @@ def _compared(
     scored: Sequence[Scored],
     truths: Sequence[EpisodeTruth],
     reference: str | None,
-    weights: tuple[int, int],
+    resampling: tuple[int, int],
 ) -> ComparedTables:
-    """Compare the methods with each other; ``weights`` are the samples and the seed of them."""
+    """Compare the methods; ``resampling`` is the number of samples, and their seed."""
     things = [truth.thing for truth in truths]
     families = np.unique(things, return_inverse=True)[1]
-    samples, seed = weights
+    samples, seed = resampling
     drawn = st.resample_families(families, samples, np.random.default_rng(seed))
     episodes = pd.concat([one.episodes() for one in scored])
     counted = Counted.of(episodes, SHARES, {}, families)

@@ -32,11 +32,11 @@ from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.things.memory import open_memory
 from nextview.types import Float, Index
-from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import ALL, ONE, Counted, Key, corrected
 from nextview_lab.benchmark.jobs import Job, Settings, check_place, check_same, run_jobs
 from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample
+from nextview_lab.benchmark.text_tables import Board, Column
 from nextview_lab.extras import extras
 from nextview_lab.worlds.tables import SimulatedTable, TableCamera, poses_around
 

@@ -16,7 +16,6 @@ from nextview.session.system import UNKNOWN_ALPHA
 from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
-from nextview_lab.benchmark.board_page import Board, Column
 from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
@@ -28,6 +27,7 @@ from nextview_lab.benchmark.comparison import (
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
 from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample_families
+from nextview_lab.benchmark.text_tables import Board, Column
 from nextview_lab.benchmark.thing_episodes import EPISODE_SPHERE, KnownThings
 from nextview_lab.benchmark.thing_policies import (
     BEST_BLIND,

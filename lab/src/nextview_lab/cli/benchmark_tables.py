@@ -5,10 +5,10 @@ from typing import Any
 
 from nextview.cli.progress import Terminal
 from nextview_lab.benchmark import class_tables as board
-from nextview_lab.benchmark.board_page import WrittenTable, points
 from nextview_lab.benchmark.class_tables import ClassResults
 from nextview_lab.benchmark.comparison import SIGNIFICANT, significant, written
 from nextview_lab.benchmark.results import ComparedTables
+from nextview_lab.benchmark.text_tables import WrittenTable, points
 from nextview_lab.cli.printing import print_tables
 from nextview_lab.errors import EntryError
 

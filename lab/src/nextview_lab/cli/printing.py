@@ -7,9 +7,9 @@ from rich.table import Table
 
 from nextview.checks import number_of
 from nextview.cli.progress import Terminal, console
-from nextview_lab.benchmark.board_page import WrittenTable
 from nextview_lab.benchmark.bop import BopRun
 from nextview_lab.benchmark.real import RealRun, real_table
+from nextview_lab.benchmark.text_tables import WrittenTable
 
 
 def print_tables(tables: Iterable[WrittenTable]) -> None:

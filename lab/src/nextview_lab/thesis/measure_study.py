@@ -41,9 +41,9 @@ from nextview.cli.progress import track
 from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.recognition.map_names import map_name
-from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.replay import make_specs, replay
 from nextview_lab.benchmark.statistics import holm, interval, resample, sign_flip_p
+from nextview_lab.benchmark.text_tables import markdown
 from nextview_lab.benchmark.true_maps import true_map, true_measure
 from nextview_lab.data.metrics import ratio
 from nextview_lab.data.predictions import Predictions

@@ -21,12 +21,12 @@ import tyro
 from nextview.cli.exit_status import orderly_end
 from nextview.files import sha256_of
 from nextview.recognition.belief import PLAIN_SUM
-from nextview_lab.benchmark.board_page import markdown
 from nextview_lab.benchmark.class_tables import ClassTables, nothing_differs, summarise
 from nextview_lab.benchmark.comparison import ALL, SIGNIFICANT
 from nextview_lab.benchmark.entries import default_entries
 from nextview_lab.benchmark.published import published, published_threshold
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
+from nextview_lab.benchmark.text_tables import markdown
 from nextview_lab.data.predictions import Predictions
 
 AT = 0.97
