@@ -115,18 +115,22 @@ def why_in_doubt(world: World, found: Named) -> str:
         found: what is believed of one of its things.
     """
     things = world.hypotheses.things[found.rows]
+    totals = world.totals[found.rows]
+    others = things != things[0]
+    rival = "the same thing in another size"
+    if totals[others].max(initial=0.0) >= (1 - found.lead) * totals[0] - 1e-6:
+        rival = world.library.names[int(things[others.argmax()])]
+    alike = f"{rival} explains the views nearly as well"
+    if found.right >= found.most:
+        return alike
+
     terms = {
-        f"it explains its pixels by {100 * found.share:.0f} %, as well as it could be": (
+        f"it fits only {100 * found.share:.0f} % of its pixels": (
             OF_SHARE * (found.share - 0.7)
         ),
         "few pixels show it": OF_GAIN * (np.log(max(found.gain, 1.0)) - np.log(1000)),
+        alike: OF_LEAD * (min(found.lead, LARGEST_LEAD) - LARGEST_LEAD),
     }
-    rival = things[things != things[0]]
-    if len(rival):
-        name = world.library.names[int(rival[0])]
-        terms[f"{name} explains the views nearly as well"] = OF_LEAD * (
-            min(found.lead, LARGEST_LEAD) - LARGEST_LEAD
-        )
     return min(terms, key=lambda one: terms[one])
 
 
