@@ -14,6 +14,7 @@ from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
+AIM_ERROR = 0.05  # standard deviation of the aim of a camera, image widths
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
@@ -133,26 +134,19 @@ def _overlap(mask: Mask, inside: Mask) -> float:
 
 
 def _aimed_at(seen: SegmentedFrame) -> Mask:
-    """Return the largest instance near the optical axis, preferably on a support surface.
-
-    Pixels are weighted by their distance from the axis.
-    """
+    """Return the instance at which the camera is most likely to be aimed."""
     shown = _of_size(seen)
-    pairs = zip(seen.masks, seen.carriers, strict=True)
-    carried = {id(mask) for mask, level in pairs if level is not None}
-    shown = [mask for mask in shown if id(mask) in carried] or shown
     if not shown:
         raise ObservationError(NO_INSTANCE.format(where="before the camera"))
-    return max(shown, key=lambda mask: _weight(mask, seen.frame))
+    return max(shown, key=lambda mask: _hit(mask, seen.frame))
 
 
-def _weight(mask: Mask, frame: Frame) -> float:
-    """Return the number of pixels of an instance, weighted by distance from the optical axis."""
+def _hit(mask: Mask, frame: Frame) -> float:
+    """Return how likely an aim with an error hits an instance, up to a factor."""
     rows, columns = np.nonzero(mask)
     column, row = frame.intrinsics[:2, 2]
-    away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]
-    # at 0.08 image widths from the optical axis pixels have the weight 1 / e
-    return float(len(rows) * np.exp(-((away / 0.08) ** 2)))
+    squares = (rows - row) ** 2 + (columns - column) ** 2
+    return float(np.exp(-squares / 2 / (AIM_ERROR * frame.shape[1]) ** 2).sum())
 
 
 def _of_size(seen: SegmentedFrame) -> list[Mask]:

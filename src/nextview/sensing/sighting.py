@@ -114,10 +114,11 @@ def sighting_of(
 
 
 def _in_large_groups(facets: Facets, noise: Noise, coarse: int) -> Mask:
-    """Return which facets are not in a small isolated group, (N,) bool.
+    """Return which facets are not in an isolated group that is small or far away, (N,) bool.
 
     A fragment of the background, or of an edge, would determine the radius of the object. Groups
-    are apart by some pixels, or by as much in depth.
+    are apart by some pixels, or by as much in depth. No part of an object is further behind the
+    largest one, or in front of it, than that is wide.
     """
     depth = facets.points[:, 2]
     step = GROUP_GAP * float(facets.pitch.mean())
@@ -131,8 +132,13 @@ def _in_large_groups(facets: Facets, noise: Noise, coarse: int) -> Mask:
     cells = np.zeros([int(index.max()) + 1 for index in at], bool)
     cells[at] = True
     group = ndimage.label(cells, np.ones((3, 3, 3)))[0][at]
+    counts = np.bincount(group)
+    main = int(counts.argmax())
+    width = np.linalg.norm(np.ptp(facets.points[group == main], axis=0))
+    away = np.asarray(ndimage.median(depth, group, np.arange(len(counts))))
+    near = np.abs(away - away[main]) < width
     # one facet in a hundred
-    return np.asarray(np.bincount(group)[group] >= 0.01 * len(group))
+    return np.asarray(near[group] & (counts[group] >= 0.01 * len(group)))
 
 
 def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
