@@ -57,11 +57,18 @@ def test_a_name_that_is_ruled_out_leaves_the_likeliest_other_one(
     assert pickle.loads(pickle.dumps(without)).ruled_out == ("banana",)
 
 
-def test_if_all_names_are_ruled_out_the_object_is_unknown(ycb, banana_frame):
-    result = result_of(ycb.without(*ycb.classes), banana_frame)
-    assert result.unknown
-    assert result.answer is None
-    assert result.pose is None
+def test_a_scene_finds_no_thing_that_is_ruled_out(ycb, banana_frame):
+    frame, _ = banana_frame
+    for system, is_there in ((ycb, True), (ycb.without("banana"), False)):
+        scene = nextview.Scene(system)
+        scene.update(frame)
+        assert ("banana" in scene.objects[0].beliefs) == is_there
+
+
+def test_all_names_are_not_ruled_out(ycb):
+    first, *others = ycb.classes
+    with pytest.raises(UsageError):
+        ycb.without(*others).without(first)
 
 
 def test_what_is_no_taught_thing_is_not_ruled_out(ycb):

@@ -629,7 +629,8 @@ class Scene:
             return before, Look(False, warnings=(self._why_wrong(top),))
 
         world = told.world.with_view(told.view, told.held)
-        world = world.searched(np.ones(len(world.library), bool)).numbered()
+        among = ~np.isin(world.library.names, self.system.ruled_out)
+        world = world.searched(among).numbered()
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, kept.world, gone)
         state = replace(kept, world=world, tops=(*kept.tops, top))

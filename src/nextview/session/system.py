@@ -248,7 +248,7 @@ class System:
             names: of things; ``classes`` still contains them, with a belief of 0.
 
         Raises:
-            UsageError: no thing has such a name.
+            UsageError: no thing has such a name, or no name is left.
             ModelError: things are ruled out by their geometry, and the models have none.
         """
         recogniser = self.models.recogniser
@@ -259,8 +259,11 @@ class System:
         if not isinstance(recogniser, RulesOut):
             what = "only things of known geometry are ruled out, and it knows none"
             raise ModelError(f"{recogniser.name}: {what}")
+        ruled_out = (*self.ruled_out, *names)
+        if set(self.classes) <= {*ruled_out}:
+            raise UsageError("every name is ruled out: leave one at least")
         models = replace(self.models, recogniser=recogniser.without(names))
-        return replace(self, models=models, ruled_out=(*self.ruled_out, *names))
+        return replace(self, models=models, ruled_out=ruled_out)
 
     def __post_init__(self) -> None:
         check_unknown(self.unknown, self.models.recogniser)
