@@ -76,10 +76,10 @@ NOT_WHERE_THEY_WERE = (
     "this frame does not fit the others and is left out: most objects are not where they"
     " were"
 )
-WRONG_POSE = "so its pose is likely to be wrong"
+WRONG_POSE = "so its pose or that of an earlier frame is likely to be wrong"
 NOTHING_AGAIN = (
-    "this frame shows neither the plane that things stand on nor any object where they were: check"
-    " its pose, or aim the camera at them"
+    "this frame shows neither the plane that things stand on nor any object where they were: its"
+    " pose or that of an earlier frame is wrong, or the camera looks elsewhere"
 )
 MOVED_OR_POSE = ViewWarning(
     "pose",
