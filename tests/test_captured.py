@@ -2,6 +2,8 @@
 of them is named.
 """
 
+import shutil
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,7 @@ from factories import TABLE
 from recordings import HALF, LAYOUTS, SHAPE, K, write_png
 from scipy.spatial.transform import Rotation
 
+from nextview.captured.bundled_table import BUNDLED_TABLE
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.check import check_capture
 from nextview.captured.folders import read_capture
@@ -117,6 +120,31 @@ def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
     with pytest.raises(DatasetError) as refused:
         CapturedCamera(read_capture(tmp_path))
     assert refused.value.kind == kind
+
+
+def bundled_table(folder):
+    """A copy of the bundled recording of three frames."""
+    shutil.copytree(BUNDLED_TABLE, folder)
+    return folder
+
+
+def test_a_single_pose_with_a_mistake_is_named(tmp_path):
+    table = bundled_table(tmp_path / "table")
+    pose = table / "poses/000001.txt"
+    np.savetxt(pose, np.linalg.inv(np.loadtxt(pose)))
+    with pytest.raises(DatasetError, match="frame 000001 alone") as refused:
+        check_capture(read_capture(table))
+    assert refused.value.kind == "inverse pose"
+
+
+def test_no_two_conventions_of_poses_are_named_at_once(tmp_path):
+    """No poses explain images of a constant depth."""
+    table = bundled_table(tmp_path / "table")
+    for image in (table / "depth").iterdir():
+        write_png(image, np.full((480, 848), 700))
+    with pytest.raises(DatasetError) as refused:
+        check_capture(read_capture(table))
+    assert refused.value.kind.count("inverse") <= 1
 
 
 def test_depth_that_is_too_large_is_named(nine, tmp_path):

@@ -13,7 +13,7 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import in_one_place
-from nextview.sensing.mistakes import Mistake, PosedViews, Stored, mistakes
+from nextview.sensing.mistakes import Mistake, PosedViews, Stored, in_poses, mistakes
 from nextview.sensing.registration import CameraOffset, camera_offsets
 from nextview.types import Float, Index
 
@@ -156,7 +156,8 @@ def _contradicting(
     views = [SurfaceView.of(frame, rng, whole=False) for frame in frames]
     poses = np.stack([frame.pose for frame in capture.frames])
     posed = PosedViews(views, poses[compared])
-    found = _find_mistake(posed, _stored(capture, frames))
+    stored = _stored(capture, frames)
+    found = _find_mistake(posed, stored)
     if found is not None:
         raise _disagree(capture, found.sentence, found.name)
 
@@ -191,7 +192,12 @@ def _contradicting(
     too_many = len(blamed) > (most - (late != 0).sum() if len(frames) >= 5 else 0)
     too_many |= max(_wrong(standing), across) > MUCH_CONTRADICTED
     if too_many or blamed:
-        offset = _find_offset(posed)
+        single = _likeliest(
+            *_of_single_poses(posed, names, stored), stored.median_depth
+        )
+        if single and too_many:
+            raise _disagree(capture, single.sentence, single.name)
+        offset = "" if single else _find_offset(posed)
         if offset:
             raise _disagree(capture, offset, "camera offset")
     if too_many:
@@ -256,16 +262,40 @@ def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
     pairs = (
         one.with_another(other)
         for one, other in combinations([one for one in single if one.combines], 2)
-        if one.name != other.name
+        if not {*one.name.split()} & {*other.name.split()}
     )
     few = _some(posed)
     found = _likeliest(few, pairs, stored.median_depth)
     return found and _likeliest(posed, [found], stored.median_depth)
 
 
+def _of_single_poses(
+    posed: PosedViews, names: Sequence[str], stored: Stored
+) -> tuple[PosedViews, list[Mistake]]:
+    """Return some of the frames, and each mistake of poses in each of these frames alone.
+
+    Args:
+        posed: frames and poses as read.
+        names: of the frames.
+        stored: storage conventions of the frames.
+    """
+    rows = _few_rows(posed)
+    single = [
+        one.of_single_pose(row, names[of_all])
+        for row, of_all in enumerate(rows)
+        for one in in_poses(stored.to_world)
+    ]
+    return _some(posed), single
+
+
+def _few_rows(posed: PosedViews) -> Index:
+    """Return rows of frames among which a search is fast."""
+    return evenly_spread(len(posed.views), 20)
+
+
 def _some(posed: PosedViews) -> PosedViews:
     """Return frames among which a search is fast."""
-    rows = evenly_spread(len(posed.views), 20)
+    rows = _few_rows(posed)
     return PosedViews([posed.views[row] for row in rows], posed.poses[rows])
 
 

@@ -7,7 +7,7 @@ mistake, add an entry to ``mistakes``.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -62,7 +62,7 @@ class Mistake:
     """A mistake, with the change that undoes it.
 
     Attributes:
-        name: of the affected quantity; two mistakes of one name are not combined.
+        name: of the affected quantity; two whose names share a word are not combined.
         sentence: description, the end of a sentence.
         right_poses: function that corrects poses, camera-to-world, (N, 4, 4).
         prior: probability that a single frame has it; 0 if only many frames tell.
@@ -93,6 +93,22 @@ class Mistake:
             f"{self.sentence} and {other.sentence}",
             lambda poses: other.right_poses(self.right_poses(poses)),
         )
+
+    def of_single_pose(self, row: int, frame: str) -> "Mistake":
+        """Return the mistake in the pose of one frame alone.
+
+        Args:
+            row: of the pose.
+            frame: name of the frame.
+        """
+
+        def right_poses(poses: Float) -> Float:
+            right = poses.copy()
+            right[row] = self.right_poses(poses[row : row + 1])[0]
+            return right
+
+        sentence = f"in frame {frame} alone, {self.sentence}"
+        return replace(self, sentence=sentence, right_poses=right_poses)
 
 
 def mistakes(stored: Stored) -> list[Mistake]:
