@@ -293,10 +293,20 @@ def test_the_command_lists_the_objects_on_the_table(ycb_meshes, tmp_path, capsys
     intrinsics = tmp_path / "table" / "camera-intrinsics.txt"
     main(["look", str(one), "--intrinsics", str(intrinsics), "--depth-scale", "0.001"])
     shown = capsys.readouterr().out
-    assert "cracker_box" in shown
-    assert "mug" in shown
+    rows = [line.split() for line in shown.splitlines() if line[:3] in (" 1 ", " 2 ")]
+    assert {row[1] for row in rows} == {"cracker_box", "mug"}
+    assert all(len(row) >= 6 for row in rows)  # its place is on the same line
 
     with pytest.raises(SystemExit) as end:
         main(["look", str(tmp_path / "table"), "--frames", "0"])
     assert end.value.code == 2
     assert "at least one frame" in capsys.readouterr().err
+
+
+def test_the_command_says_once_what_remains_unexplained(tmp_path, capsys):
+    rows, columns = np.mgrid[:480, :640]
+    steps = 800 - 40 * ((rows // 12 + columns // 12) % 2)
+    Image.fromarray(steps.astype(np.uint16)).save(tmp_path / "steps.png")
+    main(f"look {tmp_path / 'steps.png'} --intrinsics 600 600 320 240".split())
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("is its unit right?") == 1

@@ -115,6 +115,9 @@ def test_small_steps_side_by_side_are_not_empty(ycb):
     look = scene.update(from_above(0.8 - 0.04 * (higher & inner)))
     assert "empty" not in names(look)
     assert not scene.done
+    # where nothing is found, the unit may be wrong
+    assert scene.objects == ()
+    assert "unit" in names(look)
 
 
 @pytest.mark.parametrize(

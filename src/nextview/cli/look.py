@@ -143,6 +143,7 @@ def look(
         print(json.dumps(plain(scene_as_json(scene, looks, left_out)), indent=1))
     else:
         print_scene(scene, path.name)
+    remarked = {remark.name for remark in scene.remarks}
     first = next((name for name, one in looks.items() if one.taken), "")
     for name, one in looks.items():
         if capture.stands and name != first:
@@ -151,10 +152,11 @@ def look(
         for ended, whole in one.joined:
             console.print(f"{name}: {ended} turned out to be a part of {whole}")
         for warning in one.warnings:
-            console.print(
-                f"{name}: warning ({warning.name}): {warning.message}",
-                soft_wrap=True,
-            )
+            if warning.name not in remarked:
+                console.print(
+                    f"{name}: warning ({warning.name}): {warning.message}",
+                    soft_wrap=True,
+                )
     for name, reason in left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
     if output.figure is not None:
@@ -249,11 +251,11 @@ def print_scene(scene: Scene, name: str) -> None:
     """
     objects = scene.objects
     console = Terminal()
-    remarks = [f"{remark.message}." for remark in scene.remarks]
+    remarks = [one.message for one in scene.remarks]
     if not objects:
-        console.print(f"{name}: {' '.join(remarks)}")
+        console.print(f"{name}: {'; '.join(remarks)}")
         return
-    table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=box.SIMPLE, pad_edge=False, padding=0)
     frames = len(scene.frames)
     table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
     rows = [row_of(thing) for thing in objects]
@@ -263,7 +265,7 @@ def print_scene(scene: Scene, name: str) -> None:
             column,
             justify="right" if column in ("", "frames") else "left",
             overflow="fold",
-            no_wrap=column == "name" and longest <= WHOLE_NAME,
+            no_wrap=column in ("name", "place, m") and longest <= WHOLE_NAME,
         )
     for row in rows:
         table.add_row(*row)

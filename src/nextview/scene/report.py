@@ -28,7 +28,7 @@ def row_of(thing: SceneObject) -> list[str]:
     name = thing.name
     belief = f"{thing.confidence:.3f}"
     if thing.name == UNKNOWN_NAME:
-        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
+        sides = "x".join(f"{100 * side:.0f}" for side in thing.size)
         name = f"{UNKNOWN_NAME} ({sides} cm)"
         belief = ""
     elif not thing.confident:
@@ -38,7 +38,7 @@ def row_of(thing: SceneObject) -> list[str]:
         str(thing.number),
         name,
         belief,
-        place_in_words(thing.place).removesuffix(" m"),
+        place_in_words(thing.place).strip("[] m"),
         "" if off is None else f"{off.millimetres:.1f}, {off.degrees:.1f}",
         str(len(thing.pixels)),
         ", ".join(str(number) for number in thing.touches),

@@ -105,7 +105,7 @@ class SceneState:
         left_out = len(self.tops[-1].seen.carried_by_none) if self.tops else 0
         if left_out:
             things = number_of(left_out, "thing")
-            what = f"{things} in the last frame left out: no surface that is seen carries them"
+            what = f"left out: {things} standing on nothing visible"
             remarks.append(ViewWarning("left out", what, holds=False))
 
         if self.unexplained:
@@ -113,6 +113,11 @@ class SceneState:
             what = f"{area:.0f} square centimetres in view are neither ground nor an object"
             why = "is the ground another plane, or did the segmentation miss things?"
             remarks.append(ViewWarning("unexplained", f"{what}: {why}", holds=False))
-        elif self.tops and not self.objects and not left_out:
+        if remarks and not self.objects:
+            depth = self.tops[-1].frame.depth
+            middle = float(np.median(depth[depth > 0]))
+            what = f"no object is found, and the depth has a median of {middle:.2g} m"
+            remarks.append(ViewWarning("unit", f"{what}: is its unit right?", False))
+        elif self.tops and not self.objects:
             remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)
         return tuple(remarks)
