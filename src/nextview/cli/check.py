@@ -2,11 +2,19 @@
 
 from pathlib import Path
 
-from nextview.captured.check import check_capture, errors_of_cameras
+from nextview.captured.check import (
+    check_capture,
+    errors_of_cameras,
+    evenly_spread,
+    summary,
+)
 from nextview.captured.depth_quality import draw_quality, quality_of
 from nextview.captured.folders import read_capture
 from nextview.cli.common_options import check_file, check_there
 from nextview.cli.progress import console
+from nextview.sensing.known_frames import REPEATED, repeated
+
+FEW = 60  # frames among which repeated ones are sought
 
 
 def check(
@@ -19,8 +27,8 @@ def check(
 ) -> None:
     """Check captured frames, their depth, and the poses of their cameras.
 
-    Captured frames are compared with each other: wrong poses, units and axes are named. Of each
-    camera it is told how noisy its depth is, by how much it is too long or too short, and which
+    Captured frames are compared with each other: wrong poses, units and axes are named. For each
+    camera it prints how noisy the depth is, by how much it is too long or too short, and which
     things can be told apart at which distance. If several cameras took the frames, the error of
     the pose of each camera is estimated from the surfaces that it sees in common with others,
     relative to the first camera by name.
@@ -42,11 +50,24 @@ def check(
     read = read_capture(path, intrinsics, depth_scale=depth_scale)
     console.print(f"{read!r}", soft_wrap=True)
     capture, left_out = check_capture(read, masked=False)
+    few = [capture.frames[k] for k in evenly_spread(len(capture.frames), FEW)]
+    frames = [captured.read(masked=False) for captured in few]
+    again = [
+        few[k].name
+        for k in range(len(few))
+        if repeated(frames[k], frames[:k]) is not None
+    ]
+    if again:
+        console.print(
+            summary(dict.fromkeys(again, REPEATED.message)),
+            style="yellow",
+            soft_wrap=True,
+        )
     for name, reason in left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
     if len(capture.frames) > 1:
         console.print(
-            f"{capture.folder}: {len(capture.frames)} frames contradict each other nowhere",
+            f"{capture.folder}: all {len(capture.frames)} frames agree",
             soft_wrap=True,
         )
     cameras = capture.cameras

@@ -47,7 +47,7 @@ TOO_FAR = 2.5
 NEAR_RANGE = 0.25, 0.1
 REPEATED = ViewWarning(
     "repeated",
-    "this picture was handed in before, to the last bit, and counts once: does the camera hang?",
+    "this picture was handed in before, to the last bit, and counts once: is the camera frozen?",
 )
 
 
@@ -84,7 +84,7 @@ class KnownFrames:
             )
         if self.frames and (frame.pose is None or self.frames[0].pose is None):
             raise ObservationError(
-                "a second frame needs a pose, and the first one too: how else do they fit together?"
+                "a second frame needs a pose, and the first one too: without poses they cannot be put together"
             )
 
     def stands(self, frame: Frame) -> bool:
@@ -196,7 +196,7 @@ def check_sizes(
 def repeated(
     frame: Frame, earlier: Sequence[Frame], any_mask: bool = False
 ) -> int | None:
-    """Return which earlier frame a frame repeats, as from a camera that hangs.
+    """Return which earlier frame a frame repeats, as from a camera that is frozen.
 
     No two images of a depth camera are bitwise identical, so such a frame was not captured at its
     stated pose.
