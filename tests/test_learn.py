@@ -11,7 +11,7 @@ from factories import SimulatedTable, TableCamera, poses_around, refused, write_
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import UsageError
+from nextview.errors import DatasetError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.recognition.model_card import read_card
 from nextview.simulation.sensor import SENSORS
@@ -72,8 +72,10 @@ def test_meshes_without_a_unit_are_refused_at_once_with_the_units_they_may_have(
 ):
     (tmp_path / "scans").mkdir()
     trimesh.creation.box((60, 60, 80)).export(tmp_path / "scans/tile.ply")
-    with pytest.raises(UsageError, match=r"unit='mm' \(5.8 cm\)"):
+    with pytest.raises(UsageError, match=r"unit='mm' \(8 cm\)"):
         learn(tmp_path / "scans", tmp_path / "mine", workers=0)
+    with pytest.raises(DatasetError, match=r"radius of 58.3 m if unit='m' is right"):
+        learn(tmp_path / "scans", tmp_path / "mine", unit="m", track=pytest.fail)
     (tmp_path / "scans/tile.ply").write_text("no mesh")
     with pytest.raises(UsageError, match="unit='foot'"):
         learn(tmp_path / "scans", tmp_path / "mine", workers=0)

@@ -13,7 +13,7 @@ from msgspec.structs import replace as replace_record
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from nextview.checks import check_extra, one_line
+from nextview.checks import check_extras, one_line
 from nextview.data.pool import GivenItem, Result, WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, in_lines, silently
@@ -52,7 +52,7 @@ from nextview.teaching.shown_views import (
     summary,
     to_be_shown,
 )
-from nextview.teaching.sizes import check_sizes, refuse_without_unit
+from nextview.teaching.sizes import check_sizes, check_unit, refuse_without_unit
 from nextview.teaching.symmetries import named_symmetries
 from nextview.teaching.thing_sources import (
     Found,
@@ -272,8 +272,8 @@ def learn_things(
         out: folder of the memory to write.
         add: add the things to those in OUT, which are not processed again; FOLDER contains only the
             new things.
-        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added, and this or
-            --symmetry is what changes.
+        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added: only
+            this and --symmetry change OUT.
         workers: number of processes; by default one for each core; 0 uses this process.
         scheduler: address of a dask.distributed scheduler to use instead, whose workers see the
             same files.
@@ -291,7 +291,7 @@ def learn_things(
     folder = Path(folder)
     out = Path(out)
     how.check()
-    check_extra("teach")
+    check_extras("teach")
     count_workers(workers)  # rejects an invalid number
     changes = bool(remove or how.symmetry)
     nothing_new = changes and folder.resolve() == out.resolve()
@@ -304,19 +304,22 @@ def learn_things(
     meshes = [one.path for one in found.things if not is_of_frames(one.path)]
     if meshes and how.unit is None:
         refuse_without_unit(meshes[0], how.up)
+    if not how.any_size:
+        check_unit(meshes, how.up, how.unit)
 
     with only_one(out), unfinished(out, PARTS) as part:
         # Read under the lock: another run may have changed it before.
         old = _before(out, keeps)
         taught = [] if old is None else _known(*old, remove)
-        _check_names(found.things, taught)
+        _check_names(found.things, taught, how.symmetry)
 
         work = Work(how, part, workers, scheduler, track)
-        track(
-            _teach(found.things, work, taught, left_out),
-            len(found.things),
-            "teaching things",
-        )
+        if found.things:
+            track(
+                _teach(found.things, work, taught, left_out),
+                len(found.things),
+                "teaching things",
+            )
         if not taught and nothing_new:
             raise UsageError(
                 f"{out}: no thing would be left; delete the folder instead"
@@ -359,11 +362,13 @@ def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
     return open_memory(out / CARD)
 
 
-def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
-    """Refuse things with the name of a known thing.
+def _check_names(
+    things: Sequence[ThingSource], taught: Sequence[Pair], symmetry: Sequence[str]
+) -> None:
+    """Refuse things with the name of a known thing, and symmetries of unknown things.
 
     Raises:
-        UsageError: a name is taken.
+        UsageError: a name is taken, or unknown.
     """
     names = {source.name for source, _ in taught}
     for thing in things:
@@ -371,6 +376,12 @@ def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
             raise UsageError(
                 f"{thing.path}: something called {thing.name} is known already;"
                 f" {option('remove')} it, or rename it"
+            )
+    names |= {thing.name for thing in things}
+    for name in named_symmetries(symmetry):
+        if name not in names:
+            raise UsageError(
+                f"{option('symmetry')}: nothing is called {one_line(name)}"
             )
 
 
@@ -406,18 +417,11 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 
 
 def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
-    """Replace detected symmetries by those of the user.
-
-    Raises:
-        UsageError: one names an unknown thing.
-    """
+    """Replace detected symmetries by those of the user."""
     known = {source.name: arrays for source, arrays in taught}
     for name, symmetries in named_symmetries(given).items():
-        if name not in known:
-            raise UsageError(
-                f"{option('symmetry')}: nothing is called {one_line(name)}"
-            )
-        known[name][SYMMETRIES] = rows_of(symmetries)
+        if name in known:  # and could be taught
+            known[name][SYMMETRIES] = rows_of(symmetries)
 
 
 def _teach(

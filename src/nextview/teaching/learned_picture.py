@@ -67,6 +67,7 @@ def draw_learned(
     _draw_things(page, pictures, shown)
     if accuracy:
         _draw_bars(figure, accuracy, height)
+    if accuracy and len(pictures) > 1:
         _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
     # imshow changes the limits
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")

@@ -17,6 +17,7 @@ ODD_SIZE = 300
 LARGEST_MEDIAN_RADIUS = 20.0
 SMALLEST_RADIUS = 0.001  # smallest one, metres: the resolution of depth cameras
 USUAL_RADII = (0.01, 3.0)  # range of usual radii, metres
+FIRST = 5  # mesh files whose sizes are checked before the others
 SIZE_ERROR = 0.05  # standard deviation of a measured log-radius
 
 
@@ -32,9 +33,12 @@ def refuse_without_unit(path: Path, up: str | None) -> None:
     """
     units = [option("unit", name) for name in UNITS]
     with suppress(MeshError):  # its unit is asked for first
-        units = _likely_units(load_mesh(path, up).radius) or units
+        mesh = load_mesh(path, up)
+        longest = float(np.ptp(mesh.vertices, axis=0).max())
+        units = _likely_units(mesh.radius, longest * mesh.radius) or units
     raise UsageError(
-        f"{path}: the unit of its lengths is missing; is it {', '.join(units)}?"
+        f"{path}: the unit of its lengths is missing; by its longest side, is it"
+        f" {', '.join(units)}?"
     )
 
 
@@ -65,6 +69,25 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
             raise DatasetError(f"{path}: is {how} than most others; {hint}")
 
 
+def check_unit(paths: Sequence[Path], up: str | None, unit: str | None) -> None:
+    """Refuse mesh files in another unit before they are taught, by the sizes of the first ones.
+
+    Args:
+        paths: paths of the mesh files.
+        up: up axis of the files, "y" or "z"; None for that of their format.
+        unit: unit of their lengths.
+
+    Raises:
+        DatasetError: see ``check_sizes``.
+    """
+    radii = {}
+    for path in paths[:FIRST]:
+        with suppress(MeshError):  # it is left out later
+            radii[path] = load_mesh(path, up, unit).radius
+    if radii:
+        check_sizes(list(radii), np.array([*radii.values()]), unit)
+
+
 def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> str:
     """A sentence about things of implausible size, with the unit that makes them usual."""
     middle = int(np.argmin(np.abs(radii - median)))
@@ -75,17 +98,17 @@ def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> 
         else f"{paths[middle]}: {size}, and half of the others are like it"
     )
 
-    likely = _likely_units(median / UNITS[unit])
+    likely = _likely_units(median / UNITS[unit], median / UNITS[unit])
     hint = f"is it {' or '.join(likely)}?" if likely else "is that right?"
     return f"{who}; {hint} {option('any_size', True)} accepts it"
 
 
-def _likely_units(radius: float) -> list[str]:
-    """The units in which a radius is usual, as options, each with the radius in it."""
+def _likely_units(radius: float, length: float) -> list[str]:
+    """The units in which a radius is usual, as options, each with a length in it."""
     found = []
     for unit, metres in UNITS.items():
         if USUAL_RADII[0] <= radius * metres <= USUAL_RADII[1]:
-            found.append(f"{option('unit', unit)} ({_length(radius * metres)})")
+            found.append(f"{option('unit', unit)} ({_length(length * metres)})")
     return found
 
 
