@@ -9,7 +9,7 @@ import pytest
 from factories import run_python
 from programs import COMMANDS, called, check_help, example_of, main
 
-from nextview.checks import extras
+from nextview.checks import check_extras, extras
 from nextview.cli.call_with_arguments import call, find
 from nextview.cli.commands import NEXTVIEW
 from nextview.errors import MissingExtraError
@@ -144,6 +144,15 @@ def test_an_unknown_module_is_not_reported_as_a_missing_extra():
     with pytest.raises(ModuleNotFoundError) as raised, extras():
         import no_such_package_at_all  # noqa: F401
     assert not isinstance(raised.value, MissingExtraError)
+
+
+def test_all_missing_extras_are_named_at_once(monkeypatch):
+    for package in ("viser", "websockets", "rerun"):
+        monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError) as raised:
+        check_extras("explore", "record")
+    assert "viser, websockets, rerun" in str(raised.value)
+    assert "nextview[explore,record]" in str(raised.value)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -5,10 +5,11 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import cache
+from importlib.util import find_spec
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -40,15 +41,19 @@ _NOT_PLUGINS = (
 )
 
 
-def needs_package(package: str, extra: str, project: str = "nextview") -> str:
-    """What to say of a missing package: the end of a sentence that begins with what needs it.
+def needs_packages(
+    packages: Sequence[str], wanted: Sequence[str], project: str = "nextview"
+) -> str:
+    """What to say of missing packages: the end of a sentence that begins with what needs them.
 
     Args:
-        package: as pip knows it.
-        extra: part of the installation that brings it.
-        project: whose part it is.
+        packages: as Python imports them.
+        wanted: extras that bring them.
+        project: whose extras they are.
     """
-    return f"needs the package {package}: pip install '{project}[{extra}]'"
+    noun = "package" if len(packages) == 1 else "packages"
+    names = ", ".join(packages)
+    return f"needs the {noun} {names}: pip install '{project}[{','.join(wanted)}]'"
 
 
 def missing_extra(
@@ -68,7 +73,14 @@ def missing_extra(
         (extra for extra, of_extra in packages.items() if package in of_extra),
         None,
     )
-    return None if extra is None else f"this {needs_package(package, extra, project)}"
+    if extra is None:
+        return None
+    missing = [one for one in packages[extra] if one == package or not _is_there(one)]
+    return f"this {needs_packages(missing, [extra], project)}"
+
+
+def _is_there(package: str) -> bool:
+    return find_spec(package) is not None
 
 
 @contextmanager
@@ -94,18 +106,22 @@ def extras(
         raise MissingExtraError(sentence) from error
 
 
-def check_extra(extra: str) -> None:
-    """Check that an optional part of the installation is there, before any work.
+def check_extras(*needed: str) -> None:
+    """Check that optional parts of the installation are there, before any work.
 
     Args:
-        extra: name of the part, one of EXTRAS.
+        needed: names of the parts, of EXTRAS.
 
     Raises:
-        MissingExtraError: it is not installed; the sentence says how to install it.
+        MissingExtraError: some are not installed; the sentence says how to install them all.
     """
-    for package in EXTRAS[extra]:
-        with extras():
-            importlib.import_module(package)
+    missing = {
+        extra: [one for one in EXTRAS[extra] if not _is_there(one)] for extra in needed
+    }
+    wanted = [extra for extra, packages in missing.items() if packages]
+    if wanted:
+        packages = [one for extra in wanted for one in missing[extra]]
+        raise MissingExtraError(f"this {needs_packages(packages, wanted)}")
 
 
 def one_line(text: str, most: int = 80) -> str:

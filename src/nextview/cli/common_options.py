@@ -2,12 +2,11 @@
 
 import os
 from dataclasses import dataclass, fields
-from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
 from nextview.captured.bag import At
-from nextview.checks import extras, one_line
+from nextview.checks import one_line
 from nextview.cli.progress import console
 from nextview.errors import UsageError
 from nextview.files import LONGEST_PATH, check_new
@@ -210,7 +209,6 @@ def check_file(
     path: Path | None,
     overwrite: bool,
     kinds: tuple[str, ...] = FIGURE_ENDINGS,
-    package: str = "",
 ) -> None:
     """Check the path of an output file before any work is done.
 
@@ -218,17 +216,12 @@ def check_file(
         path: of the file; None for no file.
         overwrite: whether an existing file may be replaced.
         kinds: allowed suffixes.
-        package: that is needed to write it, of an optional part of the installation.
 
     Raises:
         ResultsError: the file cannot be written.
-        MissingExtraError: the package is missing.
         UsageError: the suffix is not allowed.
     """
     if path is not None:
         check_new(path, overwrite)
         if path.suffix.lower() not in kinds:
             raise UsageError(f"{path}: the name ends in {' or '.join(kinds)}")
-        if package:
-            with extras():
-                import_module(package)

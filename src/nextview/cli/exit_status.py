@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import NoReturn, TextIO
 
-from nextview.checks import EXTRAS, missing_extra, needs_package
+from nextview.checks import EXTRAS, missing_extra, needs_packages
 from nextview.errors import NextviewError
 from nextview.errors import printable as on_one_line
 
@@ -110,7 +110,8 @@ def require(
     if not missing:
         return
 
-    print(f"{sys.argv[0]} {needs_package(missing[0], extra, project)}", file=sys.stderr)
+    said = needs_packages(missing, [extra], project)
+    print(f"{sys.argv[0]} {said}", file=sys.stderr)
     if not {"-h", "--help"} & set(sys.argv[1:]):
         sys.exit(2)
     from nextview.cli.stand_ins import import_stand_ins

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from nextview.checks import extras
+from nextview.checks import check_extras, number_of
 from nextview.cli.common_options import EpisodeOptions, Unit
 from nextview.cli.progress import console
 
@@ -47,7 +47,7 @@ def explore(
         port: port of the page; if it is taken, the next free one is used.
         browser: by default the page is opened in a browser.
     """
-    check_viser()
+    check_extras("explore")
     from nextview.viewers.exploration import Exploration, shown_objects
 
     options = dict(vars(looking))
@@ -59,16 +59,6 @@ def explore(
         port,
         browser,
     )
-
-
-def check_viser() -> None:
-    """Fail early, before models are loaded, if the package of the page is missing.
-
-    Raises:
-        MissingExtraError: it is.
-    """
-    with extras():
-        import viser  # noqa: F401
 
 
 def serve(exploration: "Exploration", host: str, port: int, browser: bool) -> None:
@@ -84,7 +74,8 @@ def serve(exploration: "Exploration", host: str, port: int, browser: bool) -> No
 
     page = Page(exploration, host, port)
     console.print(
-        f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it"
+        f"{page.address} shows {number_of(len(page.exploration.objects), 'object')};"
+        " Ctrl-C ends it"
     )
     if host not in ("127.0.0.1", "localhost", "::1"):
         console.print(

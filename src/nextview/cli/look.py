@@ -16,6 +16,7 @@ from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
 from nextview.captured.still_moments import still_moments
+from nextview.checks import check_extras
 from nextview.cli.common_options import Three, check_file, say_written
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
@@ -107,8 +108,12 @@ def look(
             a single depth image (.png) or cloud (.pcd).
     """
     check_file(output.figure, output.overwrite)
-    check_file(output.explorer, output.overwrite, (".html",), "viser")
-    check_file(output.record, output.overwrite, (".rrd",), "rerun")
+    check_file(output.explorer, output.overwrite, (".html",))
+    check_file(output.record, output.overwrite, (".rrd",))
+    check_extras(
+        *(["explore"] if output.explorer else []),
+        *(["record"] if output.record else []),
+    )
     if looking.frames < 1:
         raise UsageError(f"at least one frame is looked at, not {looking.frames}")
     read = read_capture(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nextview.checks import check_extras
 from nextview.cli.common_options import (
     EpisodeOptions,
     ObjectOptions,
@@ -70,7 +71,8 @@ def recognise(
         )
 
     check_file(output.figure, output.overwrite)
-    check_file(output.record, output.overwrite, (".rrd",), "rerun")
+    check_file(output.record, output.overwrite, (".rrd",))
+    check_extras(*(["record"] if output.record else []))
     system = load(**vars(looking))
 
     failed = []

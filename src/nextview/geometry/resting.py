@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy.spatial import QhullError, cKDTree
 from scipy.spatial.transform import Rotation
 
-from nextview.checks import check_extra
+from nextview.checks import check_extras
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import Directions
 from nextview.types import Float
@@ -102,7 +102,7 @@ def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses
 
-    check_extra("teach")  # networkx, which trimesh imports only when it is asked
+    check_extras("teach")  # networkx, which trimesh imports only when it is asked
 
     axes = np.linalg.eigh(np.cov(mesh.vertices.T))[1].T
     normal = axes[0]  # of the plane that is nearest to all vertices

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from nextview.checks import check_extras
 from nextview.cli.common_options import EpisodeOptions
-from nextview.cli.explore import check_viser, serve
+from nextview.cli.explore import serve
 
 
 def explore(
@@ -31,7 +32,7 @@ def explore(
         port: port of the page; if it is taken, the next free one is used.
         browser: by default the page is opened in a browser.
     """
-    check_viser()
+    check_extras("explore")
     from nextview.viewers.exploration import Exploration
     from nextview_lab.data.stored_views import objects_of
 
