@@ -11,6 +11,7 @@ pytest.importorskip("viser", reason="the extra 'explore' is not installed")
 from rerun.chunk import RrdReader
 
 import nextview
+from nextview.errors import ResultsError
 from nextview.viewers.page import serve
 from nextview.viewers.scene_page import draw_scene_in_3d
 from nextview.viewers.scene_recording import SceneRecorder, record_scene
@@ -92,6 +93,8 @@ def test_a_recording_has_things_and_cameras_where_they_are(made, camera):
 def test_a_finished_scene_can_be_recorded(made, tmp_path, camera):
     scene, before, _ = made
     record_scene(scene, tmp_path / "end.rrd")
+    with pytest.raises(ResultsError):
+        record_scene(scene, tmp_path / "end.rrd")
     rows = rows_of(tmp_path / "end.rrd")
     key = (f"world/objects/{before['mug']}", "Mesh3D:vertex_positions", 3)
     assert off(rows[key], camera, "mug") < 0.004

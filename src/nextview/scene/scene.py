@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import did_you_mean, one_line
+from nextview.checks import did_you_mean, number_of, one_line
 from nextview.cores import one_blas_thread
 from nextview.errors import ModelError, ObservationError, SessionError, UsageError
 from nextview.geometry.axes import upright_axes
@@ -204,6 +204,10 @@ class Scene:
         library = _library_of(self.system)
         self._widest = 2 * float(library.radii.max())
         self._state = SceneState(World(library), region)
+
+    def __repr__(self) -> str:
+        frames = number_of(len(self.frames), "frame")
+        return f"Scene({frames}, {number_of(len(self.objects), 'object')})"
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the lock, so that a scene can be copied and pickled."""

@@ -10,6 +10,7 @@ import numpy as np
 from nextview.checks import extras
 from nextview.errors import UsageError
 from nextview.figures.style import ACCENT, GREY, INK, rgb
+from nextview.files import new_file
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.viewers.scene_shapes import colour_of, named, placed_shape, seen_points
@@ -161,16 +162,22 @@ class SceneRecorder:
             self._stream.log("log", rr.TextLog(repr(thing), level=rr.TextLogLevel.INFO))
 
 
-def record_scene(scene: Scene, path: str | Path) -> None:
+def record_scene(scene: Scene, path: str | Path, overwrite: bool = False) -> None:
     """Write the current state of a scene as a recording for the Rerun viewer.
 
     Args:
         scene: with at least one frame.
-        path: of the file, .rrd; an existing file is replaced.
+        path: of the file, .rrd.
+        overwrite: whether to replace an existing file.
+
+    Raises:
+        UsageError: the file name has another suffix.
+        ResultsError: the file exists, or cannot be written.
     """
-    recorder = SceneRecorder(path)
-    recorder(scene)
-    recorder.close()
+    with new_file(Path(path), overwrite) as part:
+        recorder = SceneRecorder(part)
+        recorder(scene)
+        recorder.close()
 
 
 def scene_blueprint() -> rrb.Blueprint:
