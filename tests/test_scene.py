@@ -307,9 +307,7 @@ def test_the_command_says_once_what_remains_unexplained(tmp_path, capsys):
     rows, columns = np.mgrid[:480, :640]
     steps = 800 - 40 * ((rows // 12 + columns // 12) % 2)
     Image.fromarray(steps.astype(np.uint16)).save(tmp_path / "steps.png")
-    main(
-        f"look {tmp_path / 'steps.png'} --intrinsics 600 600 320 240 --depth-scale".split()
-        + ["0.001"]
-    )
+    options = "--intrinsics 600 600 320 240 --depth-scale 0.001"
+    main(f"look {tmp_path / 'steps.png'} {options}".split())
     said = capsys.readouterr()
     assert (said.out + said.err).count("is its unit right?") == 1

@@ -93,20 +93,30 @@ def refuse_many(capture: Capture, refused: Mapping[str, str], total: int) -> Non
     """
     if len(refused) == total or len(refused) > max(1, MOST_REFUSED * total):
         what = f"{len(refused)} of {total} frames cannot be used"
+        if total == 1:
+            what = "its only frame cannot be used"
         raise DatasetError(f"{capture.folder}: {what}: {summary(refused)}")
 
 
 def summary(refused: Mapping[str, str]) -> str:
     """Summarise the unusable frames and the most frequent reason in one phrase."""
-    reasons = list(refused.values())
+    reasons = [_without_file(*item) for item in refused.items()]
     commonest = max(reasons, key=reasons.count)
-    names = [name for name, reason in refused.items() if reason == commonest]
+    names = [
+        name for name, one in zip(refused, reasons, strict=True) if one == commonest
+    ]
     listed = ", ".join(names[:3])
     if len(names) > 3:
         listed += f" and {len(names) - 3} more"
     others = len(refused) - len(names)
     more = f"; {others} for other reasons" if others else ""
     return f"{listed}: {commonest}{more}"
+
+
+def _without_file(name: str, reason: str) -> str:
+    """Return a reason without the path of a frame's file, with which it may begin."""
+    path, _, rest = reason.partition(": ")
+    return rest if name in path and rest else reason
 
 
 def _evenly_spread(capture: Capture) -> list[int]:

@@ -148,7 +148,7 @@ def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
         reason = "threshold reached" if has_threshold else f"{result.stopping}"
     rest = f"{result.views[-1].belief.max():.3f}, {effort} ({reason})."
     return Text.assemble(
-        "It is a ",
+        "Answer: ",
         (printable(f"{result.answer}"), "bold"),
         ", belief ",
         rest,

@@ -138,7 +138,7 @@ def make_mesh(
         vertices = vertices[used]
     if not np.isfinite(vertices).all():
         raise MeshError(
-            f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite"
+            f"{name}: NaN or infinite vertices: {int((~np.isfinite(vertices)).any(1).sum())}"
         )
     low = vertices.min(0)
     high = vertices.max(0)

@@ -438,9 +438,7 @@ def find_models(models: str | Path) -> Collection:
                 f" {paths[1].name}"
             )
     if "recogniser" not in networks:
-        raise ModelError(
-            f"{folder}: holds no card of a recogniser; nextview learn makes one"
-        )
+        raise ModelError(f"{folder}: no memory here; nextview learn makes one")
 
     own = {kind: paths[0] for kind, paths in networks.items()}
     return _with_memory(Collection(own.pop("recogniser"), bundled | own, policies))

@@ -84,7 +84,8 @@ class KnownFrames:
             )
         if self.frames and (frame.pose is None or self.frames[0].pose is None):
             raise ObservationError(
-                "a second frame needs a pose, and the first one too: without poses they cannot be put together"
+                "a second frame needs a pose, and the first one too: without poses they cannot be"
+                " put together"
             )
 
     def stands(self, frame: Frame) -> bool:
