@@ -51,9 +51,10 @@ def needs_packages(
         wanted: extras that bring them.
         project: whose extras they are.
     """
-    noun = "package" if len(packages) == 1 else "packages"
-    names = ", ".join(packages)
-    return f"needs the {noun} {names}: pip install '{project}[{','.join(wanted)}]'"
+    return (
+        f"needs the package{'s' * (len(packages) > 1)} {', '.join(packages)}:"
+        f" pip install '{project}[{','.join(wanted)}]'"
+    )
 
 
 def missing_extra(
@@ -75,12 +76,8 @@ def missing_extra(
     )
     if extra is None:
         return None
-    missing = [one for one in packages[extra] if one == package or not _is_there(one)]
+    missing = [one for one in packages[extra] if one == package or not find_spec(one)]
     return f"this {needs_packages(missing, [extra], project)}"
-
-
-def _is_there(package: str) -> bool:
-    return find_spec(package) is not None
 
 
 @contextmanager
@@ -116,12 +113,14 @@ def check_extras(*needed: str) -> None:
         MissingExtraError: some are not installed; the sentence says how to install them all.
     """
     missing = {
-        extra: [one for one in EXTRAS[extra] if not _is_there(one)] for extra in needed
+        package: extra
+        for extra in needed
+        for package in EXTRAS[extra]
+        if find_spec(package) is None
     }
-    wanted = [extra for extra, packages in missing.items() if packages]
-    if wanted:
-        packages = [one for extra in wanted for one in missing[extra]]
-        raise MissingExtraError(f"this {needs_packages(packages, wanted)}")
+    if missing:
+        wanted = sorted({*missing.values()})
+        raise MissingExtraError(f"this {needs_packages([*missing], wanted)}")
 
 
 def one_line(text: str, most: int = 80) -> str:

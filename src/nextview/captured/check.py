@@ -1,5 +1,6 @@
 """Check captured frames: leave out unusable ones, and reject wrong poses."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -92,15 +93,19 @@ def refuse_many(capture: Capture, refused: Mapping[str, str], total: int) -> Non
         DatasetError: more than one frame and more than a tenth are unusable.
     """
     if len(refused) == total or len(refused) > max(1, MOST_REFUSED * total):
-        what = f"{len(refused)} of {total} frames cannot be used"
-        if total == 1:
-            what = "its only frame cannot be used"
-        raise DatasetError(f"{capture.folder}: {what}: {summary(refused)}")
+        what = "its only frame" if total == 1 else f"{len(refused)} of {total} frames"
+        raise DatasetError(
+            f"{capture.folder}: {what} cannot be used: {summary(refused)}"
+        )
 
 
 def summary(refused: Mapping[str, str]) -> str:
     """Summarise the unusable frames and the most frequent reason in one phrase."""
-    reasons = [_without_file(*item) for item in refused.items()]
+    # without the path of the frame's file, with which a reason may begin
+    reasons = [
+        re.sub(rf"^[^:]*{re.escape(name)}[^:]*: ", "", reason)
+        for name, reason in refused.items()
+    ]
     commonest = max(reasons, key=reasons.count)
     names = [
         name for name, one in zip(refused, reasons, strict=True) if one == commonest
@@ -111,12 +116,6 @@ def summary(refused: Mapping[str, str]) -> str:
     others = len(refused) - len(names)
     more = f"; {others} for other reasons" if others else ""
     return f"{listed}: {commonest}{more}"
-
-
-def _without_file(name: str, reason: str) -> str:
-    """Return a reason without the path of a frame's file, with which it may begin."""
-    path, _, rest = reason.partition(": ")
-    return rest if name in path and rest else reason
 
 
 def _evenly_spread(capture: Capture) -> list[int]:
@@ -202,9 +201,12 @@ def _contradicting(
     too_many = len(blamed) > (most - (late != 0).sum() if len(frames) >= 5 else 0)
     too_many |= max(_wrong(standing), across) > MUCH_CONTRADICTED
     if too_many or blamed:
-        single = _likeliest(
-            *_of_single_poses(posed, names, stored), stored.median_depth
-        )
+        of_single_poses = [
+            one.of_single_pose(row, name)
+            for row, name in enumerate(np.array(names)[evenly_spread(len(names), 20)])
+            for one in in_poses(stored.to_world)
+        ]
+        single = _likeliest(_some(posed), of_single_poses, stored.median_depth)
         if single and too_many:
             raise _disagree(capture, single.sentence, single.name)
         offset = "" if single else _find_offset(posed)
@@ -279,33 +281,9 @@ def _find_mistake(posed: PosedViews, stored: Stored) -> Mistake | None:
     return found and _likeliest(posed, [found], stored.median_depth)
 
 
-def _of_single_poses(
-    posed: PosedViews, names: Sequence[str], stored: Stored
-) -> tuple[PosedViews, list[Mistake]]:
-    """Return some of the frames, and each mistake of poses in each of these frames alone.
-
-    Args:
-        posed: frames and poses as read.
-        names: of the frames.
-        stored: storage conventions of the frames.
-    """
-    rows = _few_rows(posed)
-    single = [
-        one.of_single_pose(row, names[of_all])
-        for row, of_all in enumerate(rows)
-        for one in in_poses(stored.to_world)
-    ]
-    return _some(posed), single
-
-
-def _few_rows(posed: PosedViews) -> Index:
-    """Return rows of frames among which a search is fast."""
-    return evenly_spread(len(posed.views), 20)
-
-
 def _some(posed: PosedViews) -> PosedViews:
     """Return frames among which a search is fast."""
-    rows = _few_rows(posed)
+    rows = evenly_spread(len(posed.views), 20)
     return PosedViews([posed.views[row] for row in rows], posed.poses[rows])
 
 

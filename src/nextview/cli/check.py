@@ -14,8 +14,6 @@ from nextview.cli.common_options import check_file, check_there
 from nextview.cli.progress import console
 from nextview.sensing.known_frames import REPEATED, repeated
 
-FEW = 60  # frames among which repeated ones are sought
-
 
 def check(
     path: Path,
@@ -50,11 +48,11 @@ def check(
     read = read_capture(path, intrinsics, depth_scale=depth_scale)
     console.print(f"{read!r}", soft_wrap=True)
     capture, left_out = check_capture(read, masked=False)
-    few = [capture.frames[k] for k in evenly_spread(len(capture.frames), FEW)]
+    few = [capture.frames[k] for k in evenly_spread(len(capture.frames), 60)]
     frames = [captured.read(masked=False) for captured in few]
     again = [
-        few[k].name
-        for k in range(len(few))
+        captured.name
+        for k, captured in enumerate(few)
         if repeated(frames[k], frames[:k]) is not None
     ]
     if again:

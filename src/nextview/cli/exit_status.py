@@ -110,8 +110,7 @@ def require(
     if not missing:
         return
 
-    said = needs_packages(missing, [extra], project)
-    print(f"{sys.argv[0]} {said}", file=sys.stderr)
+    print(sys.argv[0], needs_packages(missing, [extra], project), file=sys.stderr)
     if not {"-h", "--help"} & set(sys.argv[1:]):
         sys.exit(2)
     from nextview.cli.stand_ins import import_stand_ins

@@ -76,7 +76,6 @@ NOT_WHERE_THEY_WERE = (
     "this frame does not fit the others and is left out: most objects are not where they"
     " were"
 )
-WRONG_POSE = "so its pose or that of an earlier frame is likely to be wrong"
 NOTHING_AGAIN = (
     "this frame shows neither the plane that things stand on nor any object where they were: its"
     " pose or that of an earlier frame is wrong, or the camera looks elsewhere"
@@ -206,8 +205,8 @@ class Scene:
         self._state = SceneState(World(library), region)
 
     def __repr__(self) -> str:
-        frames = number_of(len(self.frames), "frame")
-        return f"Scene({frames}, {number_of(len(self.objects), 'object')})"
+        counts = (len(self.frames), "frame"), (len(self.objects), "object")
+        return f"Scene({', '.join(number_of(*one) for one in counts)})"
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the lock, so that a scene can be copied and pickled."""
@@ -649,7 +648,8 @@ class Scene:
         for told in top.warnings:
             if told.name == "intrinsics":
                 return replace(told, message=f"{NOT_WHERE_THEY_WERE}: {told.message}")
-        return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {WRONG_POSE}")
+        why = "so its pose or that of an earlier frame is likely to be wrong"
+        return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {why}")
 
     def _ruled(self, state: SceneState) -> SceneState:
         """Return a scene without the names that the rule rules out."""

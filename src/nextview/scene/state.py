@@ -116,8 +116,8 @@ class SceneState:
         if remarks and not self.objects:
             depth = self.tops[-1].frame.depth
             middle = float(np.median(depth[depth > 0]))
-            what = f"no object is found, and the depth has a median of {middle:.2g} m"
-            remarks.append(ViewWarning("unit", f"{what}: is its unit right?", False))
+            what = f"no object is found, and the depth has a median of {middle:.2g} m:"
+            remarks.append(ViewWarning("unit", f"{what} is its unit right?", False))
         elif self.tops and not self.objects:
             remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)
         return tuple(remarks)

@@ -101,14 +101,15 @@ class Mistake:
             row: of the pose.
             frame: name of the frame.
         """
-
-        def right_poses(poses: Float) -> Float:
-            right = poses.copy()
-            right[row] = self.right_poses(poses[row : row + 1])[0]
-            return right
-
-        sentence = f"in frame {frame} alone, {self.sentence}"
-        return replace(self, sentence=sentence, right_poses=right_poses)
+        return replace(
+            self,
+            sentence=f"in frame {frame} alone, {self.sentence}",
+            right_poses=lambda poses: np.where(
+                np.arange(len(poses))[:, None, None] == row,
+                self.right_poses(poses),
+                poses,
+            ),
+        )
 
 
 def mistakes(stored: Stored) -> list[Mistake]:

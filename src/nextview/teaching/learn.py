@@ -304,8 +304,8 @@ def learn_things(
     meshes = [one.path for one in found.things if not is_of_frames(one.path)]
     if meshes and how.unit is None:
         refuse_without_unit(meshes[0], how.up)
-    if not how.any_size:
-        check_unit(meshes, how.up, how.unit)
+    if meshes and not how.any_size:
+        check_unit(meshes[:5], how.up, how.unit)
 
     with only_one(out), unfinished(out, PARTS) as part:
         # Read under the lock: another run may have changed it before.
@@ -314,12 +314,11 @@ def learn_things(
         _check_names(found.things, taught, how.symmetry)
 
         work = Work(how, part, workers, scheduler, track)
-        if found.things:
-            track(
-                _teach(found.things, work, taught, left_out),
-                len(found.things),
-                "teaching things",
-            )
+        (track if found.things else silently)(
+            _teach(found.things, work, taught, left_out),
+            len(found.things),
+            "teaching things",
+        )
         if not taught and nothing_new:
             raise UsageError(
                 f"{out}: no thing would be left; delete the folder instead"

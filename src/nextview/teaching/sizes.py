@@ -17,7 +17,6 @@ ODD_SIZE = 300
 LARGEST_MEDIAN_RADIUS = 20.0
 SMALLEST_RADIUS = 0.001  # smallest one, metres: the resolution of depth cameras
 USUAL_RADII = (0.01, 3.0)  # range of usual radii, metres
-FIRST = 5  # mesh files whose sizes are checked before the others
 SIZE_ERROR = 0.05  # standard deviation of a measured log-radius
 
 
@@ -34,8 +33,8 @@ def refuse_without_unit(path: Path, up: str | None) -> None:
     units = [option("unit", name) for name in UNITS]
     with suppress(MeshError):  # its unit is asked for first
         mesh = load_mesh(path, up)
-        longest = float(np.ptp(mesh.vertices, axis=0).max())
-        units = _likely_units(mesh.radius, longest * mesh.radius) or units
+        longest = mesh.radius * float(np.ptp(mesh.vertices, axis=0).max())
+        units = _likely_units(mesh.radius, longest) or units
     raise UsageError(
         f"{path}: the unit of its lengths is missing; by its longest side, is it"
         f" {', '.join(units)}?"
@@ -70,22 +69,19 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
 
 
 def check_unit(paths: Sequence[Path], up: str | None, unit: str | None) -> None:
-    """Refuse mesh files in another unit before they are taught, by the sizes of the first ones.
+    """Refuse mesh files in another unit before they are taught.
 
     Args:
-        paths: paths of the mesh files.
+        paths: paths of some mesh files.
         up: up axis of the files, "y" or "z"; None for that of their format.
         unit: unit of their lengths.
 
     Raises:
         DatasetError: see ``check_sizes``.
     """
-    radii = {}
-    for path in paths[:FIRST]:
-        with suppress(MeshError):  # it is left out later
-            radii[path] = load_mesh(path, up, unit).radius
-    if radii:
-        check_sizes(list(radii), np.array([*radii.values()]), unit)
+    with suppress(MeshError):  # it is left out later
+        radii = [load_mesh(path, up, unit).radius for path in paths]
+        check_sizes(paths, np.array(radii), unit)
 
 
 def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> str:
