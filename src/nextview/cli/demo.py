@@ -33,7 +33,7 @@ def demo(out: Path | None = None, overwrite: bool = False) -> None:
     Seven YCB objects and a toy that was not taught lie on a simulated table. A wrist camera
     captures three frames, with depth noise and pose errors. The command registers the 78 bundled
     YCB scans to the frames and prints names and poses, followed by the ground truth. The table was
-    not selected by the result, so some names may be wrong. It takes about 15 s of CPU time.
+    not selected by the result, so some names may be wrong. It takes about 9 s of CPU time.
 
     It writes table.png, table.html for the browser, and the folder recording, an example of the
     layout for your own frames: nextview look nextview_demo/recording gives the same table.
