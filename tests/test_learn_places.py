@@ -42,7 +42,7 @@ def place(tmp_path, looked_at):
         (tmp_path / folder).mkdir()
         for name in names:
             shutil.copy(SAMPLE_FILES / "chair.off", tmp_path / folder / f"{name}.off")
-    learn(tmp_path / "first", tmp_path / "mine", unit="m", workers=0)
+    learn(tmp_path / "first", tmp_path / "mine", unit="cm", workers=0)
     looked_at.clear()
     return tmp_path
 
@@ -65,13 +65,13 @@ def contents(folder):
 
 RUNS = {
     "add": lambda place: learn(
-        place / "more", place / "mine", unit="m", add=True, workers=0
+        place / "more", place / "mine", unit="cm", add=True, workers=0
     ),
     "remove": lambda place: learn(
         place / "mine", place / "mine", remove=("box",), workers=0
     ),
     "overwrite": lambda place: learn(
-        place / "more", place / "mine", unit="m", overwrite=True, workers=0
+        place / "more", place / "mine", unit="cm", overwrite=True, workers=0
     ),
 }
 AFTER = {"add": ["ball", "box", "cup"], "remove": ["ball"], "overwrite": ["cup"]}
@@ -126,7 +126,7 @@ def test_concurrent_runs_are_rejected_without_loss_of_data(place, monkeypatch):
     shutil.copytree(place / "more", place / "third")
     (place / "third/cup.off").rename(place / "third/jug.off")
     with only_one(place / "mine"), pytest.raises(DatasetError):
-        learn(place / "more", place / "mine", unit="m", add=True, workers=0)
+        learn(place / "more", place / "mine", unit="cm", add=True, workers=0)
 
     find = module.find_things
     waiting = [place / "third"]
@@ -134,11 +134,11 @@ def test_concurrent_runs_are_rejected_without_loss_of_data(place, monkeypatch):
     # while this run looks for its things, another one begins and ends
     def find_things(folder, out, one_class):
         if waiting:
-            learn(waiting.pop(), place / "mine", unit="m", add=True, workers=0)
+            learn(waiting.pop(), place / "mine", unit="cm", add=True, workers=0)
         return find(folder, out, one_class)
 
     monkeypatch.setattr(module, "find_things", find_things)
-    learn(place / "more", place / "mine", unit="m", add=True, workers=0)
+    learn(place / "more", place / "mine", unit="cm", add=True, workers=0)
     assert known(place / "mine") == ["ball", "box", "cup", "jug"]
 
 
@@ -175,7 +175,7 @@ def test_frames_that_were_changed_in_place_are_processed_again(
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learn(tmp_path / "scans", tmp_path / "mine", unit="m", workers=0, track=stop)
+        learn(tmp_path / "scans", tmp_path / "mine", unit="cm", workers=0, track=stop)
     assert sorted(looked_at) == ["box", "thing"]
     looked_at.clear()
     change, again = CHANGES[what]
@@ -186,6 +186,6 @@ def test_frames_that_were_changed_in_place_are_processed_again(
     change(folder)
     for path, time in times.items():  # as cp over what is there leaves it
         os.utime(path, ns=(time, time))
-    learn(tmp_path / "scans", tmp_path / "mine", unit="m", workers=0)
+    learn(tmp_path / "scans", tmp_path / "mine", unit="cm", workers=0)
     assert looked_at == ["thing"] * again
     assert {path.name for path in tmp_path.iterdir()} == {"scans", "disk", "mine"}
