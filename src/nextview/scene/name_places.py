@@ -72,11 +72,12 @@ def name_places(
             )
             cost += OUTSIDE * (1 - _overlap(box, (low, high)))
             if best is None or cost < best[0] - 1e-9:
-                best = cost, place, box
+                best = cost, place
 
         assert best is not None
-        taken.append(best[2])
-        found[row] = float(best[1][0]), float(best[1][1])
+        place = np.clip(best[1], low + half, high - half)
+        taken.append((place - half, place + half))
+        found[row] = float(place[0]), float(place[1])
     return [found[row] for row in range(len(objects))]
 
 
