@@ -203,10 +203,12 @@ def _contradicting(
     if too_many or blamed:
         of_single_poses = [
             one.of_single_pose(row, name)
-            for row, name in enumerate(np.array(names)[evenly_spread(len(names), 20)])
+            for row, name in enumerate(names)
             for one in in_poses(stored.to_world)
+            if len(names)
+            <= 20  # among more it takes long, and a single one is left out
         ]
-        single = _likeliest(_some(posed), of_single_poses, stored.median_depth)
+        single = _likeliest(posed, of_single_poses, stored.median_depth)
         if single and too_many:
             raise _disagree(capture, single.sentence, single.name)
         offset = "" if single else _find_offset(posed)
