@@ -32,7 +32,6 @@ from nextview.policies.gain import (
 )
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
-from nextview.recognition.map_names import in_order
 from nextview.session.episode import Episodes
 from nextview.teaching.thing_sources import find_things
 from nextview.types import Float, Index
@@ -46,9 +45,8 @@ from nextview_lab.benchmark.thing_episodes import (
 )
 from nextview_lab.benchmark.thing_runs import scan_of
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
-from nextview_lab.training.rollout import OBJECTIVES, value_of
+from nextview_lab.training.rollout import OBJECTIVES, check_inputs, value_of
 
 with extras():
     import gymnasium
@@ -288,18 +286,7 @@ class RecogniseEnv(ViewsEnv):
 
         p = p if split is None else p.of_split(split)
         p = p.deduplicate() if split == "train" else p
-        for name in given.maps:
-            if name not in p.maps:
-                known = ", ".join((*INPUTS, *in_order(p.maps)))
-                raise PredictionsError(
-                    f"these predictions hold no map {name!r}; inputs are some of {known}"
-                )
-        if p.azimuth_bins is None and (
-            "azimuth_bin" in given.inputs or given.frame == "object"
-        ):
-            raise PredictionsError(
-                "these predictions hold no azimuth bins, which the inputs or the frame need"
-            )
+        check_inputs(p, given.inputs, given.frame)
 
         super().__init__(p.sphere, given)
         self.predictions = replace(p, maps={name: p.maps[name] for name in given.maps})

@@ -28,6 +28,7 @@ from nextview_lab.benchmark.comparison import (
     Counted,
     corrected,
     measures_of,
+    tested_by,
 )
 from nextview_lab.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview_lab.benchmark.methods import check_said
@@ -309,9 +310,7 @@ def _compared(
             " favours it."
         )
     compared = reference or blind or scored[0].submission.method
-    tests = counted.tests(
-        ALL, drawn, compared, lambda key: key.measure == RIGHT and key.views > 1
-    )
+    tests = counted.tests(ALL, drawn, compared, tested_by((RIGHT,)))
     columns = [
         Column(f"right after {k + 1}", (RIGHT,), k + 1, short=f"right after {k + 1}")
         for k in range(views)

@@ -36,7 +36,7 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import MeshError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import pinhole
-from nextview.geometry.ray_caster import embree_scene
+from nextview.geometry.ray_caster import RayCaster, embree_scene
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float
 from nextview_lab.studies.shared import scans_in
@@ -234,9 +234,7 @@ def depth_pictures(mesh: trimesh.Trimesh, centre: Float, radius: float) -> Float
     Returns:
         Depth, (40, PICTURE_SIDE ** 2), metres; infinity beside the mesh.
     """
-    scene = embree_scene(
-        [(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))]
-    )
+    caster = RayCaster([(mesh.vertices, mesh.faces)])
     matrix = pinhole(PICTURE_SIDE, RADII_AWAY / 1.3)
     at = (np.arange(PICTURE_SIDE) + 0.5 - matrix[0, 2]) / matrix[0, 0] / 1.02
     x, y = np.meshgrid(at, at)
@@ -245,14 +243,7 @@ def depth_pictures(mesh: trimesh.Trimesh, centre: Float, radius: float) -> Float
     pictures = []
     for pose in VIEWPOINTS.poses:
         origin = centre + RADII_AWAY * radius * pose[:3, 3] / VIEWPOINTS.distance
-        directions = np.ascontiguousarray(rays @ pose[:3, :3].T, np.float32)
-        starts = np.ascontiguousarray(
-            np.broadcast_to(origin, directions.shape),
-            np.float32,
-        )
-
-        hits = scene.run(starts, directions, output=1)
-        pictures.append(np.where(hits["primID"] >= 0, hits["tfar"], np.inf))
+        pictures.append(caster.cast(origin, rays @ pose[:3, :3].T)[0])
     return np.stack(pictures)
 
 
