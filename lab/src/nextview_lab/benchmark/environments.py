@@ -46,7 +46,12 @@ from nextview_lab.benchmark.thing_episodes import (
 from nextview_lab.benchmark.thing_runs import scan_of
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.extras import extras
-from nextview_lab.training.rollout import OBJECTIVES, check_inputs, value_of
+from nextview_lab.training.rollout import (
+    OBJECTIVES,
+    check_inputs,
+    state_after,
+    value_of,
+)
 
 with extras():
     import gymnasium
@@ -342,26 +347,15 @@ class RecogniseEnv(ViewsEnv):
             self._asked.view = view
             episodes.keep_choice(episodes.next_choice())
         p = self.predictions
-        calibration = p.calibration
-        here = np.array([view])
-        step = episodes.update(p.evidence(self._objects, here))
-        n_seen = np.maximum(step.seen, 1)
+        step = episodes.update(p.evidence(self._objects, np.array([view])))
         visited = np.zeros((1, len(p.sphere)), bool)
         visited[0, self.views] = True
-        labels = p.labels[self._objects]
-        classes = len(p.classes)
-        state = EpisodeState(
-            here,
-            visited,
-            step.belief,
-            step.evidence,
-            len(self.views),
-            np.zeros(1, np.int64),
-            calibration.azimuth_bins(
-                step.total, n_seen, classes, p.sphere.azimuth[here]
-            ),
+        state = state_after(step, p, visited, len(self.views))
+
+        logs = p.calibration.log_belief(
+            step.total, np.maximum(step.seen, 1), len(p.classes)
         )
-        logs = calibration.log_belief(step.total, n_seen, classes)
+        labels = p.labels[self._objects]
         value = float(value_of(logs, labels, self.rules.objective)[0])
         inputs, frame = self.rules.inputs, self.rules.frame
         reached = cells_from(p.sphere)[origin(p.sphere, state, frame)][0]

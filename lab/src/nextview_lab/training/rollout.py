@@ -13,8 +13,8 @@ from nextview.policies.baselines import Random
 from nextview.policies.gain import INPUTS, VISIBILITY, CellFrame, Gain, maps_of
 from nextview.recognition.belief import PLAIN_SUM, FixedLength, of_true_class
 from nextview.recognition.map_names import in_order
-from nextview.session.episode import run_episodes
-from nextview.types import Float, Index
+from nextview.session.episode import Step, run_episodes
+from nextview.types import Float, Index, Mask
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
 from nextview_lab.training.card_fits import fit_temperature
@@ -137,27 +137,39 @@ def rollout(
     travel = np.zeros(len(data))
     for k, step in enumerate(run.steps, 1):
         visited[step.episodes, step.views] = True
-        azimuth = sphere.azimuth[step.views]
-        seen = np.maximum(step.seen, 1)
-        azimuth_bins = data.calibration.azimuth_bins(
-            step.total,
-            seen,
-            len(data.classes),
-            azimuth,
-        )
-        state = EpisodeState(
-            step.views,
-            visited.copy(),
-            step.belief,
-            step.evidence,
-            k,
-            step.episodes,
-            azimuth_bins,
-        )
+        state = state_after(step, data, visited.copy(), k)
         yield DecisionState(state, step.total, travel, step.seen)
 
         if k < len(run.steps):
             travel = travel + sphere.travel[step.views, step.next_views]
+
+
+def state_after(
+    step: Step, data: Predictions, visited: Mask, number: int
+) -> EpisodeState:
+    """Return the state of B episodes after a view.
+
+    Args:
+        step: the view.
+        data: of the objects.
+        visited: views so far, (B, V).
+        number: of views so far.
+    """
+    azimuth_bins = data.calibration.azimuth_bins(
+        step.total,
+        np.maximum(step.seen, 1),
+        len(data.classes),
+        data.sphere.azimuth[step.views],
+    )
+    return EpisodeState(
+        step.views,
+        visited,
+        step.belief,
+        step.evidence,
+        number,
+        step.episodes,
+        azimuth_bins,
+    )
 
 
 def value_after(
