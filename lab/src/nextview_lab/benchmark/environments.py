@@ -101,12 +101,8 @@ class Rules:
             raise UsageError(
                 f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
             )
-        for value, known in (
-            (self.frame, get_args(CellFrame)),
-            (self.objective, OBJECTIVES),
-        ):
-            if value not in known:
-                raise UsageError(f"{value!r} is none of {', '.join(known)}")
+        one_of(self.frame, get_args(CellFrame), "the frame")
+        one_of(self.objective, OBJECTIVES, "the objective")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
         # raises an error for an invalid threshold

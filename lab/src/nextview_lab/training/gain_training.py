@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, collected, silently
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.policies.base import Policy
@@ -419,16 +419,10 @@ def train_gain(
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
     learned, validated, about, rng = _load(predictions, sensed, recipe, folds)
-    best: list[Best] = []
+    trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
+    epochs = best_epoch(trainings, validated, recipe)
+    policies, value = collected(epochs, recipe.epochs, "training", track)[-1]
 
-    def epochs() -> Iterator[int]:
-        trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
-        for policies in best_epoch(trainings, validated, recipe):
-            best.append(policies)
-            yield len(best)
-
-    track(epochs(), recipe.epochs, "training")
-    policies, value = best[-1]
     # the lowest weight at which the policy travels no farther than a random walk in the window
     judged = list(zip(validated, policies, strict=True))
     travel_weight = fit_travel_weight(

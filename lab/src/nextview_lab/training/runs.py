@@ -503,8 +503,12 @@ def load_run(network: N, run: Path) -> N:
         ModelError: the parameters are of another network.
     """
     path = run / "network.pt"
-    fault = f"{path}: not the weights of the network that {run}/run.json describes"
-    _load_state(network, _read_state(path), fault)
+    try:
+        network.load_state_dict(_read_state(path))
+    except RuntimeError:  # names what is missing, unknown or of another shape
+        raise ModelError(
+            f"{path}: not the weights of the network that {run}/run.json describes"
+        ) from None
     return network.eval()
 
 
@@ -584,23 +588,21 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         share[turn % colours, turn % channels] = 1
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
+    wanted, given = (
+        {name: tuple(value.shape) for name, value in values.items()}.items()
+        for values in (own, state)
+    )
+    if wanted != given:
+        raise ModelError(
+            f"{path}: not the weights of this {network.name} ({min(wanted ^ given)[0]} is missing,"
+            " unknown or of another shape)"
+        )
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise ModelError(
                 f"{path}: {name} holds numbers that are not finite; download the checkpoint again"
             )
-    _load_state(network, state, f"{path}: not the weights of this {network.name}")
-
-
-def _load_state(network: nn.Module, state: dict[str, Tensor], fault: str) -> None:
-    """Load parameters into a network; ModelError if they are of another one."""
-    try:
-        network.load_state_dict(state)
-    except (
-        RuntimeError
-    ) as error:  # a line for what is missing, unknown, or of another shape
-        _, first, *_ = str(error).splitlines()
-        raise ModelError(f"{fault} ({first.strip().rstrip('. ')})") from None
+    network.load_state_dict(state)
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
