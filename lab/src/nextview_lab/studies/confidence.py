@@ -29,7 +29,8 @@ from nextview_lab.benchmark.statistics import wilson
 BELIEFS = (0.5, 0.8, 0.95, 0.97, 1.01)  # a confident name has at least the last but one
 MARKERS = "os^D"
 ASIDE = 0.11  # between two series
-RIGHT, NAMED = "names that are right", "strangers with such a name"
+RIGHT = "names that are right"
+NAMED = "strangers with such a name"
 
 
 def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
@@ -51,7 +52,8 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
     }
 
     for low, high in pairwise(BELIEFS):
-        right, named = [], set()
+        right = []
+        named = set()
         for row in rows:
             if row["named"] == "True" and low <= float(row["belief"]) < high:
                 thing = row["folder"], row["frame"], row["number"]
@@ -79,6 +81,7 @@ def main(tables: tyro.conf.Positional[tuple[Path, ...]], figure: Path) -> None:
 
         share = [counts[k][0] / counts[k][1] for k in known]
         ends = [wilson(*counts[k]) for k in known]
+
         axes.errorbar(
             [k + ASIDE * (number - (len(series) - 1) / 2) for k in known],
             share,

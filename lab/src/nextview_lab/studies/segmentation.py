@@ -120,6 +120,7 @@ class Counts:
         np.add.at(both, (truth.ravel(), found.ravel()), 1)
         numbers = np.flatnonzero(both[1:].sum(1) >= LEAST_PIXELS) + 1
         segments = np.flatnonzero(both[:, 1:].sum(0) >= LEAST_PIXELS / 2) + 1
+
         shared = both[np.ix_(numbers, segments)]
         size = both[numbers].sum(1)
         overlap = shared / (size[:, None] + both[:, segments].sum(0) - shared)

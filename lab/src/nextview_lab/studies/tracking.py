@@ -357,6 +357,7 @@ def follow(
 
         mine = next(each for each in every if each.number == one.number)
         off = errors(mine.pose, trajectory.poses[number], thing.vertices, axis)
+
         still = [
             errors(each.pose, other.pose, other.vertices, None)[0]
             for each in every
