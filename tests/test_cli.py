@@ -1,5 +1,6 @@
 """The command line: its table of commands, how they end, and what they show."""
 
+import re
 import subprocess
 import sys
 from functools import wraps
@@ -7,13 +8,15 @@ from pathlib import Path
 
 import pytest
 from factories import run_python
-from programs import COMMANDS, called, check_help, example_of, main
+from programs import COMMANDS, UNTIDY, called, example_of, help_of, main
 
 from nextview.checks import check_extras, extras
-from nextview.cli.call_with_arguments import call, find
+from nextview.cli.call_with_arguments import call, entry, find
 from nextview.cli.commands import NEXTVIEW
+from nextview.cli.option_names import option_names
 from nextview.errors import MissingExtraError
 
+WITHOUT_ARGUMENTS = ("nextview demo", "nextview demo-episode", "nextview explore")
 COMMAND = [sys.executable, "-m", "nextview"]
 
 
@@ -26,7 +29,14 @@ def ended(capsys, *arguments):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_explains_itself(name, capsys):
-    check_help(name, COMMANDS[name], called, capsys)
+    shown, explained = help_of(name, called, capsys)
+    assert shown.startswith(f"usage: {name} ")
+    assert "(required)" in shown or name in WITHOUT_ARGUMENTS
+    assert explained.keys() == option_names(entry(COMMANDS[name])[0])
+    for option, text in explained.items():
+        assert re.match(r"[^-(]", text), f"{option} has no explanation"
+    assert not re.search(UNTIDY, shown)
+    assert shown.splitlines()[-1] == f"example: {example_of(name, COMMANDS[name])}"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -93,6 +93,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview(-lab)? explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
     ),
+    r"\bimport robot\b": "needs a robot; tests/test_grasps.py runs the loop with a stand-in",
     r"pyrealsense2": (
         "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
     ),

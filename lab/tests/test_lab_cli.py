@@ -1,5 +1,6 @@
 """The command line: its table of commands, how they end, and what they show."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -9,10 +10,11 @@ from dataclasses import replace
 import pytest
 from factories import run_python
 from lab_programs import COMMANDS, called, main
-from programs import check_help
+from programs import UNTIDY, example_of, help_of
 
 from nextview.checks import EXTRAS
-from nextview.cli.call_with_arguments import find
+from nextview.cli.call_with_arguments import entry, find
+from nextview.cli.option_names import option_names
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import EXTRAS as EXTRAS_OF_LAB
 
@@ -23,7 +25,14 @@ LAB_COMMAND = [sys.executable, "-m", "nextview_lab"]
 @pytest.mark.parametrize("name", OF_LAB)
 def test_every_command_explains_itself(name, capsys):
     pytest.importorskip("torch")
-    check_help(name, COMMANDS[name], called, capsys)
+    shown, explained = help_of(name, called, capsys)
+    assert shown.startswith(f"usage: {name} ")
+    assert "(required)" in shown
+    assert explained.keys() == option_names(entry(COMMANDS[name])[0])
+    for option, text in explained.items():
+        assert re.match(r"[^-(]", text), f"{option} has no explanation"
+    assert not re.search(UNTIDY, shown)
+    assert shown.splitlines()[-1] == f"example: {example_of(name, COMMANDS[name])}"
 
 
 @pytest.mark.parametrize("preset", [None, "thesis"])

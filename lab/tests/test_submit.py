@@ -152,6 +152,14 @@ def test_a_process_that_breaks_the_protocol_is_noticed(archive, tmp_path, code, 
     assert "\n" not in str(raised.value)
 
 
+def test_a_method_that_does_not_answer_is_ended(archive, tmp_path, monkeypatch):
+    monkeypatch.setattr("nextview_lab.benchmark.methods.ANSWER_LIMIT", 0.5)
+    command = as_command(tmp_path, "import time\ntime.sleep(60)")
+    how = SubmitOptions(command=command, name="sleeper", version="1")
+    with pytest.raises(ResultsError, match=r"sleeper has not answered within 0\.5 s"):
+        submit(archive, tmp_path / "out.json", how)
+
+
 def test_a_changed_image_is_found(own, tmp_path, capsys):
     path = own / "episodes/0000/000.png"
     with Image.open(path) as image:

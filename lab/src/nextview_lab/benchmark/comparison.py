@@ -218,6 +218,15 @@ def tests_of(name: str, reference: str, rows: Sequence[tuple]) -> "pd.DataFrame"
     return pd.DataFrame(given, columns=TEST_COLUMNS).astype({"threshold": "float64"})
 
 
+def tested_by(measures: Sequence[str]) -> Callable[[Key], bool]:
+    """Select measures to compare with the reference; the first view of all policies is the same.
+
+    Args:
+        measures: their names.
+    """
+    return lambda key: key.measure in measures and key.views != 1
+
+
 def corrected(
     tests: Sequence["pd.DataFrame"],
     bound: Callable[[str], bool] | None = None,

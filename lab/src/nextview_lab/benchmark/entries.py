@@ -4,7 +4,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_softmax
 
 from nextview.checks import did_you_mean
 from nextview.errors import OtherUseError
@@ -291,11 +290,7 @@ def fixed_views(
     if kind in ("high-entropy", "low-entropy"):
         values = p.depth_entropy.astype(np.float64)
     else:
-        values = log_softmax(p.logits.astype(np.float64), axis=2)[
-            np.arange(len(p)),
-            :,
-            p.labels,
-        ]
+        values = p.log_truth
     return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]
 
 

@@ -32,7 +32,6 @@ from nextview.policies.gain import (
 )
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
-from nextview.recognition.map_names import in_order
 from nextview.session.episode import Episodes
 from nextview.teaching.thing_sources import find_things
 from nextview.types import Float, Index
@@ -46,9 +45,13 @@ from nextview_lab.benchmark.thing_episodes import (
 )
 from nextview_lab.benchmark.thing_runs import scan_of
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
-from nextview_lab.training.rollout import OBJECTIVES, value_of
+from nextview_lab.training.rollout import (
+    OBJECTIVES,
+    check_inputs,
+    state_after,
+    value_of,
+)
 
 with extras():
     import gymnasium
@@ -98,12 +101,8 @@ class Rules:
             raise UsageError(
                 f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
             )
-        for value, known in (
-            (self.frame, get_args(CellFrame)),
-            (self.objective, OBJECTIVES),
-        ):
-            if value not in known:
-                raise UsageError(f"{value!r} is none of {', '.join(known)}")
+        one_of(self.frame, get_args(CellFrame), "the frame")
+        one_of(self.objective, OBJECTIVES, "the objective")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
         # raises an error for an invalid threshold
@@ -288,18 +287,7 @@ class RecogniseEnv(ViewsEnv):
 
         p = p if split is None else p.of_split(split)
         p = p.deduplicate() if split == "train" else p
-        for name in given.maps:
-            if name not in p.maps:
-                known = ", ".join((*INPUTS, *in_order(p.maps)))
-                raise PredictionsError(
-                    f"these predictions hold no map {name!r}; inputs are some of {known}"
-                )
-        if p.azimuth_bins is None and (
-            "azimuth_bin" in given.inputs or given.frame == "object"
-        ):
-            raise PredictionsError(
-                "these predictions hold no azimuth bins, which the inputs or the frame need"
-            )
+        check_inputs(p, given.inputs, given.frame)
 
         super().__init__(p.sphere, given)
         self.predictions = replace(p, maps={name: p.maps[name] for name in given.maps})
@@ -355,26 +343,15 @@ class RecogniseEnv(ViewsEnv):
             self._asked.view = view
             episodes.keep_choice(episodes.next_choice())
         p = self.predictions
-        calibration = p.calibration
-        here = np.array([view])
-        step = episodes.update(p.evidence(self._objects, here))
-        n_seen = np.maximum(step.seen, 1)
+        step = episodes.update(p.evidence(self._objects, np.array([view])))
         visited = np.zeros((1, len(p.sphere)), bool)
         visited[0, self.views] = True
-        labels = p.labels[self._objects]
-        classes = len(p.classes)
-        state = EpisodeState(
-            here,
-            visited,
-            step.belief,
-            step.evidence,
-            len(self.views),
-            np.zeros(1, np.int64),
-            calibration.azimuth_bins(
-                step.total, n_seen, classes, p.sphere.azimuth[here]
-            ),
+        state = state_after(step, p, visited, len(self.views))
+
+        logs = p.calibration.log_belief(
+            step.total, np.maximum(step.seen, 1), len(p.classes)
         )
-        logs = calibration.log_belief(step.total, n_seen, classes)
+        labels = p.labels[self._objects]
         value = float(value_of(logs, labels, self.rules.objective)[0])
         inputs, frame = self.rules.inputs, self.rules.frame
         reached = cells_from(p.sphere)[origin(p.sphere, state, frame)][0]

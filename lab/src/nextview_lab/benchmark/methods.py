@@ -7,6 +7,7 @@ the same as one line of JSON on its standard input, and answers with one on its 
 import select
 import shlex
 import subprocess
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -35,6 +36,7 @@ from nextview_lab.benchmark.frozen import FrozenView, Matrix, as_matrix, read_vi
 from nextview_lab.benchmark.thing_policies import BLIND_RULES, rules_of
 
 LONGEST_LINE = 1 << 20  # bytes
+ANSWER_LIMIT = 600.0  # seconds that a process has for an answer
 ENDING = 5.0  # seconds that a process has to end when its input does
 ONE_LINE = (
     "standard output is for one line a view, and all else belongs to standard error"
@@ -306,8 +308,8 @@ class CommandMethod:
             look: the view.
 
         Raises:
-            ResultsError: the process had written something before, has ended, or what it says is
-                no answer.
+            ResultsError: the process had written something before, has ended, takes longer than
+                ``ANSWER_LIMIT``, or what it says is no answer.
         """
         where = f"{self._command}, episode {look.episode}, view {look.step}"
         output = cast(IO[bytes], self._process.stdout)
@@ -316,7 +318,7 @@ class CommandMethod:
         with suppress(BrokenPipeError):  # then its output has ended, too
             line = msgspec.json.encode(look) + b"\n"
             cast(IO[bytes], self._process.stdin).write(line)
-        said = output.readline(LONGEST_LINE)
+        said = self._line(where)
         if not said:
             raise ResultsError(f"{where}: the process has ended, or closed its output")
         return decode_record(
@@ -327,6 +329,23 @@ class CommandMethod:
             ResultsError,
         )
 
+    def _line(self, where: str) -> bytes:
+        """The next line of the output; ResultsError if it is not there in time."""
+        output = cast(IO[bytes], self._process.stdout)
+        until = time.monotonic() + ANSWER_LIMIT
+        line = b""
+        while not line.endswith(b"\n") and len(line) < LONGEST_LINE:
+            left = max(until - time.monotonic(), 0)
+            if not select.select([output], [], [], left)[0]:
+                raise ResultsError(
+                    f"{where}: {self.name} has not answered within {ANSWER_LIMIT:g} s"
+                )
+            letter = output.read(1)
+            if not letter:
+                break
+            line += letter
+        return line
+
     def finish(self) -> None:
         """See that it has said nothing but its answers, and end it; ResultsError if it has."""
         self._refuse_unasked(self.close())
@@ -335,11 +354,12 @@ class CommandMethod:
         """End the input of the process, and after 5 s the process; what it wrote unasked."""
         if self._process.returncode is not None:
             return b""
-        try:
-            return self._process.communicate(timeout=ENDING)[0]
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.communicate()[0]
+        with self._process:
+            try:
+                return self._process.communicate(timeout=ENDING)[0]
+            except subprocess.TimeoutExpired as late:
+                self._process.kill()  # what it has started may keep the output open
+                return late.output or b""
 
     def _refuse_unasked(self, said: bytes) -> None:
         if said:

@@ -5,7 +5,7 @@ and without marks of HTML.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from nextview.checks import number_of, one_line, whole
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, collected, silently
 from nextview.errors import ResultsError, UsageError
 from nextview.files import check_new, command, read_record
 from nextview.geometry.mesh import load_mesh
@@ -28,6 +28,7 @@ from nextview_lab.benchmark.comparison import (
     Counted,
     corrected,
     measures_of,
+    tested_by,
 )
 from nextview_lab.benchmark.frozen import EpisodeTruth, FrozenArchive
 from nextview_lab.benchmark.methods import check_said
@@ -138,14 +139,8 @@ def leaderboard_of(
 
     truths = frozen.truths()
     clouds: dict[str, Float] = {}
-    scored: list[Scored] = []
-
-    def score() -> Iterator[int]:
-        for one in read:
-            scored.append(_scored(one, frozen, truths, clouds))
-            yield len(scored)
-
-    track(score(), len(read), "methods")
+    comparing = (_scored(one, frozen, truths, clouds) for one in read)
+    scored = collected(comparing, len(read), "methods", track)
     scored.sort(key=lambda one: (-one.right[:, -1].mean(), one.submission.method))
 
     tables = _compared(
@@ -309,9 +304,7 @@ def _compared(
             " favours it."
         )
     compared = reference or blind or scored[0].submission.method
-    tests = counted.tests(
-        ALL, drawn, compared, lambda key: key.measure == RIGHT and key.views > 1
-    )
+    tests = counted.tests(ALL, drawn, compared, tested_by((RIGHT,)))
     columns = [
         Column(f"right after {k + 1}", (RIGHT,), k + 1, short=f"right after {k + 1}")
         for k in range(views)

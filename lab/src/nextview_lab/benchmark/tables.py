@@ -32,7 +32,7 @@ from nextview.session.system import System, load
 from nextview.simulation.sensor import SENSORS
 from nextview.things.memory import open_memory
 from nextview.types import Float, Index
-from nextview_lab.benchmark.comparison import ALL, ONE, Counted, Key, corrected
+from nextview_lab.benchmark.comparison import ALL, ONE, Counted, corrected, tested_by
 from nextview_lab.benchmark.jobs import Job, Settings, check_place, check_same, run_jobs
 from nextview_lab.benchmark.results import ComparedTables, write_compared
 from nextview_lab.benchmark.statistics import resample
@@ -378,6 +378,7 @@ AFTER = {name: (top, bottom) for name, (top, bottom, _) in SHARES.items()}
 AFTER["CPU, s"] = ("seconds", ONE)
 COUNTS = tuple(dict.fromkeys(column for pair in AFTER.values() for column in pair))
 ENDS = {"frames until done": ("done", ONE)}
+TESTED = ("recall", "frames until done")
 
 
 def benchmark_tables(
@@ -393,9 +394,8 @@ def benchmark_tables(
     Each table has 6 to 10 objects at true size in resting poses; one of them is a stranger. The
     results give, after each number of frames: the share of the things that was found and named
     correctly (recall); the share of the names that is correct (precision; a name of the stranger or
-    of a fragment is wrong); the same for confident names; the share of correctly named things with
-    a good pose (ADD-S below a tenth of the diameter), in the world and in the frame of the last
-    camera; and the share of strangers called unknown. An interrupted run resumes.
+    of a fragment is wrong); the same for confident names; and the share of strangers called
+    unknown. An interrupted run resumes.
 
     All policies choose among the same candidate views, all around the scene at the distance of the
     last camera.
@@ -484,7 +484,7 @@ def summarise_tables(
     weights = resample(
         len(runs), settings.samples, np.random.default_rng(settings.seed)
     )
-    tests = counted.tests(ALL, weights, settings.reference, _is_compared)
+    tests = counted.tests(ALL, weights, settings.reference, tested_by(TESTED))
     things = sum(each.runs[policies[0]].counts[0]["things"] for each in runs)
     about = f"{len(runs)} tables, {things:g} known things"
     return ComparedTables(
@@ -497,13 +497,6 @@ def summarise_tables(
         ),
         "",
     )
-
-
-def _is_compared(key: Key) -> bool:
-    """Return True if a measure is compared with the reference; the first view is the same."""
-    if key.measure == "recall":
-        return key.views > 1
-    return key.measure == "frames until done"
 
 
 def _columns(k: int) -> tuple[Column, ...]:

@@ -13,7 +13,7 @@ from zlib import crc32
 import msgspec
 import numpy as np
 
-from nextview.checks import number, whole
+from nextview.checks import number, one_of, whole
 from nextview.errors import DatasetError, PolicyError, UsageError
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
@@ -173,8 +173,7 @@ class ThingSettings(Settings):
 
         if number(self.threshold, "the threshold", 0) >= 1:
             raise UsageError(f"a threshold is below 1, not {self.threshold}")
-        if self.unit not in UNITS:
-            raise UsageError(f"the unit is {', '.join(UNITS)}, not {self.unit}")
+        one_of(self.unit, UNITS, "the unit")
 
         if self.reference == BEST_BLIND and self.choose_seed == self.seed:
             raise UsageError(

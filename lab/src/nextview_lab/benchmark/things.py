@@ -20,9 +20,9 @@ from nextview_lab.benchmark.comparison import (
     ALL,
     ONE,
     Counted,
-    Key,
     corrected,
     measures_of,
+    tested_by,
 )
 from nextview_lab.benchmark.jobs import check_place, check_same, run_jobs
 from nextview_lab.benchmark.results import ComparedTables, write_compared
@@ -59,6 +59,7 @@ ENDS = {
     "confident": ("confident", ONE),
     "wrong, of the confident": ("wrong", "confident"),
 }
+TESTED = ("accuracy", "views until confident")
 
 
 def _episodes(runs: Sequence[EpisodeRuns], threshold: float) -> "pd.DataFrame":
@@ -135,7 +136,7 @@ def summarise_things(
     kept = episodes[episodes["views"].isin([0, *how.views])]
     counted = Counted.of(kept, AFTER, ENDS, family)
     found = [counted.measures(ALL, weights), _poses(kept), _times(episodes)]
-    tests = counted.tests(ALL, weights, how.reference, _is_tested)
+    tests = counted.tests(ALL, weights, how.reference, tested_by(TESTED))
     known = how.reference in CEILINGS
     return ComparedTables(
         _by_policy(pd.concat(found, ignore_index=True), policies),
@@ -222,13 +223,6 @@ def _poses(episodes: "pd.DataFrame") -> "pd.DataFrame":
             for which, value in zip(QUANTILES, values, strict=True)
         ]
     return measures_of(ALL, rows)
-
-
-def _is_tested(key: Key) -> bool:
-    """Return True if a measure is compared with the reference; the first view is the same."""
-    if key.measure == "accuracy":
-        return key.views > 1
-    return key.measure == "views until confident"
 
 
 CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is selected

@@ -11,7 +11,7 @@ import numpy as np
 
 from nextview.data.pool import counted
 from nextview.errors import DAMAGED
-from nextview.files import check_new, command, unfinished
+from nextview.files import check_new, command, new_file, unfinished
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED_MODELS, ModelCard
@@ -96,11 +96,11 @@ def predict(
             for item in zip(objects.tolist(), files, strict=True)
             if not item[1].exists()
         ]
-        networks = tuple((name, _card_file(card)) for name, card in maps.items())
-        work = partial(
-            _predict_object,
-            (store.path.absolute(), _card_file(recogniser), networks),
+        networks = tuple(
+            (name, card.card_path.absolute()) for name, card in maps.items()
         )
+        opened = store.path.absolute(), recogniser.card_path.absolute(), networks
+        work = partial(_predict_object, opened)
         yield from counted(
             work,
             items,
@@ -175,10 +175,6 @@ def _plan(
     )
 
 
-def _card_file(card: ModelCard) -> Path:
-    return card.card_path.absolute()
-
-
 @lru_cache(maxsize=1)
 def _open(
     store: Path,
@@ -229,10 +225,8 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     for name in {"azimuth_bins", "logits"} & found.keys():
         found[name][nothing] = 0
 
-    # written completely or not at all
-    aside = file.with_name(f"{i}.part.npz")
-    np.savez(aside, **found)
-    aside.replace(file)
+    with new_file(file) as part:
+        np.savez(part, **found)
 
 
 def _together(files: Sequence[Path]) -> dict[str, Float32]:

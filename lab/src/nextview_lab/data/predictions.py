@@ -17,7 +17,12 @@ from nextview.files import decode_record, new_file, regular_file
 from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
-from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
+from nextview.recognition.belief import (
+    PLAIN_SUM,
+    Calibration,
+    log_evidence_of,
+    of_true_class,
+)
 from nextview.types import Float, Float32, Index, Mask
 from nextview_lab.data.splits import deduplicated, duplicate_groups, some_objects
 from nextview_lab.data.store import ViewStore
@@ -174,6 +179,11 @@ class Predictions:
         """Weights of the objects, (N,), with sum N; all occurring classes have the same weight."""
         count = np.bincount(self.labels, minlength=len(self.classes))
         return len(self) / ((count > 0).sum() * count[self.labels])
+
+    @property
+    def log_truth(self) -> Float:
+        """Log-probability of the true class in each view alone, (N, V)."""
+        return of_true_class(self.logits.astype(np.float64), self.labels)
 
     def evidence(self, objects: Index, views: Index) -> Evidence:
         """Return the outputs of the models for single views.

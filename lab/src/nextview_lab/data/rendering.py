@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.checks import number, whole
+from nextview.checks import number, one_of, whole
 from nextview.data.folders import Entry, Listing, scan_dataset, select
 from nextview.data.pool import WorkerDied, count, each
 from nextview.errors import DatasetError, MeshError, UsageError, option
@@ -252,8 +252,7 @@ def _check(
     whole(options.seed, "the seed", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
 
-    if options.unit not in (None, *UNITS):
-        raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
+    one_of(options.unit, (None, *UNITS), "the unit")
 
     if sphere.distance + 1 > FARTHEST_STORED:
         raise DatasetError(

@@ -29,7 +29,8 @@ from nextview_lab.benchmark.statistics import wilson
 BELIEFS = (0.5, 0.8, 0.95, 0.97, 1.01)  # a confident name has at least the last but one
 MARKERS = "os^D"
 ASIDE = 0.11  # between two series
-RIGHT, NAMED = "names that are right", "strangers with such a name"
+RIGHT = "names that are right"
+NAMED = "strangers with such a name"
 
 
 def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
@@ -37,6 +38,9 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
 
     Args:
         path: a table of ``nextview-lab real``.
+
+    Returns:
+        For ``RIGHT`` and ``NAMED``, in the order of the ranges, how many and of how many.
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -46,8 +50,10 @@ def shares(path: Path) -> dict[str, list[tuple[int, int]]]:
         for row in rows
         if row["taught"] == "False" and row["number"] != "0"
     }
+
     for low, high in pairwise(BELIEFS):
-        right, named = [], set()
+        right = []
+        named = set()
         for row in rows:
             if row["named"] == "True" and low <= float(row["belief"]) < high:
                 thing = row["folder"], row["frame"], row["number"]
@@ -72,8 +78,10 @@ def main(tables: tyro.conf.Positional[tuple[Path, ...]], figure: Path) -> None:
     for number, (path, what, counts) in enumerate(series):
         known = [k for k, (_, total) in enumerate(counts) if total]
         print(f"{path.stem}, {what}: {', '.join(f'{n} of {of}' for n, of in counts)}")
+
         share = [counts[k][0] / counts[k][1] for k in known]
         ends = [wilson(*counts[k]) for k in known]
+
         axes.errorbar(
             [k + ASIDE * (number - (len(series) - 1) / 2) for k in known],
             share,
@@ -86,11 +94,13 @@ def main(tables: tyro.conf.Positional[tuple[Path, ...]], figure: Path) -> None:
             label=f"{path.stem}: {what}",
             elinewidth=1.2,
         )
+
     for k, (low, high) in enumerate(pairwise(BELIEFS)):
         around = [k - 4 * ASIDE, k + 4 * ASIDE]
         axes.fill_between(around, low, min(high, 1), color=FAINT, linewidth=0, zorder=0)
     ranges = [f"{low:g} to {high:g}" for low, high in pairwise(BELIEFS[:-1])]
     axes.set_xticks(range(len(BELIEFS) - 1), [*ranges, f"{BELIEFS[-2]:g} to 1"])
+
     axes.set_xlabel("belief in a name")
     axes.grid(visible=False, axis="x")
     axes.set_ylim(-0.02, 1.02)

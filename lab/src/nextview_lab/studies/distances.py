@@ -48,6 +48,7 @@ def main(
         table = SimulatedTable.draw([mesh_of(path)], rng, 0.0)
         placed = table.things[0].placed
         middle = (placed.min(0) + placed.max(0)) / 2
+
         azimuth = rng.uniform(0, 2 * np.pi, 1)
         for name in sensors:
             camera = TableCamera(table, SENSORS[name], rng)
@@ -59,6 +60,7 @@ def main(
                 depth = np.rint(1000 * frame.depth).astype(np.uint16)
                 own = (camera.owner == 0).astype(np.uint8)
                 shots.setdefault((name, distance), {})[path.stem] = depth, own, [told]
+
     for (name, distance), frames in shots.items():
         matrix = SENSORS[name].intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         write_frames(out / f"{name}-{distance:g}", matrix, frames)

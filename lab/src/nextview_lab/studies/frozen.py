@@ -69,18 +69,12 @@ from nextview_lab.studies.staged_things import (
 )
 
 COMPRESSION = 6  # of PNG
-DISTANCES = (
-    0.35,
-    0.45,
-)  # metres from the cameras to their aim, between which one is drawn
-AIM_ERROR = (
-    0.01  # metres along each axis, of an episode's aim, and of each view's about it
-)
-WORLD_REACH = (
-    1.0,
-    1.0,
-    0.5,
-)  # metres along x, y and z that the aim is from the world's origin
+# metres from the cameras to their aim, between which one is drawn
+DISTANCES = (0.35, 0.45)
+# metres along each axis, of an episode's aim, and of each view's about it
+AIM_ERROR = 0.01
+# metres along x, y and z that the aim is from the world's origin
+WORLD_REACH = (1.0, 1.0, 0.5)
 SCENES_TRIED = 12  # until the first view shows enough of the thing
 LIBRARIES = ("mujoco", "numpy", "scipy", "trimesh")  # that decide what is shown
 TERMS_FILE = ".terms.json"  # which does not belong to the archive
@@ -164,6 +158,11 @@ def draw_views(
     """Draw all that a method is told of the cameras.
 
     It depends on nothing but the place: neither the thing nor its scene is known here.
+
+    Args:
+        place: where the thing will be.
+        how: what the archive depends on.
+        rng: draws.
     """
     left, right, low, high = WHERE_CAMERAS_STAND[place]
     rings, azimuths = how.grid
@@ -185,7 +184,15 @@ def draw_views(
 
 
 def moved(pose: Float, by: Float) -> Float:
-    """A pose, (4, 4), moved along the axes of its world, (3,), metres."""
+    """Move a pose along the axes of its world.
+
+    Args:
+        pose: (4, 4), metres.
+        by: (3,), metres.
+
+    Returns:
+        The moved pose, (4, 4), metres.
+    """
     there = pose.copy()
     there[:3, 3] += by
     return rounded(there)
@@ -215,6 +222,13 @@ def scene_before(
 ) -> tuple[Any, Any, Float, NDArray[np.uint16], NDArray[np.bool_]] | None:
     """A scene whose thing the first of drawn views shows; None if it cannot be shown there.
 
+    Args:
+        views: of the cameras.
+        place: where the thing is.
+        scans: folder of the scans.
+        name: of the thing.
+        rng: draws.
+
     Returns:
         MuJoCo's model and data with all things at rest, the aim of the cameras, (3,), metres, and
         of the first view the depth, (H, W), steps, and the pixels of the thing, (H, W).
@@ -240,14 +254,30 @@ def scene_before(
 
 
 def shown_pixels(depth: NDArray[np.uint16], mask: NDArray[np.bool_]) -> int:
-    """How many pixels of a mask, (H, W), have a depth."""
+    """How many pixels of a mask have a depth.
+
+    Args:
+        depth: (H, W), 0 for holes.
+        mask: (H, W).
+    """
     return int((mask & (depth > 0)).sum())
 
 
 def make_episode(
     folder: Path, scans: Path, name: str, place: Place, how: FrozenTerms
 ) -> EpisodeTruth | None:
-    """Write an episode; its truth, or None if the thing cannot be shown there."""
+    """Write an episode.
+
+    Args:
+        folder: of the episode.
+        scans: folder of the scans.
+        name: of the thing.
+        place: where it is.
+        how: what the archive depends on.
+
+    Returns:
+        Its truth; None if the thing cannot be shown there.
+    """
     rng = np.random.default_rng([how.seed, PLACES.index(place), *name.encode()])
     views = draw_views(place, how, rng)
     scene = scene_before(views, place, scans, name, rng)
@@ -258,6 +288,7 @@ def make_episode(
 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
+
     pixels = []
     for number, pose in enumerate(views.poses):
         depth, mask = first
@@ -265,6 +296,7 @@ def make_episode(
             depth, mask = looked(model, data, moved(pose, aim), rng)
         depth[depth > how.farthest * STEPS_PER_METRE] = 0
         pixels.append(shown_pixels(depth, mask))
+
         place_of = folder / f"{number:03d}"
         for end, image in (("", depth), ("-mask", mask)):
             Image.fromarray(image).save(
@@ -279,6 +311,7 @@ def make_episode(
         poses=tuple(map(as_matrix, views.told)),
     )
     write_record(folder / EPISODE_FILE, episode)
+
     true = rounded(views.world @ moved(true_pose(data), -aim))
     cameras = tuple(as_matrix(rounded(views.world @ pose)) for pose in views.poses)
     return EpisodeTruth(name, place, as_matrix(true), cameras, tuple(pixels))
@@ -343,6 +376,7 @@ def finish(
         source=SOURCE,
         licence=LICENCE,
     )
+
     (out / "README.md").write_text(card, encoding="utf-8")
     return seal(out, out.name, how.seed, made_with)
 
@@ -397,6 +431,7 @@ def main(
                     file = out / TRUTH_FOLDER / f"{number}.json"
                     write_record(file, truth, overwrite=True)
                     os.replace(part, folder)
+
             done = folder.exists()
             said = "done" if done else "cannot be shown there"
             print(

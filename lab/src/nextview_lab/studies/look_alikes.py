@@ -2,8 +2,8 @@
 
     python -m nextview_lab.studies.look_alikes YCB OUT [--models ModelNet10] [--pairs 40] [--seed 0]
 
-Each pair is one body with and
-without a change, or with two changes that differ, and the change is on one side of the body:
+Each pair is one body with and without a change, or with two changes that differ, and the change is
+on one side of the body:
 
 | change | first | second |
 |---|---|---|
@@ -36,7 +36,7 @@ from nextview.cli.exit_status import orderly_end
 from nextview.errors import MeshError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import pinhole
-from nextview.geometry.ray_caster import embree_scene
+from nextview.geometry.ray_caster import RayCaster, embree_scene
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float
 from nextview_lab.studies.shared import scans_in
@@ -196,7 +196,12 @@ NAMES = {"handle moved": ("low_handle", "high_handle"), "spout": ("straight", "b
 
 
 def place_on_side(body: trimesh.Trimesh, rng: np.random.Generator) -> Place | None:
-    """Draw a place on the outside of a body that looks sideways; None if the ray missed."""
+    """Draw a place on the outside of a body that looks sideways; None if the ray missed.
+
+    Args:
+        body: metres, z up.
+        rng: draws.
+    """
     azimuth = rng.uniform(0, 2 * np.pi)
     height = rng.uniform(0.35, 0.7)
     outward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -219,24 +224,26 @@ def place_on_side(body: trimesh.Trimesh, rng: np.random.Generator) -> Place | No
 
 
 def depth_pictures(mesh: trimesh.Trimesh, centre: Float, radius: float) -> Float:
-    """Exact depth from the 40 views, (40, PICTURE_SIDE ** 2), metres; infinity beside the mesh."""
-    scene = embree_scene(
-        [(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))]
-    )
+    """Exact depth from the 40 views.
+
+    Args:
+        mesh: metres.
+        centre: at which the cameras look, (3,), metres.
+        radius: of a ball about the centre that holds the mesh, metres.
+
+    Returns:
+        Depth, (40, PICTURE_SIDE ** 2), metres; infinity beside the mesh.
+    """
+    caster = RayCaster([(mesh.vertices, mesh.faces)])
     matrix = pinhole(PICTURE_SIDE, RADII_AWAY / 1.3)
     at = (np.arange(PICTURE_SIDE) + 0.5 - matrix[0, 2]) / matrix[0, 0] / 1.02
     x, y = np.meshgrid(at, at)
+
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     pictures = []
     for pose in VIEWPOINTS.poses:
         origin = centre + RADII_AWAY * radius * pose[:3, 3] / VIEWPOINTS.distance
-        directions = np.ascontiguousarray(rays @ pose[:3, :3].T, np.float32)
-        starts = np.ascontiguousarray(
-            np.broadcast_to(origin, directions.shape),
-            np.float32,
-        )
-        hits = scene.run(starts, directions, output=1)
-        pictures.append(np.where(hits["primID"] >= 0, hits["tfar"], np.inf))
+        pictures.append(caster.cast(origin, rays @ pose[:3, :3].T)[0])
     return np.stack(pictures)
 
 
@@ -254,8 +261,14 @@ def telling_share(pair: Pair) -> float:
 
 
 def body_of(path: Path, scan: bool) -> trimesh.Trimesh | None:
-    """The mesh of a file in metres, standing on z = 0; None if it is too small or too large a
-    file.
+    """The mesh of a file in metres, standing on z = 0.
+
+    Args:
+        path: of the file.
+        scan: whether it is in metres; a model is scaled to ``TOY_DIAMETER``.
+
+    Returns:
+        The mesh; None if it has too many faces, or is too small.
     """
     try:
         mesh = load_mesh(path, unit="m")
@@ -264,9 +277,11 @@ def body_of(path: Path, scan: bool) -> trimesh.Trimesh | None:
     if len(mesh.faces) > MOST_FACES:
         return None
     body = trimesh.Trimesh(mesh.vertices * mesh.radius, mesh.faces, process=False)
+
     if not scan:
         body.apply_scale(TOY_DIAMETER / _size(body))
     body.apply_translation((0, 0, -body.bounds[0, 2]))
+
     if _size(body) < SMALLEST_DIAMETER or min(body.extents) < SMALLEST_EXTENT:
         return None
     return body
@@ -280,8 +295,17 @@ def make_pairs(
 ) -> list[tuple[tuple[str, str, str, str, str], Pair]]:
     """Draw bodies, changes and places until there are enough pairs.
 
+    Args:
+        scans: files in metres.
+        models: files that are scaled.
+        count: of the pairs.
+        seed: decides bodies, changes and places.
+
     Returns:
         A row of the table, and the meshes, of each.
+
+    Raises:
+        UsageError: there are too few bodies.
     """
     rng = np.random.default_rng(seed)
     scans = [scans[k] for k in rng.permutation(len(scans))]
@@ -295,10 +319,12 @@ def make_pairs(
             raise UsageError(
                 f"there are bodies for {number} pairs only, not for {count}"
             )
+
         path = files.pop()
         body = body_of(path, scan)
         if body is None:
             continue
+
         # The changes take turns. One that no place on this body suits is left out.
         turn = number % len(CHANGES)
         names = list(CHANGES)
@@ -309,6 +335,7 @@ def make_pairs(
                 break
         if found is None:
             continue
+
         pair, share = found
         endings = NAMES.get(change, ("plain", change.replace(" ", "_")))
         first, second = (f"{number:02d}_{path.stem}_{ending}" for ending in endings)
@@ -321,8 +348,8 @@ def _changed(
     change: str,
     rng: np.random.Generator,
 ) -> tuple[Pair, float] | None:
-    """A pair of a body that differs in the wanted share of the views; None if no place was
-    found.
+    """A pair of a body that differs in the wanted share of the views, and the share; None if no
+    place was found.
     """
     for _ in range(PLACES_TRIED):
         place = place_on_side(body, rng)

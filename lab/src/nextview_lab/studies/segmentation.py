@@ -109,11 +109,18 @@ class Counts:
     frames: int = 0
 
     def add(self, frame: Frame, truth: Labels, found: Labels) -> None:
-        """Count a frame."""
+        """Count a frame.
+
+        Args:
+            frame: what the camera measured.
+            truth: number of the thing of each pixel, 0 for none, (H, W).
+            found: number of the segment of each pixel, 0 for none, (H, W).
+        """
         both = np.zeros((int(truth.max()) + 1, int(found.max()) + 1), np.int64)
         np.add.at(both, (truth.ravel(), found.ravel()), 1)
         numbers = np.flatnonzero(both[1:].sum(1) >= LEAST_PIXELS) + 1
         segments = np.flatnonzero(both[:, 1:].sum(0) >= LEAST_PIXELS / 2) + 1
+
         shared = both[np.ix_(numbers, segments)]
         size = both[numbers].sum(1)
         overlap = shared / (size[:, None] + both[:, segments].sum(0) - shared)
@@ -124,10 +131,12 @@ class Counts:
         self.good += int((overlap.max(0, initial=0) > GOOD_IOU).sum())
         self.merges += int((most.sum(0) > 1).sum())
         self.frames += 1
+
         for row, number in enumerate(numbers):
             mask = truth == number
             near = truth[ndimage.binary_dilation(mask, iterations=BESIDE)]
             pieces = np.bincount(ndimage.label(mask, np.ones((3, 3)))[0][mask])
+
             self.things.append(
                 Parted(
                     frame,
@@ -154,6 +163,7 @@ class Counts:
             f" splits {sum(thing.cut > 1 for thing in self.things)},"
             f" {self.seconds / self.frames:.3f} s a frame"
         )
+
         print(f"{'':28}things    IoU  joined    cut")
         for name, (value, low, high) in GROUPS.items():
             those = [one for one in self.things if low <= getattr(one, value) <= high]
@@ -182,8 +192,10 @@ def draw_worst(things: Sequence[Parted], out: Path) -> None:
         axis = figure.add_subplot(*PICTURES, place)
         axis.imshow(grey_picture(thing.frame), cmap="gray", vmin=0, vmax=1)
         axis.contourf(thing.mask, [0.5, 2], colors=[BLUE], alpha=0.35)
+
         for number in np.setdiff1d(thing.found, [0]):
             axis.contour(thing.found == number, [0.5], colors=[ACCENT], linewidths=1.3)
+
         high, wide = (np.array([at.min(), at.max()]) for at in np.nonzero(thing.mask))
         half = 0.75 * max(np.ptp(high), np.ptp(wide) * 0.75, FEWEST_ROWS)
         middle = np.clip(high.mean(), half, len(thing.mask) - half)
@@ -191,6 +203,7 @@ def draw_worst(things: Sequence[Parted], out: Path) -> None:
             xlim=wide.mean() + np.array([-1, 1]) * half / 0.75,
             ylim=middle + np.array([1, -1]) * half,
         )
+
         axis.set_axis_off()
         axis.set_title(
             f"IoU {thing.overlap:.2f}"
@@ -199,6 +212,7 @@ def draw_worst(things: Sequence[Parted], out: Path) -> None:
             fontsize=8.5,
             pad=3,
         )
+
     figure.suptitle("blue: the thing; red: outlines of the segments", fontsize=9.5)
     with new_file(out, overwrite=True) as part:
         figure.savefig(part, format="png", dpi=110, facecolor="white")
@@ -207,7 +221,15 @@ def draw_worst(things: Sequence[Parted], out: Path) -> None:
 
 
 def labels_of(frame: Frame, things: Sequence[TrueThing]) -> Labels:
-    """The number of the thing of each pixel with depth, 0 for none, (H, W)."""
+    """Number the things of a frame.
+
+    Args:
+        frame: (H, W).
+        things: with their pixels, (H, W), where these are known.
+
+    Returns:
+        The number of the thing of each pixel with depth, 0 for none, (H, W).
+    """
     labels = np.zeros(frame.shape, np.int64)
     for number, thing in enumerate(things, 1):
         if thing.pixels is not None:

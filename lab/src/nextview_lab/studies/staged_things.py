@@ -77,12 +77,26 @@ WHERE_CAMERAS_STAND: dict[Place, tuple[float, float, float, float]] = {
 
 
 def rounded(values: ArrayLike) -> Float:
-    """Values without their last bits, in which processors differ, and without -0."""
+    """Values without their last bits, in which processors differ, and without -0.
+
+    Args:
+        values: of any shape.
+
+    Returns:
+        Of the same shape, float64.
+    """
     return np.round(np.asarray(values, float), DECIMALS) + 0.0
 
 
 def quaternion(turn: Float) -> Float:
-    """A rotation, (3, 3), as MuJoCo is given it: w, x, y, z."""
+    """A rotation as MuJoCo is given it.
+
+    Args:
+        turn: (3, 3).
+
+    Returns:
+        Quaternion w, x, y, z, (4,).
+    """
     return rounded(
         Rotation.from_matrix(turn).as_quat(canonical=True, scalar_first=True)
     )
@@ -120,7 +134,16 @@ def hull_or_none(points: Float) -> trimesh.Trimesh | None:
 
 @cache
 def pieces_of(folder: str, name: str, most: int = 20) -> tuple[Float, ...]:
-    """Corners of convex pieces that cover a scan, (N, 3) each, metres."""
+    """Convex pieces that cover a scan.
+
+    Args:
+        folder: of the scans.
+        name: of the thing.
+        most: pieces.
+
+    Returns:
+        Corners of each piece, (N, 3), metres.
+    """
     scan = scan_of(folder, name)
     hull = scan.convex_hull
     if abs(scan.volume) > CONVEX_SHARE * hull.volume:
@@ -132,9 +155,11 @@ def pieces_of(folder: str, name: str, most: int = 20) -> tuple[Float, ...]:
     while open_parts and len(open_parts) + len(whole) < most:
         open_parts.sort(key=lambda part: round(part[0].volume, 15))
         hull, faces = open_parts.pop()
+
         axis = int(np.ptp(middles[faces], axis=0).argmax())
         low = middles[faces, axis] < np.median(middles[faces, axis])
         halves = [faces[low], faces[~low]]
+
         hulls = [hull_or_none(scan.triangles[half].reshape(-1, 3)) for half in halves]
         if None in hulls:
             whole.append((hull, faces))
@@ -151,7 +176,16 @@ def add_scan(
     pose: tuple[Float, Float] | None = None,
     scale: float = 1.0,
 ) -> None:
-    """Add a scan to a scene, free to fall unless its place and rotation are given."""
+    """Add a scan to a scene.
+
+    Args:
+        spec: the scene.
+        body_name: of the new body.
+        pieces: corners of convex pieces, (N, 3) each, metres: what collides.
+        scan: what is seen, metres.
+        pose: place, (3,), metres, and rotation, (3, 3); without one it is free to fall.
+        scale: of scan and pieces.
+    """
     body = spec.worldbody.add_body(name=body_name)
     if pose is None:
         body.add_freejoint()
@@ -178,7 +212,14 @@ def add_scan(
 def add_box(
     body: Any, low: Sequence[float], high: Sequence[float], turn: Float | None = None
 ) -> None:
-    """Add a box to a body by two opposite corners, (3,), metres, and its rotation, (3, 3)."""
+    """Add a box to a body.
+
+    Args:
+        body: of MuJoCo.
+        low: its lowest corner, (3,), metres.
+        high: its highest corner, (3,), metres.
+        turn: its rotation about its middle, (3, 3); None without one.
+    """
     corners = rounded([low, high])
     box = body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX)
     box.pos = corners.mean(0)
@@ -203,6 +244,7 @@ def room(rng: np.random.Generator, table: bool = True) -> Any:
     for wall in (-2.05, 2.05):
         add_box(world, (wall - 0.05, -2.1, floor), (wall + 0.05, 2.1, 2))
         add_box(world, (-2.1, wall - 0.05, floor), (2.1, wall + 0.05, 2))
+
     if table:
         edges = np.linspace(-0.55, 0.55, 9)
         for left, right in pairwise(edges):
@@ -222,8 +264,17 @@ def placed(
     lowest: float,
     scale: float = 1.0,
 ) -> tuple[Float, Float]:
-    """Place and rotation with the middle of a turned scan at a spot, (2,), and its lowest point at
-    a height.
+    """Put a scan at a spot.
+
+    Args:
+        scan: metres.
+        turn: its rotation, (3, 3).
+        spot: x and y of its middle, (2,), metres.
+        lowest: height of its lowest point, metres.
+        scale: of the scan.
+
+    Returns:
+        Place, (3,), metres, and rotation, (3, 3).
     """
     points = scale * scan.vertices @ turn.T
     middle = (points.min(0) + points.max(0)) / 2
@@ -236,24 +287,41 @@ def turned(rng: np.random.Generator) -> Float:
 
 
 def with_up(up: Float, rng: np.random.Generator) -> Float:
-    """A random rotation that turns a direction, (3,), upwards."""
+    """Draw a rotation that turns a direction upwards.
+
+    Args:
+        up: the direction, (3,).
+        rng: draws.
+
+    Returns:
+        Rotation, (3, 3).
+    """
     tilt, _ = Rotation.align_vectors([[0, 0, 1.0]], [up])
     spin = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
     return (spin * tilt).as_matrix()
 
 
 def stable_ups(scan: trimesh.Trimesh) -> tuple[Float, Float]:
-    """Directions that are upwards when a scan rests on a side of its hull, (N, 3), none within 10
-    degrees of another, and the areas of these sides, (N,), square metres, largest first.
+    """How a scan can rest on a side of its hull.
+
+    Args:
+        scan: metres.
+
+    Returns:
+        Directions that are upwards then, (N, 3), none within 10 degrees of another, and the areas
+        of these sides, (N,), square metres, largest first.
     """
     hull = scan.convex_hull
     normals = hull.face_normals
     heights = ((hull.triangles[:, 0] - hull.center_mass) * normals).sum(1)
     feet = hull.center_mass + heights[:, None] * normals
+
     weights = trimesh.triangles.points_to_barycentric(hull.triangles, feet)
     stable = (weights >= 0).all(1)
+
     level = normals[stable] @ normals.T > np.cos(np.radians(2))
     areas = level @ hull.area_faces
+
     kept: list[int] = []
     for one in np.argsort(-np.round(areas, 12), kind="stable"):
         others = normals[stable][kept]
@@ -303,7 +371,12 @@ class Actor:
         return scan_of(self.folder, self.name)
 
     def enters(self, spec: Any, pose: tuple[Float, Float] | None = None) -> None:
-        """Join a scene."""
+        """Join a scene.
+
+        Args:
+            spec: the scene.
+            pose: place, (3,), metres, and rotation, (3, 3); without one it is free to fall.
+        """
         add_scan(spec, "thing", pieces_of(self.folder, self.name), self.scan, pose)
 
 
@@ -327,6 +400,7 @@ def shelf(actor: Actor, rng: np.random.Generator) -> Staging:
         ((-0.18, 0.35, 0), (0.18, 0.37, 0.42)),
     ):
         add_box(world, low, high)
+
     actor.enters(spec)
     spot = rng.uniform((-0.05, -0.15), (0.05, 0.15))
     begin = placed(actor.scan, turned(rng), spot, 0.02)
@@ -340,12 +414,14 @@ def stack(actor: Actor, rng: np.random.Generator) -> Staging:
     name = str(rng.choice([each for each in FLAT_TOPS if each != actor.name]))
     under = Actor(actor.folder, name, 0).scan
     add_scan(spec, "under", pieces_of(actor.folder, name), under)
+
     flat = with_up(stable_ups(under)[0][0], rng)
     if actor.tries < 3:
         turn = turned(rng)
     else:  # on any side of its hull that it can rest on
         ups = stable_ups(actor.scan)[0]
         turn = with_up(ups[rng.integers(len(ups))], rng)
+
     above = 0.008 + np.ptp(under.vertices @ flat[2])
     starts = {
         "under": placed(under, flat, np.zeros(2), 0.003),
@@ -372,6 +448,7 @@ def in_a_bin(actor: Actor, rng: np.random.Generator) -> Staging:
     small = [name for name in all_names if scans[name].extents.max() < 0.2]
     small = [name for name in small if name != actor.name]
     others = rng.choice(small, 4, replace=False)
+
     actor.enters(spec)
     names = {"thing": actor.name}
     for number, name in enumerate(map(str, others)):
@@ -448,6 +525,7 @@ def held(actor: Actor, rng: np.random.Generator) -> Staging:
         along = points @ axes.T
         end = along[:, 2].max()
         tip = along[along[:, 2].argmax()]
+
         pinched = along[
             (np.abs(along[:, 1] - tip[1]) < 0.01) & (along[:, 2] > end - 0.03)
         ]
@@ -456,6 +534,7 @@ def held(actor: Actor, rng: np.random.Generator) -> Staging:
             break
     else:
         low = high = tip[0]
+
     middle = (low + high) / 2
     boxes = [
         ((-0.05, -0.03, 0.02), (0.05, 0.03, 0.1)),
@@ -467,6 +546,7 @@ def held(actor: Actor, rng: np.random.Generator) -> Staging:
         boxes.append(((half, -0.01, -0.03), (half + 0.008, 0.01, 0.02)))
     else:
         boxes.append(((-0.012, -0.012, 0), (0.012, 0.012, 0.02)))
+
     gripper.pos = rounded(axes.T @ (middle, tip[1], end))
     gripper.quat = quaternion(axes.T)
     for corners in boxes:
@@ -533,8 +613,15 @@ def true_pose(data: Any) -> Float:
 def as_told(
     pose: Float, arm_error: tuple[float, float], rng: np.random.Generator
 ) -> Float:
-    """What an arm says of a camera's pose, (4, 4): standard deviations of its error along and about
-    each axis are in millimetres and degrees.
+    """What an arm says of a camera's pose.
+
+    Args:
+        pose: the true one, (4, 4), metres.
+        arm_error: standard deviations along and about each axis, millimetres and degrees.
+        rng: draws.
+
+    Returns:
+        The reported pose, (4, 4), metres.
     """
     millimetres, degrees = arm_error
     told = pose.copy()
@@ -555,7 +642,15 @@ def field(rng: np.random.Generator) -> Float:
 
 
 def slope_along(values: Float, axis: int) -> Float:
-    """Steps to the next pixel or from the last, (H, W), whichever are smaller: edges have none."""
+    """Steps to the next pixel or from the last, whichever are smaller: edges have none.
+
+    Args:
+        values: (H, W).
+        axis: 0 for down, 1 for across.
+
+    Returns:
+        The steps, (H, W).
+    """
     steps = np.diff(values, axis=axis)
     before = np.insert(steps, 0, np.inf, axis)
     after = np.insert(steps, steps.shape[axis], np.inf, axis)
@@ -563,7 +658,15 @@ def slope_along(values: Float, axis: int) -> Float:
 
 
 def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """What a stereo camera makes of depth: (H, W), metres, in; steps, 0 for holes, out."""
+    """What a stereo camera makes of depth.
+
+    Args:
+        depth: without noise, (H, W), metres.
+        rng: draws the noise.
+
+    Returns:
+        Measured depth, (H, W), steps of ``1 / STEPS_PER_METRE`` metres, 0 for holes.
+    """
     true = FOCAL * STEREO_BASE / depth  # disparities, pixels
     slopes = [slope_along(true, axis) for axis in (0, 1)]
     rows, columns = np.indices(IMAGE)
@@ -597,7 +700,17 @@ def as_measured(depth: Float, rng: np.random.Generator) -> NDArray[np.uint16]:
 
 
 def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> Float:
-    """Pose of a camera, (4, 4), OpenCV axes, that is aimed at a point, (3,); degrees, metres."""
+    """Aim a camera at a point.
+
+    Args:
+        aim: the point, (3,), metres.
+        azimuth: of the camera, degrees from the +x axis.
+        elevation: of the camera, degrees.
+        distance: from the point, metres.
+
+    Returns:
+        Camera-to-world pose, (4, 4), OpenCV axes, metres.
+    """
     turn = np.radians([azimuth, elevation])
     back = np.array(
         [np.cos(turn[1]) * np.cos(turn[0]), np.cos(turn[1]) * np.sin(turn[0]), 0]
@@ -614,7 +727,17 @@ def camera_at(aim: Float, azimuth: float, elevation: float, distance: float) -> 
 def looked(
     model: Any, data: Any, pose: Float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint16], Bools]:
-    """Measured depth, (H, W), steps, and the pixels of the thing, (H, W)."""
+    """Take a view of a scene.
+
+    Args:
+        model: of MuJoCo.
+        data: of MuJoCo.
+        pose: of the camera, (4, 4), OpenCV axes, metres.
+        rng: draws the noise.
+
+    Returns:
+        Measured depth, (H, W), steps, 0 for holes, and the pixels of the thing, (H, W).
+    """
     rows, columns = np.indices(IMAGE)
     across, down = columns - CAMERA_MATRIX[0, 2], rows - CAMERA_MATRIX[1, 2]
     right, below, ahead = pose[:3, :3].T
@@ -640,6 +763,7 @@ def looked(
         count,
         FARTHEST,
     )
+
     depth[hit < 0] = FARTHEST
     thing = hit.reshape(IMAGE) == model.geom("thing seen").id
     return as_measured(depth.reshape(IMAGE), rng), thing

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 from rich.progress import track
 
 import nextview
@@ -25,6 +26,7 @@ from nextview.data.folders import list_dataset
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.sensed_camera import SensedCamera
+from nextview.types import Float
 from nextview_lab.benchmark.statistics import interval, resample
 
 BOOTSTRAP_SAMPLES = 1000
@@ -70,47 +72,66 @@ def episodes(
     chosen = np.sort(np.random.default_rng(seed).permutation(len(entries))[:objects])
     entries = [entries[i] for i in chosen]
 
-    # One row of outcomes for each object; each holds the means over its episodes.
     rows = []
-    labels = []
-
     every = track(entries, f"episodes of {meshes.name}", console=console)
     for number, entry in enumerate(every, 1):
-        outcomes = []
-        for draw in range(draws):
-            rng = np.random.default_rng([seed, number, draw])
-            mesh = nextview.load_mesh(entry.path, unit=unit)
-            if not aligned:
-                mesh = rotated(mesh, rotation_z(rng.uniform(0, 2 * np.pi)))
-            camera = (
-                nextview.SimulatedCamera(mesh)
-                if sensor is None
-                else SensedCamera(mesh, sensor, rng)
-            )
-            session = system.session_with(camera, None, int(rng.integers(2**32)))
-            result = session.run(camera)
-            most_like = entry.label == result.most_like
-            named_right = most_like and not result.unknown
-            sure = result.confident and not result.unknown
-            outcomes.append(
-                (result.unknown, named_right, most_like, sure, len(result.views))
-            )
+        mesh = nextview.load_mesh(entry.path, unit=unit)
+        outcomes = [
+            _outcome(system, mesh, entry.label, sensor, aligned, [seed, number, draw])
+            for draw in range(draws)
+        ]
         rows.append(np.mean(outcomes, axis=0))
-        labels.append(entry.label)
-    table = np.array(rows)
+    print(f"{len(rows)} objects, {draws} episodes each")
+    _print_out(np.array(rows), np.array([entry.label for entry in entries]), seed)
+
+
+def _outcome(
+    system: nextview.System,
+    mesh: nextview.Mesh,
+    label: str,
+    sensor: str | None,
+    aligned: bool,
+    seed: list[int],
+) -> tuple[float, ...]:
+    """Run an episode: 0 or 1 for each of ``REPORTED``, and the number of views."""
+    rng = np.random.default_rng(seed)
+    if not aligned:
+        mesh = rotated(mesh, rotation_z(rng.uniform(0, 2 * np.pi)))
+    camera = (
+        nextview.SimulatedCamera(mesh)
+        if sensor is None
+        else SensedCamera(mesh, sensor, rng)
+    )
+    session = system.session_with(camera, None, int(rng.integers(2**32)))
+    result = session.run(camera)
+
+    most_like = label == result.most_like
+    named = not result.unknown
+    reported = (
+        result.unknown,
+        most_like and named,
+        most_like,
+        result.confident and named,
+    )
+    return *reported, len(result.views)
+
+
+def _print_out(table: Float, labels: NDArray[np.str_], seed: int) -> None:
+    """Print means with their intervals, and the classes that are most often unknown.
+
+    Args:
+        table: outcomes of each object, means over its episodes, (N, 5).
+        labels: classes of the objects, (N,).
+        seed: of the intervals.
+    """
     weights = resample(len(table), BOOTSTRAP_SAMPLES, np.random.default_rng(seed))
     low, high = interval(weights @ table / weights.sum(1, keepdims=True))
-
-    print(f"{len(table)} objects, {draws} episodes each")
     for column, name in enumerate(REPORTED):
         mean = table[:, column].mean()
         print(f"{name:22} {mean:.3f} ({low[column]:.3f}-{high[column]:.3f})")
     print(f"{'views':22} {table[:, -1].mean():.2f}")
 
-    of_class = np.array(labels)
-    shares = {
-        label: table[of_class == label, 0].mean() for label in sorted(set(labels))
-    }
+    shares = {label: table[labels == label, 0].mean() for label in np.unique(labels)}
     most = sorted(shares, key=lambda label: -shares[label])[:MOST_UNKNOWN_CLASSES]
     print(
         "most often unknown: "

@@ -117,10 +117,12 @@ class Trajectory:
         waves = rng.uniform(0.25, 0.5, (2, 3))
         phases = rng.uniform(0, 2 * np.pi, (2, 3))
         size = rng.uniform(0.5, 1, (2, 3))
+
         # a wave that starts at rest
         ramp = begun**2 / (begun**2 + 0.3)
         angle = 2 * np.pi * waves[:, None] * begun[:, None] + phases[:, None]
         both = ramp[:, None] * size[:, None] * (np.sin(angle) - np.sin(phases)[:, None])
+
         shift, turn = both
         shift[:, 2] *= 0.3
         shift = _slowed(shift * 0.1, SPEED * 0.85, RATE)
@@ -148,13 +150,21 @@ class Trajectory:
         )
 
     def cast(self, number: int) -> tuple[NDArray[np.float32], float]:
-        """Depth of a frame without noise, and the share of the thing's pixels that is visible."""
+        """Take a frame without noise.
+
+        Args:
+            number: of the frame.
+
+        Returns:
+            Depth, (H, W), metres, 0 for holes, and the share of the thing's pixels that is visible.
+        """
         pinhole = PinholeCamera.of(SENSOR.intrinsics, SENSOR.shape)
         rays = pinhole.rays.reshape(-1, 3) @ self.camera[:3, :3].T
         origin = self.camera[:3, 3]
         thing = self.table.things[self.row]
         pose = self.poses[number]
         since = pose @ np.linalg.inv(thing.pose)
+
         own = (thing.vertices @ pose[:3, :3].T + pose[:3, 3], thing.faces)
         moved = [
             (one @ since[:3, :3].T + since[:3, 3], faces) for one, faces in self.gripper
@@ -165,6 +175,7 @@ class Trajectory:
 
         alone, _ = RayCaster([own]).cast(origin, rays)
         depth, owner = RayCaster([own, *moved, hand, *world]).cast(origin, rays)
+
         clean = np.where(np.isfinite(depth), depth, 0).reshape(SENSOR.shape)
         share = np.count_nonzero(owner == 0) / max(1, np.isfinite(alone).sum())
         return clean.astype(np.float32), float(share)
@@ -198,6 +209,7 @@ def _gripper(placed: Float) -> tuple[Triangles, ...]:
         parts.append((FINGER, place))
     above = np.array([*middle[:2], tips + FINGER[2] + HAND[2] / 2])
     parts.append((HAND, above))
+
     boxes = []
     for size, place in parts:
         # sizes are given along the opening first
@@ -239,7 +251,14 @@ def named(
 def errors(
     estimate: Float, truth: Float, vertices: Float, axis: Float | None
 ) -> tuple[float, float]:
-    """Millimetres between the middles of a scan in two poses, and degrees between these."""
+    """Millimetres between the middles of a scan in two poses, and degrees between these.
+
+    Args:
+        estimate: pose of the scan, (4, 4), metres.
+        truth: its true pose, (4, 4), metres.
+        vertices: of the scan, (V, 3), metres.
+        axis: about which any turn looks the same, (3,); None without one.
+    """
     middle = (vertices.min(0) + vertices.max(0)) / 2
     apart = (estimate - truth)[:3, :3] @ middle + (estimate - truth)[:3, 3]
     if axis is None:
@@ -293,11 +312,13 @@ def _named_table(
             table = SimulatedTable.draw(chosen, rng, GAP)
         except UsageError:
             continue
+
         scene = named(system, table, rng)
         row = int(rng.integers(THINGS))
         one = _rightly_named(scene, table.things[row])
         if one is None:
             continue
+
         trajectory = _visible_trajectory(table, row, rng)
         if trajectory is not None:
             return trajectory, scene, one
@@ -311,21 +332,32 @@ def follow(
     meshes: Sequence[Mesh],
     seed: tuple[int, int],
 ) -> dict[str, Any]:
-    """Track one thing along a trajectory."""
+    """Track one thing along a trajectory.
+
+    Args:
+        system: that knows the things.
+        meshes: of the things, metres.
+        seed: of the table, the trajectory and the noise.
+
+    Returns:
+        Name and symmetry of the thing; of each frame the errors, the time and the visible share.
+    """
     rng = np.random.default_rng(seed)
     trajectory, scene, one = _named_table(system, meshes, rng)
     table = trajectory.table
     thing = table.things[trajectory.row]
     axis = axis_of(one)
+
     tracker = Tracker(scene)
-    line: dict[str, Any] = {"thing": thing.name, "symmetric": axis is not None}
     steps = []
     for number, (frame, visible) in enumerate(trajectory.frames(rng)):
         began = time.process_time()
         every = tracker.update(frame, number / RATE)
         spent = time.process_time() - began
+
         mine = next(each for each in every if each.number == one.number)
         off = errors(mine.pose, trajectory.poses[number], thing.vertices, axis)
+
         still = [
             errors(each.pose, other.pose, other.vertices, None)[0]
             for each in every
@@ -343,26 +375,13 @@ def follow(
                 "others_mm": max(still, default=0.0),
             }
         )
-    return line | {"steps": steps}
+    return {"thing": thing.name, "symmetric": axis is not None, "steps": steps}
 
 
 def summary(lines: Sequence[dict[str, Any]]) -> str:
-    """What the tracker kept, in words."""
-    said = []
-    every = []
-    for line in lines:
-        steps = line["steps"]
-        every += steps
-        off = [one for one in steps if _is_off(one)]
-        seen = [one for one in steps if one["visible"] > 0.3 and not one["lost"]]
-        said.append(
-            f"{line['thing']}: median {np.median([one['mm'] for one in seen]):.1f} mm,"
-            f" {np.median([one['degrees'] for one in seen]):.1f} degrees;"
-            f" 95 % {np.quantile([one['mm'] for one in seen], 0.95):.1f} mm,"
-            f" {np.quantile([one['degrees'] for one in seen], 0.95):.1f} degrees;"
-            f" {len(off)} frames off, {sum(one['lost'] for one in steps)} told lost,"
-            f" at the end {'off' if _is_off(steps[-1]) else 'on'} the thing"
-        )
+    """What the tracker kept, in words: a line for each trajectory, then for all."""
+    said = [_of_trajectory(line["thing"], line["steps"]) for line in lines]
+    every = [one for line in lines for one in line["steps"]]
     seen = [one for one in every if one["visible"] > 0.3]
     for unit in ("mm", "degrees"):
         values = [one[unit] for one in seen]
@@ -370,11 +389,13 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
         said.append(
             f"where a third is visible: {middle:.2f} {unit} (median), {high:.2f} (95 %)"
         )
+
     wrong = [one for one in every if _is_off(one) and one["visible"] > 0.3]
     said.append(
         f"off while visible: {len(wrong)} of {len(seen)} frames,"
         f" {sum(not one['lost'] for one in wrong)} of them not told lost"
     )
+
     kept = [one for one in seen if not one["lost"]]
     for unit in ("mm", "degrees"):
         share = np.mean([one[unit] <= 1 for one in kept])
@@ -382,6 +403,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     said.append(
         f"told lost while on the thing: {sum(one['lost'] and not _is_off(one) for one in every)}"
     )
+
     spent = np.array([one["seconds"] / one["things"] for one in every])
     said.append(
         f"{1000 * spent.mean():.1f} ms a thing and frame,"
@@ -391,6 +413,22 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
         f"others off by {max(one['others_mm'] for one in every):.1f} mm at most"
     )
     return "\n".join(said)
+
+
+def _of_trajectory(thing: str, steps: Sequence[dict[str, Any]]) -> str:
+    """What the tracker kept of one thing, in words."""
+    seen = [one for one in steps if one["visible"] > 0.3 and not one["lost"]]
+    middle, high = (
+        [np.quantile([one[unit] for one in seen], share) for unit in ("mm", "degrees")]
+        for share in (0.5, 0.95)
+    )
+    return (
+        f"{thing}: median {middle[0]:.1f} mm, {middle[1]:.1f} degrees;"
+        f" 95 % {high[0]:.1f} mm, {high[1]:.1f} degrees;"
+        f" {sum(map(_is_off, steps))} frames off,"
+        f" {sum(one['lost'] for one in steps)} told lost,"
+        f" at the end {'off' if _is_off(steps[-1]) else 'on'} the thing"
+    )
 
 
 def _is_off(step: dict[str, Any]) -> bool:
@@ -419,6 +457,7 @@ def main(
         raise UsageError(
             f"{scans}: fewer than {THINGS} scans have names of known things"
         )
+
     meshes = [mesh_of(path) for path in paths]
     lines = []
     with out.open("x") as file:

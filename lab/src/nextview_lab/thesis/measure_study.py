@@ -33,7 +33,6 @@ if __name__ == "__main__":
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from scipy.special import log_softmax
 from scipy.stats import rankdata
 
 from nextview.cli.exit_status import orderly_end
@@ -73,15 +72,6 @@ def correlations(
     return np.divide((a * b).sum(1), spread, out=np.zeros(len(a)), where=spread > 0)
 
 
-def of_true_class(p: Predictions) -> NDArray[np.float64]:
-    """Log-probability of the true class in each view alone, (N, V)."""
-    return log_softmax(p.logits.astype(np.float64), axis=2)[
-        np.arange(len(p)),
-        :,
-        p.labels,
-    ]
-
-
 def agreement(
     p: Predictions,
     values: NDArray[np.floating],
@@ -92,7 +82,7 @@ def agreement(
     Several best views count by the share of them: a measure that is constant agrees as often as
     chance does.
     """
-    theirs = of_true_class(p).argmax(1)
+    theirs = p.log_truth.argmax(1)
     best = values >= values.max(1, keepdims=True)
     away = p.sphere.travel[theirs]
     return {
@@ -126,7 +116,7 @@ def study(
         rows: gets measure, label, quantity, value, low, high, p.
     """
     weights = resample(len(test), samples, np.random.default_rng([seed, 1]))
-    reference = of_true_class(test)
+    reference = test.log_truth
     right: dict[tuple[str, int], NDArray[np.bool_]] = {}
 
     def note(

@@ -243,24 +243,6 @@ def fit_temperature(
     )
 
 
-def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:
-    """Return the calibration of predictions, fitted to them if their recogniser has none.
-
-    Args:
-        data: the predictions.
-        rng: source of all random numbers.
-        walks: number of random walks of each kind over every object.
-
-    Returns:
-        The calibration.
-    """
-    return (
-        data.calibration
-        if data.calibration != PLAIN_SUM
-        else fit_temperature(data, rng, walks=walks)
-    )
-
-
 def loss(
     data: Predictions,
     calibration: Calibration,

@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, collected, silently
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, sha256_of
 from nextview.recognition.inference import (
@@ -479,14 +479,9 @@ def _export(
                 f"{name}: its answers differ from the network's by up to {difference:.2g}; not"
                 " written"
             )
-        rows: list[Float32] = []
-
-        def judged() -> Iterator[int]:
-            for i in candidate.judging:
-                rows.append(answers(candidate.seen(int(i))))
-                yield len(rows)
-
-        track(judged(), len(candidate.judging), "validation objects")
+        judging = candidate.judging
+        judged = (answers(candidate.seen(int(i))) for i in judging)
+        rows = collected(judged, len(judging), "validation objects", track)
         scores = {
             f"validation ({len(rows)} objects of the training split)": candidate.scores(
                 np.stack(rows)

@@ -10,30 +10,25 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, collected, silently
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import (
     FEATURES_INPUT,
-    INPUTS,
-    VISIBILITY,
     Gain,
     GainTable,
     features,
-    maps_of,
     mirrored,
     mirrored_features,
     origin,
 )
 from nextview.policies.learned_tables import cells_from
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
-from nextview.recognition.map_names import in_order
 from nextview.runtime import open_onnx
 from nextview.types import Float, Float32, Floats
 from nextview_lab.data.predictions import Predictions
-from nextview_lab.errors import PredictionsError
 from nextview_lab.extras import extras
 from nextview_lab.training.export import export_onnx
 from nextview_lab.training.fitting_set import hold_out, load_sensed
@@ -41,6 +36,7 @@ from nextview_lab.training.recipes import GainRecipe
 from nextview_lab.training.rollout import (
     Value,
     candidate_values,
+    check_inputs,
     fit_travel_weight,
     for_replay,
     judge_all,
@@ -423,16 +419,10 @@ def train_gain(
     for path in (out, out.with_suffix(".onnx")):
         check_new(path, overwrite)
     learned, validated, about, rng = _load(predictions, sensed, recipe, folds)
-    best: list[Best] = []
+    trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
+    epochs = best_epoch(trainings, validated, recipe)
+    policies, value = collected(epochs, recipe.epochs, "training", track)[-1]
 
-    def epochs() -> Iterator[int]:
-        trainings = [train(part, recipe, fold) for fold, part in enumerate(learned)]
-        for policies in best_epoch(trainings, validated, recipe):
-            best.append(policies)
-            yield len(best)
-
-    track(epochs(), recipe.epochs, "training")
-    policies, value = best[-1]
     # the lowest weight at which the policy travels no farther than a random walk in the window
     judged = list(zip(validated, policies, strict=True))
     travel_weight = fit_travel_weight(
@@ -463,7 +453,7 @@ def _load(
     variants = load_sensed(sensed, table)
     sources = [(predictions, table), *zip(sensed, variants, strict=True)]
     for path, p in sources:
-        _check(path, p, recipe)
+        check_inputs(p, recipe.inputs, recipe.frame, f"{path}: ")
     everything = np.arange(len(table))
     # few objects have one fold each
     folds = min(folds, len(np.unique(table.depth_entropy, axis=0)))
@@ -498,26 +488,3 @@ def _load(
         ),
     )
     return learned, validated, about, rng
-
-
-def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
-    """Reject predictions that lack inputs of the policy."""
-    lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
-    if lacking:
-        known = ", ".join((*INPUTS, *in_order(p.maps)))
-        raise PredictionsError(
-            f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}"
-        )
-
-    if VISIBILITY in recipe.inputs:
-        raise PredictionsError(
-            f"{path}: holds no visibility, as nothing stands around the objects; choose other"
-            " --inputs"
-        )
-
-    if p.azimuth_bins is None and (
-        recipe.frame == "object" or "azimuth_bin" in recipe.inputs
-    ):
-        other = "give --frame camera and --inputs without azimuth_bin"
-        hint = f"train the recogniser with --azimuth-bins-weight, or {other}"
-        raise PredictionsError(f"{path}: holds no azimuth bins; {hint}")

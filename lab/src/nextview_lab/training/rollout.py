@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from nextview.policies.base import EpisodeState, Policy
 from nextview.policies.baselines import Random
-from nextview.policies.gain import Gain
-from nextview.recognition.belief import FixedLength, of_true_class
-from nextview.session.episode import run_episodes
-from nextview.types import Float, Index
+from nextview.policies.gain import INPUTS, VISIBILITY, CellFrame, Gain, maps_of
+from nextview.recognition.belief import PLAIN_SUM, FixedLength, of_true_class
+from nextview.recognition.map_names import in_order
+from nextview.session.episode import Step, run_episodes
+from nextview.types import Float, Index, Mask
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import PredictionsError
-from nextview_lab.training.card_fits import calibration_of
+from nextview_lab.training.card_fits import fit_temperature
 from nextview_lab.training.fitting_set import for_fitting
 
 # belief in the truth, its logarithm, or whether the answer is right
@@ -46,7 +47,42 @@ def for_replay(
         raise PredictionsError("no object is left to learn from")
     parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
     data = Predictions.joined(parts)
-    return replace(data, calibration=calibration_of(data, rng))
+    if data.calibration != PLAIN_SUM:
+        return data
+    return replace(data, calibration=fit_temperature(data, rng))
+
+
+def check_inputs(
+    p: Predictions, inputs: Sequence[str], frame: CellFrame, before: str = ""
+) -> None:
+    """Check that predictions hold the inputs of a policy.
+
+    Args:
+        p: the predictions.
+        inputs: of the policy.
+        frame: in which it sees azimuths.
+        before: beginning of the sentence of an error.
+
+    Raises:
+        PredictionsError: they lack one.
+    """
+    lacking = [name for name in maps_of(inputs) if name not in p.maps]
+    if lacking:
+        known = ", ".join((*INPUTS, *in_order(p.maps)))
+        raise PredictionsError(
+            f"{before}these predictions hold no map {lacking[0]!r}; predict it, or choose inputs"
+            f" among {known}"
+        )
+    if VISIBILITY in inputs:
+        raise PredictionsError(
+            f"{before}these predictions hold no visibility, as nothing stands around the objects;"
+            " choose other inputs"
+        )
+    if p.azimuth_bins is None and (frame == "object" or "azimuth_bin" in inputs):
+        raise PredictionsError(
+            f"{before}these predictions hold no azimuth bins; train the recogniser with"
+            " --azimuth-bins-weight, or use the frame camera and no azimuth_bin"
+        )
 
 
 @dataclass(frozen=True)
@@ -101,27 +137,39 @@ def rollout(
     travel = np.zeros(len(data))
     for k, step in enumerate(run.steps, 1):
         visited[step.episodes, step.views] = True
-        azimuth = sphere.azimuth[step.views]
-        seen = np.maximum(step.seen, 1)
-        azimuth_bins = data.calibration.azimuth_bins(
-            step.total,
-            seen,
-            len(data.classes),
-            azimuth,
-        )
-        state = EpisodeState(
-            step.views,
-            visited.copy(),
-            step.belief,
-            step.evidence,
-            k,
-            step.episodes,
-            azimuth_bins,
-        )
+        state = state_after(step, data, visited.copy(), k)
         yield DecisionState(state, step.total, travel, step.seen)
 
         if k < len(run.steps):
             travel = travel + sphere.travel[step.views, step.next_views]
+
+
+def state_after(
+    step: Step, data: Predictions, visited: Mask, number: int
+) -> EpisodeState:
+    """Return the state of B episodes after a view.
+
+    Args:
+        step: the view.
+        data: of the objects.
+        visited: views so far, (B, V).
+        number: of views so far.
+    """
+    azimuth_bins = data.calibration.azimuth_bins(
+        step.total,
+        np.maximum(step.seen, 1),
+        len(data.classes),
+        data.sphere.azimuth[step.views],
+    )
+    return EpisodeState(
+        step.views,
+        visited,
+        step.belief,
+        step.evidence,
+        number,
+        step.episodes,
+        azimuth_bins,
+    )
 
 
 def value_after(

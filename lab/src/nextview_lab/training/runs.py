@@ -505,9 +505,7 @@ def load_run(network: N, run: Path) -> N:
     path = run / "network.pt"
     try:
         network.load_state_dict(_read_state(path))
-    except (
-        RuntimeError
-    ):  # names every parameter that is missing, unknown or of another shape
+    except RuntimeError:  # names what is missing, unknown or of another shape
         raise ModelError(
             f"{path}: not the weights of the network that {run}/run.json describes"
         ) from None
@@ -591,22 +589,13 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
     wanted, given = (
-        {name: tuple(value.shape) for name, value in values.items()}
+        {name: tuple(value.shape) for name, value in values.items()}.items()
         for values in (own, state)
     )
-    faults = [f"it lacks {name}" for name in sorted(wanted.keys() - given.keys())]
-    faults += [f"it holds {name}" for name in sorted(given.keys() - wanted.keys())]
-    both = (
-        (name, shape, given[name]) for name, shape in wanted.items() if name in given
-    )
-    faults += [
-        f"{name} is {there}, not {shape}"
-        for name, shape, there in both
-        if there != shape
-    ]
-    if faults:
+    if wanted != given:
         raise ModelError(
-            f"{path}: not the weights of this {network.name} ({faults[0]})"
+            f"{path}: not the weights of this {network.name} ({min(wanted ^ given)[0]} is missing,"
+            " unknown or of another shape)"
         )
     for name, value in state.items():
         if not torch.isfinite(value).all():

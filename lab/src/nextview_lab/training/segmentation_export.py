@@ -1,6 +1,5 @@
 """Export a finished run of the segmentation network as an ONNX file and its card."""
 
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, collected, silently
 from nextview.errors import ModelError
 from nextview.files import command, new_folder, sha256_of
 from nextview.segmentation.features import SIDE_MULTIPLE
@@ -19,7 +18,6 @@ from nextview.segmentation.network import (
     new_card,
     write_segmentation_card,
 )
-from nextview.types import Float32
 from nextview_lab.data.labelled_frames import LabelledFrames, output_scores
 from nextview_lab.extras import extras
 from nextview_lab.training.architectures import SegmentationNet
@@ -150,13 +148,7 @@ def largest_difference(
 def _scores(
     network: SegmentationNetwork, frames: LabelledFrames, track: TrackProgress
 ) -> dict[str, float]:
-    outputs: list[Float32] = []
     examples = [frames.example(index, None) for index in range(len(frames))]
-
-    def judged() -> Iterator[int]:
-        for example in examples:
-            outputs.append(network(example.features))
-            yield len(outputs)
-
-    track(judged(), len(examples), "validation frames")
+    judged = (network(example.features) for example in examples)
+    outputs = collected(judged, len(examples), "validation frames", track)
     return output_scores(np.stack(outputs), examples)

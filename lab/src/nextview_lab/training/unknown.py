@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -176,13 +177,8 @@ def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
     tries = 4 * wanted
     elevations = rng.uniform(0, MAX_ELEVATION, tries)
     azimuths = rng.uniform(0, 2 * np.pi, tries)
-    seen = []
-    for pose in look_at_origin(elevations, azimuths):
-        view = camera.observe(pose)
-        if view.seen:
-            seen.append(view)
-        if len(seen) == wanted:
-            break
+    views = map(camera.observe, look_at_origin(elevations, azimuths))
+    seen = list(islice((view for view in views if view.seen), wanted))
     return _embeddings(seen) if seen else np.zeros((0, 0), np.float32)
 
 

@@ -820,7 +820,7 @@ def photograph(
     frames: list[LabelledFrame] = []
     while len(frames) < views:
         sensor = _sensor(rng, shape)
-        pose = _camera_pose(world, rng, sensor)
+        pose = _camera_pose(world, rng)
         rays = PinholeCamera.of(sensor.intrinsics, shape).rays.reshape(-1, 3)
 
         depth, owner = caster.cast(pose[:3, 3], rays @ pose[:3, :3].T)
@@ -839,7 +839,7 @@ def photograph(
     return frames
 
 
-def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
+def _camera_pose(world: World, rng: Generator) -> Float:
     """Draw a camera-to-world pose, (4, 4), aimed at the centre of a world."""
     elevation = np.radians(rng.uniform(*world.elevations))
     azimuth = rng.uniform(0, 2 * np.pi)
