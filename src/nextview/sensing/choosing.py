@@ -14,7 +14,8 @@ from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
-AIM_ERROR = 0.05  # standard deviation of the aim of a camera, image widths
+# image widths beside the optical axis at which an object may be, one among others or alone
+WELL_AIMED, ALONE_AIMED = 0.02, 0.08
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
@@ -49,7 +50,7 @@ def choose_instance(
     elif point is not None:
         chosen = _at_point(seen, point)
     else:
-        chosen = _aimed_at(seen)
+        chosen = _aimed_at(seen, ALONE_AIMED if alone else WELL_AIMED)
     return with_neighbours(chosen, seen) if alone else chosen
 
 
@@ -133,20 +134,25 @@ def _overlap(mask: Mask, inside: Mask) -> float:
     return there**2 / max(int(np.count_nonzero(mask)), 1)
 
 
-def _aimed_at(seen: SegmentedFrame) -> Mask:
-    """Return the instance at which the camera is most likely to be aimed."""
+def _aimed_at(seen: SegmentedFrame, error: float) -> Mask:
+    """Return the largest instance at the optical axis, or near it.
+
+    Args:
+        seen: the frame with its instances.
+        error: image widths from the axis at which an instance counts 1 / e.
+    """
     shown = _of_size(seen)
     if not shown:
         raise ObservationError(NO_INSTANCE.format(where="before the camera"))
-    return max(shown, key=lambda mask: _hit(mask, seen.frame))
+    return max(shown, key=lambda mask: _weight(mask, seen.frame, error))
 
 
-def _hit(mask: Mask, frame: Frame) -> float:
-    """Return how likely an aim with an error hits an instance, up to a factor."""
+def _weight(mask: Mask, frame: Frame, error: float) -> float:
+    """Return the number of pixels of an instance, weighted by distance from the optical axis."""
     rows, columns = np.nonzero(mask)
     column, row = frame.intrinsics[:2, 2]
-    squares = (rows - row) ** 2 + (columns - column) ** 2
-    return float(np.exp(-squares / 2 / (AIM_ERROR * frame.shape[1]) ** 2).sum())
+    away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]
+    return float(len(rows) * np.exp(-((away / error) ** 2)))
 
 
 def _of_size(seen: SegmentedFrame) -> list[Mask]:
