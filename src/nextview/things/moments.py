@@ -15,10 +15,6 @@ from nextview.sensing.view import View
 from nextview.things.point_pairs import FEWEST, TURNS
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-OUTLYING = (
-    4.0  # standard deviations of the depth, beyond which a point is of something else
-)
-
 
 @dataclass(frozen=True, eq=False)
 class Moments:
