@@ -133,6 +133,25 @@ def test_the_requested_object_is_selected_among_several():
         assert_found(thing, mesh, 0.1, 0.08)
 
 
+def test_a_small_object_at_the_axis_is_selected_beside_a_larger_one():
+    small = box((0.08, 0.08, 0.1), (0, 0, 0.05))
+    large = box((0.2, 0.4, 0.3), (0.05, 0.3, 0.15))
+    thing = ObservedObject()
+    pose = pose_at(45, 20, 0.9, (0, 0, 0.05))
+    thing.add(frame([TABLE, small, large], pose, seed=1))
+    assert_found(thing, small, 0.1, 0.08)
+
+
+def test_what_is_far_behind_in_a_mask_is_no_part_of_the_object():
+    pose = pose_at(20, 0, 0.7, (0, 0, 0.06))
+    owner = cast([TABLE, HULL, WALL], pose)[1]
+    mask = (owner == 1) | ((owner == 2) & (np.indices(SHAPE)[1] % 40 < 8))
+    assert (owner[mask] == 2).mean() > 0.1
+    thing = ObservedObject()
+    thing.add(frame([TABLE, HULL, WALL], pose, seed=0, mask=mask))
+    assert_found(thing, HULL, 0.1, 0.1)
+
+
 @pytest.mark.parametrize("gap", [0.01, 0.03])
 def test_things_that_nearly_touch_are_two(gap):
     """The boxes are turned, so that they meet in a concave edge."""
