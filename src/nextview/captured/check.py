@@ -19,6 +19,7 @@ from nextview.sensing.registration import CameraOffset, camera_offsets
 from nextview.types import Float, Index
 
 MOST_REFUSED = 0.1  # largest share of frames left out; a single one is always allowed
+FEW_FRAMES = 20  # up to which mistakes of the pose of one frame are tried
 # contradicted share of what frames show in common if their poses are inconsistent
 MUCH_CONTRADICTED = 0.3
 TIMES_USUAL = 4.0  # of the usual share, from which on a single frame is wrong
@@ -201,12 +202,12 @@ def _contradicting(
     too_many = len(blamed) > (most - (late != 0).sum() if len(frames) >= 5 else 0)
     too_many |= max(_wrong(standing), across) > MUCH_CONTRADICTED
     if too_many or blamed:
+        # among many frames a single one is left out, and to try each would take long
+        few = names if len(names) <= FEW_FRAMES else []
         of_single_poses = [
             one.of_single_pose(row, name)
-            for row, name in enumerate(names)
+            for row, name in enumerate(few)
             for one in in_poses(stored.to_world)
-            if len(names)
-            <= 20  # among more it takes long, and a single one is left out
         ]
         single = _likeliest(posed, of_single_poses, stored.median_depth)
         if single and too_many:
