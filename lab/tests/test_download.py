@@ -2,6 +2,7 @@
 not.
 """
 
+import gc
 import hashlib
 import io
 import threading
@@ -85,7 +86,7 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
     assert (tmp_path / "data/Shapes/chair/train/a.off").read_bytes() == MESH
 
 
-# requests leaves its socket open
+# requests leaves its socket open until it is collected
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("options", "published", "sentence"),
@@ -107,3 +108,5 @@ def test_a_download_with_a_wrong_hash_leaves_no_files(
         download(server.archive(published), tmp_path)
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
+    del refusal
+    gc.collect()
