@@ -224,6 +224,7 @@ def number(
             reach.append(f"above {above:g}")
         if most < np.inf:
             reach.append(f"of at most {most:g}")
+
         raise UsageError(
             f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not"
             f" {one_line(repr(value))}"

@@ -19,7 +19,6 @@ from nextview.sensing.registration import CameraOffset, camera_offsets
 from nextview.types import Float, Index
 
 MOST_REFUSED = 0.1  # largest share of frames left out; a single one is always allowed
-FEW_FRAMES = 20  # up to which mistakes of the pose of one frame are tried
 # contradicted share of what frames show in common if their poses are inconsistent
 MUCH_CONTRADICTED = 0.3
 TIMES_USUAL = 4.0  # of the usual share, from which on a single frame is wrong
@@ -202,12 +201,11 @@ def _contradicting(
     too_many = len(blamed) > (most - (late != 0).sum() if len(frames) >= 5 else 0)
     too_many |= max(_wrong(standing), across) > MUCH_CONTRADICTED
     if too_many or blamed:
-        # among many frames a single one is left out, and to try each would take long
-        few = names if len(names) <= FEW_FRAMES else []
         of_single_poses = [
-            one.of_single_pose(row, name)
-            for row, name in enumerate(few)
+            one.of_single_pose(int(row), names[row])
+            for row in kept[sorted(blamed)]
             for one in in_poses(stored.to_world)
+            if len(blamed) <= most
         ]
         single = _likeliest(posed, of_single_poses, stored.median_depth)
         if single and too_many:

@@ -14,8 +14,10 @@ from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
-# image widths beside the optical axis at which an object may be, one among others or alone
-WELL_AIMED, ALONE_AIMED = 0.02, 0.08
+# image widths beside the optical axis at which an instance counts 1 / e, among other objects or
+# for an object that stands alone
+WELL_AIMED = 0.02
+ALONE_AIMED = 0.08
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"

@@ -138,12 +138,14 @@ class Learned:
         thing = "thing" if self.things == 1 else "things"
         told = f"; {self._how_often()}" if self.accuracy else ""
         lines = [f"{self.things} {thing}{classes} learned{told}"]
+
         lines += [
             f"confused: {a} and {b} ({share:.0%} of the cases)"
             for a, b, share in self.confused[:5]
         ]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
+
         lines += [
             f"never confident: {name}, {why}"
             for name, why in self.never_confident[:MOST_NEVER]
