@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import entr
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints
@@ -93,8 +94,12 @@ class DiscriminateGeometry:
         if outlook is not None:
             cameras = outlook.cameras(self.viewpoints.directions[some])
             expected = outlook.expect(cameras, self.goal)
-            information = expected.worth(self.goal)
             found = expected.found
+            # whether it is one of the hypotheses shows where it was not seen yet
+            unknown = outlook.unknown
+            doubt = float(entr([unknown, 1 - unknown]).sum())
+            information = (1 - unknown) * expected.worth(self.goal)
+            information += doubt * found * self._apart(some, visited) / LEAST_INFORMATION
         best = information.max()
         if best < LEAST_INFORMATION:
             information = found * self._apart(some, visited)

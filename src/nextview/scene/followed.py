@@ -12,6 +12,7 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane
 from nextview.sensing.view import LEVEL, View
+from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
 from nextview.things.register import normal_equations
@@ -22,8 +23,10 @@ from nextview.types import Float
 SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves
 POINTS = 96  # of a thing that are compared
 INDEPENDENT_POINTS = 60.0  # of them, whose errors are not alike
-# error of the expected pose that is left before each step, as a share
-ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
+# error of the expected pose that is left before each step, as a share; and the weight of the
+# contour, which is less accurate than points
+STEPS = ((1.0, 2.0), (0.5, 2.0), (0.25, 1.0), (0.1, 0.5), (0.1, 0.3))
+HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a point
 LONGEST_STEP = 0.5  # radians, or radii
 
 
@@ -81,14 +84,19 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     weight = INDEPENDENT_POINTS / POINTS / error**2
     motion = np.zeros(6)
     told = np.zeros((6, 6))
-    for share in ERRORS_LEFT:
-        reach = float(np.hypot(share * body.displaced, 2 * error)) / radius
-        reach = min(reach, WIDEST)
-        left, right = normal_equations(library, view, _pose(body, state), reach, POINTS)
-        told = weight * left[0]
-        change = np.linalg.solve(
-            told + information, weight * right[0] - information @ motion
+    for share, of_contour in STEPS:
+        some = _pose(body, state)
+        left_over = share * body.displaced
+        reach = min(float(np.hypot(left_over, error)) / radius, WIDEST)
+        left, right = normal_equations(
+            library, view, some, reach, POINTS, hidden=share < HIDDEN_FROM
         )
+        edges = contour_equations(
+            library, view, some, np.array([2 * np.hypot(left_over, error)])
+        )
+        told = weight * left[0] + of_contour * edges[0][0]
+        shown = weight * right[0] + of_contour * edges[1][0]
+        change = np.linalg.solve(told + information, shown - information @ motion)
         longest = np.abs(change / np.repeat([1.0, radius], 3)).max()
         state = state.displaced(
             change * min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))

@@ -20,7 +20,7 @@ from nextview.things.fusion import cell_of
 from nextview.things.library import Library, near_turns
 from nextview.things.memory import open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
-from nextview.things.world import World, corrected
+from nextview.things.world import World, aligned
 from nextview.types import Floats, Index, Mask
 from nextview.views.expected_views import Outlook
 
@@ -184,14 +184,14 @@ class VerifiedRecogniser(NetworkRecogniser):
         among: Mask = ~self.ruled_out[self.labels]
         seen = tuple(observations)
         known = 0
-        world = World(self.library)
+        world = World(self.library, alone=True)
         if self._last is not None and self._last[0] == seen[: len(self._last[0])]:
             known = len(self._last[0])
             world = self._last[1]
         for observation in seen[known:]:
-            view = corrected(world, view_of(observation))
             # what is looked at is an object, and no piece of a wall
-            world = replace(world.with_view(view), flat=()).searched(among).numbered()
+            world = replace(world.with_view(view_of(observation)), flat=())
+            world = aligned(aligned(world).searched(among)).numbered()
         self._last = (seen, world)
         return world
 

@@ -9,13 +9,15 @@ the image shows through a point, the point is pulled back into the outline of it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from nextview.sensing.view import View
+from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
 from nextview.things.score import NOT_MEASURED, OUTLIER
 from nextview.types import Float, Float32, Floats, Mask
@@ -29,6 +31,19 @@ OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matche
 # of a point where nothing is measured, against one that is seen through, as in the score
 MISSING_WEIGHT = np.float32(NOT_MEASURED / OUTLIER)
 MATCHING_ERROR = 0.002  # metres, of a point on the right surface
+# standard deviations of the place of a thing by the error of a camera, left before each step; and
+# the weight of its contour, which is less accurate than its points
+CAMERA_STEPS = (
+    (3.0, 2.0),
+    (2.0, 2.0),
+    (1.5, 2.0),
+    (1.0, 1.0),
+    (0.7, 0.5),
+    (0.5, 0.2),
+    (0.35, 0.1),
+    (0.25, 0.1),
+)
+LEAST_CAMERA_REACH = 0.02  # radii
 ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
 
 
@@ -191,11 +206,7 @@ def camera_error(
     for reach in (0.15, 0.1, 0.06, 0.04, 0.03):
         left, right = normal_equations(library, view, some, reach, count)
         # a motion of each thing about its centre, as one of the world about the camera
-        arm = some.centres - view.camera[:3, 3]
-        about = np.tile(np.eye(6), (len(some), 1, 1))
-        about[:, 3:, :3] = -skew(arm)
-        left = np.einsum("mji,mjk,mkl->il", about, left, about)
-        right = np.einsum("mji,mj->i", about, right)
+        left, right = (each.sum(0) for each in _about_camera(view, some, left, right))
         weight = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
         # the things would have to move by this; so the camera moves the other way
         step = np.linalg.solve(
@@ -207,6 +218,65 @@ def camera_error(
         camera[:3, 3] -= step[3:]
         view = view.seen_from(camera)
     return view
+
+
+def seen_by_camera(
+    library: Library, view: View, some: Hypotheses, count: int = 96
+) -> Hypotheses:
+    """Move each hypothesis to where the view shows it, as far as errors of its camera reach.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses, of which one holds.
+        count: number of points of each.
+    """
+    told = np.repeat(np.array(library.camera) ** -2.0, 3) / 2
+    # things move as the camera errs the other way, beside the error that is known
+    given = view.frame.camera_to_world
+    turn = Rotation.from_matrix(given[:3, :3] @ view.camera[:3, :3].T).as_rotvec()
+    known = np.concatenate([turn, given[:3, 3] - view.camera[:3, 3]])
+    moved = np.tile(known, (len(some), 1))
+    place = view.camera[:3, 3]
+    away = np.linalg.norm(some.centres - place, axis=1)
+    error = np.hypot(library.camera[1], library.camera[0] * away)
+    radius = library.radii[some.things]
+    for share, weight in CAMERA_STEPS:
+        reach = np.maximum(share * error / radius, LEAST_CAMERA_REACH)
+        left, right = normal_equations(library, view, some, reach, count)
+        edges = contour_equations(library, view, some, 1.4 * share * error)
+        points = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
+        left, right = _about_camera(
+            view,
+            some,
+            points * left + weight * edges[0],
+            points * right + weight * edges[1],
+        )
+        right = right - told * moved
+        step = np.linalg.solve(left + np.diag(told), right[..., None])[..., 0]
+        moved += step
+        turn = turned(step[:, :3])
+        arm = some.centres - place
+        some = replace(
+            some,
+            rotations=turn @ some.rotations,
+            centres=place + np.einsum("mij,mj->mi", turn, arm) + step[:, 3:],
+        )
+    # points tell more exactly what they tell
+    return register(library, [view], some, (0.03, 0.02), count)
+
+
+def _about_camera(
+    view: View, some: Hypotheses, left: Float, right: Float
+) -> tuple[Float, Float]:
+    """Return normal equations of hypotheses, (M, 6, 6) and (M, 6), for motions about the camera."""
+    arm = some.centres - view.camera[:3, 3]
+    about = np.tile(np.eye(6), (len(some), 1, 1))
+    about[:, 3:, :3] = -skew(arm)
+    return (
+        np.einsum("mji,mjk,mkl->mil", about, left, about),
+        np.einsum("mji,mj->mi", about, right),
+    )
 
 
 def _step(
@@ -246,9 +316,10 @@ def normal_equations(
     library: Library,
     view: View,
     some: Hypotheses,
-    reach: float,
+    reach: float | Float,
     count: int,
     outline: Outline | None = None,
+    hidden: bool = False,
 ) -> tuple[Float, Float]:
     """Return the normal equations of one view for a small motion of each hypothesis.
 
@@ -259,6 +330,7 @@ def normal_equations(
         reach: how far from a thing what is measured belongs to it, radii.
         count: number of points of each.
         outline: of the segment that they explain; None for none.
+        hidden: whether what is measured in front of a point hides it.
 
     Returns:
         Left side, (M, 6, 6), and right side, (M, 6), float64: rotation about the centre and shift,
@@ -271,6 +343,8 @@ def normal_equations(
     off = np.einsum("min,min->mn", seen.normals, gap)
     used = seen.inside & (seen.depth > 0) & (np.abs(gap[:, 2]) < 4 * near)
     used &= ~view.surface[seen.row, seen.column]
+    if hidden:
+        used &= gap[:, 2] > -near
     if outline is not None:
         down, aside, beyond = outline.at(seen.row, seen.column)
         # what is measured in front of a point beside the segment hides it

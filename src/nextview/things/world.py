@@ -26,7 +26,7 @@ from nextview.things.propose import (
     best,
     propose,
 )
-from nextview.things.register import camera_error, register
+from nextview.things.register import camera_error, register, seen_by_camera
 from nextview.things.score import PIXEL_GAIN, Score, score, total, total_scores
 from nextview.types import Float, Float32, Index, Mask
 
@@ -98,6 +98,7 @@ class World:
         keys: of each hypothesis, (M,) int64: it keeps it as long as it is kept.
         next_key: key of the next new hypothesis.
         given: number of the thing that a hypothesis has explained so far, by its key.
+        alone: whether all views show one thing, which stands, and each has an error of its camera.
     """
 
     library: Library
@@ -112,6 +113,7 @@ class World:
     keys: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     next_key: int = 0
     given: Mapping[int, int] = field(default_factory=dict)
+    alone: bool = False
 
     @property
     def totals(self) -> Float:
@@ -135,7 +137,7 @@ class World:
         views = (*self.views, view)
         if len(self.views) < SETTLED_VIEWS and len(some):
             some = register(self.library, views, some, (0.03, 0.02), 96)
-            columns = [score(self.library, one, some) for one in self.views]
+            columns = [self._column(one, some) for one in self.views]
             scores = [
                 # what came later says nothing of an earlier view
                 tuple(
@@ -148,7 +150,7 @@ class World:
             ]
         else:
             scores = list(self.scores)
-        column = score(self.library, view, some)
+        column = self._column(view, some)
         world = replace(
             self,
             views=views,
@@ -162,6 +164,19 @@ class World:
             owners=(*self.owners, held),
         )
         return _balanced(world).chosen()
+
+    def _column(self, view: View, some: Hypotheses) -> list[Score | None]:
+        """Score hypotheses in a view; those of one thing alone where its camera may see them."""
+        scores = score(self.library, view, some)
+        if not self.alone or not len(some):
+            return scores
+        seen = seen_by_camera(self.library, view, some)
+        return [
+            max(one, other, key=lambda each: -np.inf if each is None else each.total)
+            for one, other in zip(
+                scores, score(self.library, view, seen), strict=True
+            )
+        ]
 
     def searched(self, among: Mask) -> World:
         """Return the world with names for what the last view shows unexplained.
@@ -281,8 +296,10 @@ class World:
         """Return the world with more hypotheses, registered to all views."""
         if len(self.views) > 1:
             new = register(self.library, self.views, new, (0.04, 0.03, 0.02), 64)
-        columns = [score(self.library, one, new) for one in self.views]
-        rows = [_since_it_stands(row) for row in zip(*columns, strict=True)]
+        columns = [self._column(one, new) for one in self.views]
+        rows = list(zip(*columns, strict=True))
+        if not self.alone:
+            rows = [_since_it_stands(row) for row in rows]
         return replace(
             self,
             hypotheses=Hypotheses.joined([self.hypotheses, new]),
@@ -534,6 +551,24 @@ def corrected(world: World, view: View) -> View:
                 value += max(found.total, (1 - MOVED_SHARE) * most * found.seen - MOVED)
         values.append(value)
     return tried[int(np.argmax(values))]
+
+
+def aligned(world: World) -> World:
+    """Return the world of one thing, with cameras that show its best hypothesis in one place."""
+    totals = world.totals
+    if not len(totals):
+        return world
+    row = np.array([totals.argmax()])
+    some = world.hypotheses[row]
+    views = []
+    for view in world.views:
+        seen = seen_by_camera(world.library, view, some)
+        turn = some.rotations[0] @ seen.rotations[0].T
+        camera = view.camera.copy()
+        camera[:3, :3] = turn @ camera[:3, :3]
+        camera[:3, 3] = turn @ (camera[:3, 3] - seen.centres[0]) + some.centres[0]
+        views.append(view.seen_from(camera))
+    return replace(world, views=tuple(views))
 
 
 def _balanced(world: World) -> World:

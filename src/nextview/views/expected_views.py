@@ -270,6 +270,7 @@ class Outlook:
         place: position of the last camera, (3,) float64, object frame, metres.
         taken: number of views so far.
         covariance: of rotation and translation of the first hypothesis, (6, 6) float64.
+        unknown: belief that the thing is none of the hypotheses.
         model: of the pixels and the cameras.
     """
 
@@ -280,6 +281,7 @@ class Outlook:
     place: Float
     taken: int
     covariance: Float
+    unknown: float = 0.0
     model: ExpectedModel = field(default_factory=ExpectedModel)
 
     @classmethod
@@ -330,6 +332,7 @@ class Outlook:
             (to_object @ view.camera)[:3, 3],
             sum(bool(mine.any()) for mine in owners),
             np.diag(variances),
+            float(np.clip(1 - sum(beliefs.values()), 0, 1)),
         )
 
     @property
