@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import entr
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints
@@ -95,11 +94,12 @@ class DiscriminateGeometry:
             cameras = outlook.cameras(self.viewpoints.directions[some])
             expected = outlook.expect(cameras, self.goal)
             found = expected.found
-            # whether it is one of the hypotheses shows where it was not seen yet
+            # what is none of the hypotheses is told by what was not seen yet
             unknown = outlook.unknown
-            doubt = float(entr([unknown, 1 - unknown]).sum())
             information = (1 - unknown) * expected.worth(self.goal)
-            information += doubt * found * self._apart(some, visited) / LEAST_INFORMATION
+            information += (
+                unknown * found * self._apart(some, visited) / LEAST_INFORMATION
+            )
         best = information.max()
         if best < LEAST_INFORMATION:
             information = found * self._apart(some, visited)

@@ -154,7 +154,13 @@ class VerifiedRecogniser(NetworkRecogniser):
         )
         found = None if thing is None else named(world, thing, ())
         if thing is None or found is None:
-            return JointBelief(alone, p_value=0.0, why_no_pose=NOTHING_FITS)
+            unknown = max(world.things, key=lambda one: one.gain, default=None)
+            return JointBelief(
+                alone,
+                p_value=0.0,
+                why_no_pose=NOTHING_FITS,
+                found=None if unknown is None else (world, unknown, {}),
+            )
         belief = np.zeros(classes)
         labels = self.labels[world.hypotheses.things[found.rows]]
         np.add.at(belief, labels, found.probabilities)
@@ -203,7 +209,7 @@ class VerifiedRecogniser(NetworkRecogniser):
             joint: result of ``together`` for them.
 
         Returns:
-            The leading hypotheses and their surroundings; None where nothing explains the views.
+            The leading hypotheses and their surroundings; None where the views show nothing.
         """
         if joint.found is None:
             return None

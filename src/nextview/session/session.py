@@ -317,7 +317,8 @@ class Session:
             found = self._episodes.outlooks(self._episodes.steps[-1], np.ones(1, bool))[
                 0
             ]
-            return found if isinstance(found, Outlook) else None
+            named = isinstance(found, Outlook) and found.unknown < 1
+            return found if named else None
 
     def _left(self) -> Mask:
         """Return which candidates may still be chosen, (V,) bool."""

@@ -27,7 +27,9 @@ LEAST_STEP = 1.0  # pixels of the view
 SHOWN = 2  # of the three steps on each side of a contour that show thing and background
 EDGE_ERROR = 1.5  # pixels: standard deviation of a contour
 ALIKE_EDGES = 3.0  # neighbouring points of a contour whose errors are alike
-THICKNESS = 0.03  # radii within which a pixel shows the surface of a pose that is not final
+THICKNESS = (
+    0.03  # radii within which a pixel shows the surface of a pose that is not final
+)
 
 _STEPS = np.arange(-SHIFTS - DEEP, SHIFTS + DEEP)  # along the normal, outwards
 _SHIFTS = np.arange(-SHIFTS, SHIFTS + 1)
@@ -134,9 +136,9 @@ def _expected(
     row, line, column = np.nonzero(edge)
     # as many of each hypothesis, evenly
     counts = np.bincount(row, minlength=len(some))
-    rank = np.arange(len(row)) - np.append(0, np.cumsum(counts))[row]
-    few = np.minimum(counts, MOST_POINTS)
-    kept = (rank + 1) * few[row] // counts[row] > rank * few[row] // counts[row]
+    rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
+    few = np.minimum(counts, MOST_POINTS)[row]
+    kept = (rank + 1) * few // counts[row] > rank * few // counts[row]
     row, line, column = row[kept], line[kept], column[kept]
 
     down, aside = np.gradient(smooth, axis=(1, 2))
@@ -184,7 +186,9 @@ def _found(
 ) -> tuple[Float, Mask]:
     """Return how far outwards each point of a contour is seen, pixels, and whether it is, (N,)."""
     along = (_STEPS + 0.5) * contours.step[:, None]
-    at = np.floor(contours.places[:, None] + along[..., None] * contours.normals[:, None])
+    at = np.floor(
+        contours.places[:, None] + along[..., None] * contours.normals[:, None]
+    )
     column, line = np.moveaxis(at, 2, 0).astype(int)
     height, width = view.frame.shape
     inside = (column >= 0) & (column < width) & (line >= 0) & (line < height)
@@ -210,7 +214,9 @@ def _found(
     gain = np.where(on, likely + PIXEL_GAIN, np.where(through, OUTLIER, 0))
     # what goes on beyond the contour is not explained
     beside = (np.abs(measured - depth) < margin) & (measured > 0) & ~carries
-    total = (gain * counted).sum(2) + LEFT_OVER * (beside[:, None] & (_INSIDE < 0)).sum(2)
+    total = (gain * counted).sum(2) + LEFT_OVER * (beside[:, None] & (_INSIDE < 0)).sum(
+        2
+    )
 
     best = total.argmax(1)
     each = np.arange(len(best))

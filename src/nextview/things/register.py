@@ -243,7 +243,9 @@ def seen_by_camera(
     radius = library.radii[some.things]
     for share, weight in CAMERA_STEPS:
         reach = np.maximum(share * error / radius, LEAST_CAMERA_REACH)
-        left, right = normal_equations(library, view, some, reach, count)
+        left, right = normal_equations(
+            library, view, some, reach, count, hidden=share <= 1
+        )
         edges = contour_equations(library, view, some, 1.4 * share * error)
         points = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
         left, right = _about_camera(

@@ -173,9 +173,7 @@ class World:
         seen = seen_by_camera(self.library, view, some)
         return [
             max(one, other, key=lambda each: -np.inf if each is None else each.total)
-            for one, other in zip(
-                scores, score(self.library, view, seen), strict=True
-            )
+            for one, other in zip(scores, score(self.library, view, seen), strict=True)
         ]
 
     def searched(self, among: Mask) -> World:

@@ -139,6 +139,12 @@ class HypothesisImages:
     step: Float32
     side: int
 
+    @property
+    def sight(self) -> Float:
+        """Probability that no unobserved obstacle occludes what is expected to show, (V,)."""
+        shown = np.isfinite(self.depth).any(1)
+        return (self.clear * shown).sum(1) / np.maximum(shown.sum(1), 1)
+
     def pixels_shown(self, pitch: float) -> Float:
         """Expected number of camera pixels that show each hypothesis.
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from nextview.recognition.poses import PoseCandidate
+from nextview.things.library import Library
 from nextview.types import Float, Index
 
 OUTLINE_PIXELS = 1.5  # standard deviation of an outline, pixels
@@ -56,6 +59,47 @@ class Leading:
     things: Index
     poses: Float
     belief: Float
+
+    @classmethod
+    def of(
+        cls,
+        library: Library,
+        poses: Sequence[PoseCandidate],
+        beliefs: Mapping[str, float],
+        to_object: Float,
+    ) -> Leading | None:
+        """Return the likeliest of some poses; None if no name is believed.
+
+        Args:
+            library: the things.
+            poses: the likeliest first.
+            beliefs: in the names of the library.
+            to_object: from the world to the object frame, (4, 4).
+        """
+        kept = [one for one in poses if beliefs.get(one.thing, 0) > 0][:MOST_LEADING]
+        if not kept:
+            return None
+        belief = np.array([one.probability * beliefs[one.thing] for one in kept])
+        return cls(
+            np.array([library.names.index(one.thing) for one in kept]),
+            np.stack([to_object @ one.pose for one in kept]),
+            belief / belief.sum(),
+        )
+
+    @classmethod
+    def as_large_as(cls, points: Float, library: Library) -> Leading:
+        """Return the taught thing that is as large as something unknown, in its place.
+
+        Args:
+            points: on it, (N, 3), object frame, metres.
+            library: the things.
+        """
+        middle = (points.min(0) + points.max(0)) / 2
+        radius = np.linalg.norm(points - middle, axis=1).max()
+        thing = int(np.abs(library.radii - radius).argmin())
+        pose = np.eye(4)
+        pose[:3, 3] = middle - library.centres[thing]
+        return cls(np.array([thing]), pose[None], np.ones(1))
 
 
 def inverses(information: Float) -> Float:

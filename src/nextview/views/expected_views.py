@@ -28,7 +28,7 @@ from nextview.views.expected_likelihood import (
     divergences,
     gaps_after_alignment,
 )
-from nextview.views.expected_model import MOST_LEADING, ExpectedModel, Leading
+from nextview.views.expected_model import ExpectedModel, Leading
 from nextview.views.expected_pose import sharper_poses
 
 Goal = Literal["thing", "pose"]
@@ -38,7 +38,7 @@ PICTURE_SIDE = 64  # rows and columns of the pictures for display
 # Bhattacharyya distance of two Gaussians of equal variance, as a share of their divergence
 BHATTACHARYYA = 0.25
 # thing pixels at which half of the information counts
-HALF_FOUND = 1000.0
+HALF_FOUND = 4000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,7 @@ def expected_views(
     moved = gaps_after_alignment(rendered, sensor, model)
     divergence, different = divergences(rendered, moved, sensor, model)
     pixels_shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
-    found = pixels_shown / (pixels_shown + HALF_FOUND)
+    found = rendered.sight * pixels_shown / (pixels_shown + HALF_FOUND)
     sharper = np.zeros(len(cameras))
 
     if covariance is not None:
@@ -302,14 +302,6 @@ class Outlook:
             beliefs: in the names of the library.
             to_object: from the world to the object frame, whose z is up, (4, 4).
         """
-        number = {name: row for row, name in enumerate(world.library.names)}
-        kept = poses[:MOST_LEADING]
-        belief = np.array([one.probability * beliefs.get(one.thing, 0) for one in kept])
-        leading = Leading(
-            np.array([number[one.thing] for one in kept]),
-            np.stack([to_object @ one.pose for one in kept]),
-            belief / max(belief.sum(), 1e-12),
-        )
         view = world.views[-1]
         depth = view.grid().depth
         sensor = ExpectedSensor(
@@ -322,8 +314,13 @@ class Outlook:
             for one, mine in zip(world.views, owners, strict=True)
         ]
         own = np.concatenate(points) @ to_object[:3, :3].T + to_object[:3, 3]
-        variances = [np.radians(kept[0].degrees) ** 2 / 3] * 3
-        variances += [(kept[0].millimetres / 1000) ** 2 / 3] * 3
+        leading = Leading.of(world.library, poses, beliefs, to_object)
+        variances = [1.0] * 6
+        if leading is None:
+            leading = Leading.as_large_as(own, world.library)
+        else:
+            variances[:3] = [np.radians(poses[0].degrees) ** 2 / 3] * 3
+            variances[3:] = [(poses[0].millimetres / 1000) ** 2 / 3] * 3
         return cls(
             world.library.caster,
             leading,
