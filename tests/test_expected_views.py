@@ -164,7 +164,7 @@ def test_a_view_is_expected_to_tell_where_the_score_tells(shown, side):
         assert expected.information()[0] < 0.1 * np.log(2)
 
 
-def outlook_of(belief, taken=1) -> Outlook:
+def outlook_of(belief, taken=1, unknown=0.0) -> Outlook:
     """A box, or the same with a knob, last seen from the side of -x."""
     return Outlook(
         caster=surfaces_of(mesh_of(BODY), mesh_of(BODY, KNOB)),
@@ -174,11 +174,12 @@ def outlook_of(belief, taken=1) -> Outlook:
         place=np.array([-AWAY, 0.0, 0.0]),
         taken=taken,
         covariance=1e-6 * np.eye(6),
+        unknown=unknown,
     )
 
 
 def settled(
-    belief, visited, reachable=None, travel=None, **policy
+    belief, visited, reachable=None, travel=None, unknown=0.0, **policy
 ) -> tuple[int, np.ndarray]:
     """Where the policy goes from some views, a box or the same with a knob, and its values."""
     been = np.isin(np.arange(len(SPHERE)), visited)[None]
@@ -190,7 +191,7 @@ def settled(
         step=len(visited),
         reachable=reachable,
         travel=travel,
-        outlook=[outlook_of(belief, len(visited))],
+        outlook=[outlook_of(belief, len(visited), unknown)],
     )
     chooses = DiscriminateGeometry(SPHERE, **policy)
     values = chooses.view_values(state)[0]
@@ -207,6 +208,27 @@ def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
     chosen, values = settled((0.5, 0.5), [from_behind], reachable)
     assert reachable[0, chosen]
     assert (np.isnan(values) == ~(reachable[0] & (np.arange(40) != from_behind))).all()
+
+
+def test_what_is_none_of_the_hypotheses_is_looked_at_from_the_other_side():
+    ahead = 0  # the knob shows
+    chosen, values = settled((0.5, 0.5), [ahead], unknown=1.0)
+    apart = angle_between(SPHERE.directions, SPHERE.directions[ahead])
+    assert apart[chosen] > np.radians(120)
+    assert np.nanmax(values) > 0.2
+
+
+def test_something_unknown_has_an_outlook_as_large_as_it_is(knobs_memory, knobs):
+    recogniser = VerifiedRecogniser(knobs_memory / "memory.json", 1)
+    library = recogniser.library
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3))
+    points *= library.radii.max() / np.linalg.norm(points, axis=1, keepdims=True)
+    found = Leading.as_large_as(points + np.array([0.3, 0.0, 0.1]), library)
+    (thing,) = found.things
+    assert library.radii[thing] == library.radii.max()
+    middle = found.poses[0, :3, 3] + library.centres[thing]
+    np.testing.assert_allclose(middle, [0.3, 0.0, 0.1], atol=0.01)
 
 
 def test_an_outlook_combines_the_views_and_what_explains_them(knobs_memory, knobs):

@@ -101,7 +101,17 @@ def test_the_page_of_the_numbers_is_what_its_script_writes():
 
 
 @pytest.mark.parametrize(
-    "module", ["flat", "naming", "point_pairs", "propose", "register", "score", "world"]
+    "module",
+    [
+        "contour",
+        "flat",
+        "naming",
+        "point_pairs",
+        "propose",
+        "register",
+        "score",
+        "world",
+    ],
 )
 def test_no_number_of_the_explanation_is_missing_on_the_page(module):
     text = (numbers.PACKAGE / f"things/{module}.py").read_text()

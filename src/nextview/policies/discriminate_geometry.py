@@ -100,6 +100,8 @@ class DiscriminateGeometry:
             information += (
                 unknown * found * self._apart(some, visited) / LEAST_INFORMATION
             )
+            # views that show little of it are worse than is foreseen
+            information = found * information
         best = information.max()
         if best < LEAST_INFORMATION:
             information = found * self._apart(some, visited)

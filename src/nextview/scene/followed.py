@@ -23,9 +23,10 @@ from nextview.types import Float
 SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves
 POINTS = 96  # of a thing that are compared
 INDEPENDENT_POINTS = 60.0  # of them, whose errors are not alike
-# error of the expected pose that is left before each step, as a share; and the weight of the
-# contour, which is less accurate than points
-STEPS = ((1.0, 2.0), (0.5, 2.0), (0.25, 1.0), (0.1, 0.5), (0.1, 0.3))
+# error of the expected pose that is left before each step, as a share
+ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
+# of the contour in each step, which is less accurate than points
+CONTOUR_WEIGHTS = (2.0, 2.0, 1.0, 0.5, 0.3)
 HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a point
 LONGEST_STEP = 0.5  # radians, or radii
 
@@ -84,7 +85,7 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     weight = INDEPENDENT_POINTS / POINTS / error**2
     motion = np.zeros(6)
     told = np.zeros((6, 6))
-    for share, of_contour in STEPS:
+    for share, of_contour in zip(ERRORS_LEFT, CONTOUR_WEIGHTS, strict=True):
         some = _pose(body, state)
         left_over = share * body.displaced
         reach = min(float(np.hypot(left_over, error)) / radius, WIDEST)

@@ -18,6 +18,9 @@ from nextview.things.score import FARTHEST, LEFT_OVER, OUTLIER, PIXEL_GAIN
 from nextview.types import Float, Float32, Index, Mask
 
 ACROSS = 32  # pixels of the image that shows a hypothesis, along each side
+NEAREST = (
+    1.2  # radii in front of the camera, within which a thing is too near to be shown
+)
 BORDER = 1.15  # width of this image, over that of a sphere around the thing
 MOST_POINTS = 48  # of a contour
 FEWEST_POINTS = 4  # of a contour that tells where it is
@@ -30,11 +33,6 @@ ALIKE_EDGES = 3.0  # neighbouring points of a contour whose errors are alike
 THICKNESS = (
     0.03  # radii within which a pixel shows the surface of a pose that is not final
 )
-
-_STEPS = np.arange(-SHIFTS - DEEP, SHIFTS + DEEP)  # along the normal, outwards
-_SHIFTS = np.arange(-SHIFTS, SHIFTS + 1)
-# how deep each step lies within the contour after each shift; negative outside, (S, K)
-_INSIDE = _SHIFTS[:, None] - 1 - _STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,32 +105,61 @@ def contour_equations(
     return turn @ left @ turn.T, right @ turn.T
 
 
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Small images that show M hypotheses, each in the middle of its own.
+
+    Attributes:
+        x: slope x/z of each column, (M, ACROSS) float64.
+        y: slope y/z of each row, (M, ACROSS) float64.
+        depth: (M, ACROSS, ACROSS) float32, metres; infinite where nothing shows.
+        away: distance of each hypothesis along the axis of the camera, (M,), metres.
+    """
+
+    x: Float
+    y: Float
+    depth: Float32
+    away: Float
+
+    @classmethod
+    def of(
+        cls, library: Library, view: View, some: Hypotheses, middle: Float
+    ) -> _Images:
+        """Render hypotheses with middles in the axes of the camera, (M, 3), metres."""
+        radius = library.radii[some.things] * some.sizes.max(1)
+        away = np.maximum(middle[:, 2], NEAREST * radius)
+        half = BORDER * radius / np.sqrt(away**2 - radius**2)
+        lines = half[:, None] * np.linspace(-1, 1, ACROSS)
+        x, y = (middle[:, side, None] / away[:, None] + lines for side in (0, 1))
+        rays = np.ones((len(some), ACROSS, ACROSS, 3), np.float32)
+        rays[..., 0] = x[:, None]
+        rays[..., 1] = y[:, :, None]
+        # a ray of a stretched thing, in its own axes
+        turn = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
+        start = np.einsum(
+            "mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres
+        )
+        start = start / some.sizes + library.centres[some.things]
+        rays = rays.reshape(len(some), -1, 3) @ turn.astype(np.float32)
+        depth, _ = library.caster.cast(some.things, start, rays)
+        return cls(x, y, depth.reshape(len(some), ACROSS, ACROSS), away)
+
+
 def _expected(
     library: Library, view: View, some: Hypotheses, middle: Float, reach: Float
 ) -> _Contours:
-    """Render hypotheses with middles in the axes of the camera, (M, 3), and find their contours."""
-    radius = library.radii[some.things] * some.sizes.max(1)
-    away = np.maximum(middle[:, 2], 1.2 * radius)
-    half = BORDER * radius / np.sqrt(away**2 - radius**2)
-    lines = half[:, None] * np.linspace(-1, 1, ACROSS)
-    x, y = (middle[:, side, None] / away[:, None] + lines for side in (0, 1))
-    rays = np.ones((len(some), ACROSS, ACROSS, 3), np.float32)
-    rays[..., 0] = x[:, None]
-    rays[..., 1] = y[:, :, None]
-    # a ray of a stretched thing, in its own axes
-    turn = (view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]).astype(
-        np.float32
-    )
-    start = np.einsum("mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres)
-    start = start / some.sizes + library.centres[some.things]
-    depth, _ = library.caster.cast(
-        some.things, start, rays.reshape(len(some), -1, 3) @ turn
-    )
-    image = depth.reshape(len(some), ACROSS, ACROSS)
-    shown = np.isfinite(image)
+    """Find where contours of hypotheses are expected.
 
-    smooth = ndimage.gaussian_filter(shown.astype(np.float32), (0, 1, 1))
-    edge = shown & (ndimage.minimum_filter(shown, (1, 3, 3), mode="constant") == 0)
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses.
+        middle: of each in the axes of the camera, (M, 3), metres.
+        reach: how far each may be from there, (M,), metres.
+    """
+    images = _Images.of(library, view, some, middle)
+    shown = np.isfinite(images.depth)
+    edge = shown & ~ndimage.minimum_filter(shown, (1, 3, 3), mode="constant")
     row, line, column = np.nonzero(edge)
     # as many of each hypothesis, evenly
     counts = np.bincount(row, minlength=len(some))
@@ -141,43 +168,36 @@ def _expected(
     kept = (rank + 1) * few // counts[row] > rank * few // counts[row]
     row, line, column = row[kept], line[kept], column[kept]
 
-    down, aside = np.gradient(smooth, axis=(1, 2))
-    normals = -np.stack(
-        [aside[row, line, column], down[row, line, column]], 1, dtype=np.float64
-    )
+    smooth = ndimage.gaussian_filter(shown.astype(np.float32), (0, 1, 1))
+    slopes = [np.asarray(np.gradient(smooth, axis=axis)) for axis in (2, 1)]
+    normals = -np.stack([one[row, line, column] for one in slopes], 1, dtype=np.float64)
     steep = np.linalg.norm(normals, axis=1) + 1e-6
     normals /= steep[:, None]
     # the contour lies between the last pixel that shows the thing and the next one
     beyond = np.clip((smooth[row, line, column] - 0.5) / steep, -0.5, 1.0)
     camera = view.frame.pinhole
-    pitch = (camera.fx * (lines[:, 1] - lines[:, 0]))[row]
-    places = np.stack(
-        [
-            camera.fx * x[row, column] + camera.cx,
-            camera.fy * y[row, line] + camera.cy,
-        ],
-        1,
-    )
-    places += (beyond * pitch)[:, None] * normals
+    pitch = camera.fx * (images.x[row, 1] - images.x[row, 0])
+    places = beyond[:, None] * pitch[:, None] * normals
+    places[:, 0] += camera.fx * images.x[row, column] + camera.cx
+    places[:, 1] += camera.fy * images.y[row, line] + camera.cy
 
-    step = np.maximum(reach / away * camera.fx / SHIFTS, LEAST_STEP)[row]
+    step = np.maximum(reach / images.away * camera.fx / SHIFTS, LEAST_STEP)[row]
     deep = (np.arange(DEEP) + 0.5) * (step / pitch)[:, None] - beyond[:, None]
-    inner_line, inner_column = (
+    into = [
         np.rint(at[:, None] - deep * normals[:, side, None])
         .astype(int)
         .clip(0, ACROSS - 1)
         for at, side in ((line, 1), (column, 0))
-    )
-    thick = shown[row[:, None], inner_line, inner_column]
-    inner = np.where(thick, image[row[:, None], inner_line, inner_column], 0)
+    ]
+    inner = images.depth[row[:, None], into[0], into[1]]
     return _Contours(
         row,
         places,
         normals,
         step,
-        image[row, line, column],
-        inner.astype(np.float32),
-        np.logical_and.accumulate(thick, axis=1),
+        images.depth[row, line, column],
+        np.where(np.isfinite(inner), inner, 0),
+        np.logical_and.accumulate(np.isfinite(inner), axis=1),
     )
 
 
@@ -185,7 +205,11 @@ def _found(
     library: Library, view: View, some: Hypotheses, contours: _Contours
 ) -> tuple[Float, Mask]:
     """Return how far outwards each point of a contour is seen, pixels, and whether it is, (N,)."""
-    along = (_STEPS + 0.5) * contours.step[:, None]
+    steps = np.arange(-SHIFTS - DEEP, SHIFTS + DEEP)  # along the normal, outwards
+    shifts = np.arange(-SHIFTS, SHIFTS + 1)
+    # how deep each step lies within the contour after each shift; negative outside, (S, K)
+    depths = shifts[:, None] - 1 - steps
+    along = (steps + 0.5) * contours.step[:, None]
     at = np.floor(
         contours.places[:, None] + along[..., None] * contours.normals[:, None]
     )
@@ -203,8 +227,8 @@ def _found(
     margin = (FARTHEST * np.hypot(sigma, pose)).astype(np.float32)
 
     # after each shift, (N, S, K)
-    deep = _INSIDE.clip(0, DEEP - 1)
-    counted = contours.thick[:, deep] & (_INSIDE >= 0) & (_INSIDE < DEEP)
+    deep = depths.clip(0, DEEP - 1)
+    counted = contours.thick[:, deep] & (depths >= 0) & (depths < DEEP)
     off = measured[:, None] - contours.inner[:, deep]
     got = (measured > 0)[:, None]
     near = np.abs(off) < margin[..., None]
@@ -214,15 +238,14 @@ def _found(
     gain = np.where(on, likely + PIXEL_GAIN, np.where(through, OUTLIER, 0))
     # what goes on beyond the contour is not explained
     beside = (np.abs(measured - depth) < margin) & (measured > 0) & ~carries
-    total = (gain * counted).sum(2) + LEFT_OVER * (beside[:, None] & (_INSIDE < 0)).sum(
-        2
-    )
+    left = (beside[:, None] & (depths < 0)).sum(2)
+    total = (gain * counted).sum(2) + LEFT_OVER * left
 
     best = total.argmax(1)
     each = np.arange(len(best))
-    close = np.abs(_INSIDE + 0.5) < 3
+    close = np.abs(depths + 0.5) < 3
     behind = (measured > depth + margin) | (carries & (measured > depth - margin))
     shows = (on & counted & close)[each, best].sum(1) >= SHOWN
-    ends = (behind[:, None] & (_INSIDE < 0) & close)[each, best].sum(1) >= SHOWN
-    shift = _SHIFTS[best] * contours.step
-    return shift, shows & ends & (np.abs(_SHIFTS[best]) < SHIFTS)
+    ends = (behind[:, None] & (depths < 0) & close)[each, best].sum(1) >= SHOWN
+    shift = shifts[best] * contours.step
+    return shift, shows & ends & (np.abs(shifts[best]) < SHIFTS)

@@ -38,7 +38,7 @@ PICTURE_SIDE = 64  # rows and columns of the pictures for display
 # Bhattacharyya distance of two Gaussians of equal variance, as a share of their divergence
 BHATTACHARYYA = 0.25
 # thing pixels at which half of the information counts
-HALF_FOUND = 4000.0
+HALF_FOUND = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
