@@ -294,7 +294,9 @@ class World:
         """Return the world with more hypotheses, registered to all views."""
         if len(self.views) > 1:
             new = register(self.library, self.views, new, (0.04, 0.03, 0.02), 64)
-        columns = [self._column(one, new) for one in self.views]
+            columns = [self._column(one, new) for one in self.views]
+        else:
+            columns = [score(self.library, one, new) for one in self.views]
         rows = list(zip(*columns, strict=True))
         if not self.alone:
             rows = [_since_it_stands(row) for row in rows]
@@ -554,7 +556,7 @@ def corrected(world: World, view: View) -> View:
 def aligned(world: World) -> World:
     """Return the world of one thing, with cameras that show its best hypothesis in one place."""
     totals = world.totals
-    if not len(totals):
+    if len(world.views) < 2 or not len(totals):
         return world
     row = np.array([totals.argmax()])
     some = world.hypotheses[row]
