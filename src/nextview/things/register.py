@@ -224,6 +224,7 @@ def seen_by_camera(
         some: M hypotheses, of which one holds.
         count: number of points of each.
     """
+    # the pose is from a view with an error of its own: their difference has twice the variance
     told = np.repeat(np.array(library.camera) ** -2.0, 3) / 2
     # things move as the camera errs the other way, beside the error that is known
     given = view.frame.camera_to_world
