@@ -199,8 +199,10 @@ class World:
                 if _settled(row):
                     before.ravel()[last.cells] = True
 
+        # what a view of one thing shows better than all others may be a handle: it is searched
+        sure = np.inf if self.alone else SURE_SHARE
         for segments, share, known in (
-            (view.instances, SURE_SHARE, before),
+            (view.instances, sure, before),
             (view.unions, CLEAR_SHARE, strange),
             (view.fragments, CLEAR_SHARE, strange),
         ):
