@@ -226,7 +226,7 @@ def seen_by_camera(
     """
     # the pose is from a view with an error of its own: their difference has twice the variance
     told = np.repeat(np.array(library.camera) ** -2.0, 3) / 2
-    # things move as the camera errs the other way, beside the error that is known
+    # an error of the camera looks like the opposite motion of the thing; some of it is corrected
     given = view.frame.camera_to_world
     turn = Rotation.from_matrix(given[:3, :3] @ view.camera[:3, :3].T).as_rotvec()
     known = np.concatenate([turn, given[:3, 3] - view.camera[:3, 3]])
@@ -258,7 +258,7 @@ def seen_by_camera(
             rotations=turn @ some.rotations,
             centres=place + np.einsum("mij,mj->mi", turn, arm) + step[:, 3:],
         )
-    # points tell more exactly what they tell
+    # the contour has a bias; in the directions that points tell, they are more exact
     return register(library, [view], some, (0.03, 0.02), count)
 
 

@@ -166,7 +166,7 @@ class World:
         return _balanced(world).chosen()
 
     def _column(self, view: View, some: Hypotheses) -> list[Score | None]:
-        """Score hypotheses in a view; those of one thing alone where its camera may see them."""
+        """Score hypotheses in a view; if all show one thing, with the error of its camera."""
         scores = score(self.library, view, some)
         if not self.alone or not len(some):
             return scores
@@ -199,7 +199,7 @@ class World:
                 if _settled(row):
                     before.ravel()[last.cells] = True
 
-        # what a view of one thing shows better than all others may be a handle: it is searched
+        # a view that one thing explains is searched, too: a handle may tell it from another one
         sure = np.inf if self.alone else SURE_SHARE
         for segments, share, known in (
             (view.instances, sure, before),
@@ -299,6 +299,7 @@ class World:
             columns = [self._column(one, new) for one in self.views]
         else:
             columns = [score(self.library, one, new) for one in self.views]
+
         rows = list(zip(*columns, strict=True))
         if not self.alone:
             rows = [_since_it_stands(row) for row in rows]
