@@ -34,7 +34,7 @@ MATCHING_ERROR = 0.002  # metres, of a point on the right surface
 # standard deviations of the place of a thing by the error of a camera, left before each step
 CAMERA_ERRORS_LEFT = (3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.35, 0.25)
 # of its contour in each step, which is less accurate than its points
-CONTOUR_WEIGHTS = (2.0, 2.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.1)
+CONTOUR_WEIGHTS = (0.0, 2.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.1)
 CONTOUR_REACH = 1.4  # times what is left of the error
 LEAST_CAMERA_REACH = 0.02  # radii
 ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
