@@ -73,10 +73,6 @@ class VerifiedRecogniser(NetworkRecogniser):
             for thing in about.things
         }
         self.library = Library(surfaces, symmetries, near, threads)
-        self.library.near_all = {
-            thing.name: near_turns(thing.near_symmetries, ())
-            for thing in about.things
-        }
         self._last: tuple[tuple[Observation, ...], World] | None = None
 
     def __getstate__(self) -> dict[str, Any]:

@@ -244,9 +244,8 @@ def _found(
     best = total.argmax(1)
     each = np.arange(len(best))
     close = np.abs(depths + 0.5) < 3
-    # nothing is measured far away and in shadows
     behind = (measured > depth + margin) | (carries & (measured > depth - margin))
-    behind |= inside & (measured == 0)
+    behind |= inside & (measured == 0)  # far away, or in a shadow
     shows = (on & counted & close)[each, best].sum(1) >= SHOWN
     ends = (behind[:, None] & (depths < 0) & close)[each, best].sum(1) >= SHOWN
     shift = shifts[best] * contours.step

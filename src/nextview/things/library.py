@@ -241,15 +241,6 @@ class Hypotheses:
         each = self[np.repeat(np.arange(len(self)), len(turns))]
         return replace(each, rotations=rotations.reshape(-1, 3, 3))
 
-    def nearly(self, library):
-        found=[]
-        for k,(thing, rotation, centre) in enumerate(zip(self.things, self.rotations, self.centres, strict=True)):
-            near = library.near_all.get(library.names[thing], np.zeros((0, 3, 3)))
-            mid = library.principal.middles[thing]
-            rotations = rotation @ near
-            found.append(Hypotheses.of(np.full(len(near), thing), rotations, centre + rotation @ mid - rotations @ mid))
-        return found
-
     def in_other_sizes(self) -> Hypotheses:
         """Return eight of each: larger and smaller, as a whole and along each axis."""
         along = np.concatenate([np.eye(3), np.ones((1, 3))])

@@ -32,9 +32,7 @@ OUTLINE_WEIGHT = 0.5  # of a point that is seen through, against one that matche
 MISSING_WEIGHT = np.float32(NOT_MEASURED / OUTLIER)
 MATCHING_ERROR = 0.002  # metres, of a point on the right surface
 # standard deviations of the place of a thing by the error of a camera, left before each step
-CAMERA_ERRORS_LEFT = (3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.35, 0.25)
-# of its contour in each step, which is less accurate than its points
-CONTOUR_WEIGHTS = (0.0, 2.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.1)
+CAMERA_ERRORS_LEFT = (4.0, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 0.5)
 CONTOUR_REACH = 1.4  # times what is left of the error
 LEAST_CAMERA_REACH = 0.02  # radii
 ALIKE_POINTS = 8.0  # neighbouring points whose errors are alike
@@ -235,19 +233,17 @@ def seen_by_camera(
     away = np.linalg.norm(some.centres - place, axis=1)
     error = np.hypot(library.camera[1], library.camera[0] * away)
     radius = library.radii[some.things]
-    for share, weight in zip(CAMERA_ERRORS_LEFT, CONTOUR_WEIGHTS, strict=True):
+    for number, share in enumerate(CAMERA_ERRORS_LEFT):
         reach = np.maximum(share * error / radius, LEAST_CAMERA_REACH)
         left, right = normal_equations(
             library, view, some, reach, count, hidden=share <= 1
         )
-        edges = contour_equations(library, view, some, CONTOUR_REACH * share * error)
-        points = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
-        left, right = _about_camera(
-            view,
-            some,
-            points * left + weight * edges[0],
-            points * right + weight * edges[1],
-        )
+        left, right = (one / MATCHING_ERROR**2 / ALIKE_POINTS for one in (left, right))
+        if number:  # a contour is sought where its depth is known
+            reach = CONTOUR_REACH * share * error
+            edges = contour_equations(library, view, some, reach)
+            left, right = left + edges[0], right + edges[1]
+        left, right = _about_camera(view, some, left, right)
         right = right - told * moved
         step = np.linalg.solve(left + np.diag(told), right[..., None])[..., 0]
         moved += step

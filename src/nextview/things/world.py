@@ -55,8 +55,6 @@ MOST_VIEWS = 6  # that are kept
 SETTLED_VIEWS = 3  # views after which poses are not refined, and names not searched
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
-import os
-NEARALL=int(os.environ.get('NEARALL','0'))
 _Rows = tuple[tuple[Score | None, ...], ...]
 
 
@@ -233,31 +231,18 @@ class World:
         for row in self._doubtful():
             near = self.rivals(row)
             near = near[taught[near] & (totals[near] > AS_LIKELY * totals[row])]
-            rows.update(near[np.argsort(-totals[near])][:(NEARALL if NEARALL and self.alone and len(self.views)>1 else RESTARTED)].tolist())
+            rows.update(near[np.argsort(-totals[near])][:RESTARTED].tolist())
         if not rows:
             return self
 
         # of each the best one, if it is better
         some = self.hypotheses[np.array(sorted(rows), np.int64)]
-        turned = some.turned(RESTART)
-        each = 6 * np.arange(len(some))[:, None] + np.arange(6)
-        groups = [turned[row] for row in each]
-        if NEARALL and self.alone and len(self.views) > 1:
-            groups = [
-                Hypotheses.joined([one, near]) for one, near in zip(groups, some.nearly(self.library), strict=True)
-            ]
-        new = Hypotheses.joined(groups)
         closer = (0.12, 0.08, 0.06, 0.04, 0.03, 0.02)
-        new = register(self.library, self.views, new, closer, 96)
-        gains = self._coarse_totals(new)
-        ends = np.cumsum([len(one) for one in groups])
-        before = self._coarse_totals(some)
-        kept = []
-        for k, part in enumerate(np.split(np.arange(len(new)), ends[:-1])):
-            top = part[gains[part].argmax()]
-            if gains[top] > before[k]:
-                kept.append(top)
-        return self.with_hypotheses(new[np.array(kept, np.int64)]).chosen()
+        new = register(self.library, self.views, some.turned(RESTART), closer, 96)
+        gains = self._coarse_totals(new).reshape(len(some), -1)
+        first = gains.shape[1] * np.arange(len(some))
+        better = gains.max(1) > self._coarse_totals(some)
+        return self.with_hypotheses(new[(first + gains.argmax(1))[better]]).chosen()
 
     def with_other_sizes(self) -> World:
         """Return the world with new or doubtful things in another size, that which fits best."""
@@ -279,7 +264,7 @@ class World:
             for one in self.things
             if one.row >= 0
             and not _settled(one.scores)
-            and (NEARALL and self.alone or int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
+            and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
         ]
         return np.array(rows, np.int64)
 
