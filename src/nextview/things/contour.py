@@ -29,7 +29,7 @@ DEEP = 6  # steps inside of a contour that are compared
 LEAST_STEP = 1.0  # pixels of the view
 SHOWN = 2  # of the three steps on each side of a contour that show thing and background
 EDGE_ERROR = 1.5  # pixels: standard deviation of a contour
-ALIKE_EDGES = 3.0  # neighbouring points of a contour whose errors are alike
+ALIKE_EDGES = 1.5  # neighbouring points of a contour whose errors are alike
 THICKNESS = (
     0.03  # radii within which a pixel shows the surface of a pose that is not final
 )
