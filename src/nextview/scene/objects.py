@@ -32,6 +32,7 @@ from nextview.types import Float, Mask
 UNKNOWN_NAME = "unknown"
 SETTLED_OBJECT_VIEWS = 2  # views after which an unknown object is settled
 TOUCHING = 0.015  # metres of depth between two objects that touch
+SEEN_POINTS = 400  # of an object, that a frame adds at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +112,6 @@ class SceneObject:
         return (
             f"{self.number}: {self.name}, belief {self.confidence:.3f}, {sure}, {where}"
         )
-
-
-SEEN_POINTS = 400  # of an object, that a frame adds at most
 
 
 def objects_of(

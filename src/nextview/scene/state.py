@@ -43,8 +43,8 @@ class SceneState:
     objects: tuple[SceneObject, ...] = ()
     ruled_out: Mapping[int, Mapping[str, str]] = field(default_factory=dict)
 
-    def named(self, ruled_out: Mapping[int, Mapping[str, str]]) -> SceneState:
-        """Return the scene after a frame with its objects.
+    def with_objects(self, ruled_out: Mapping[int, Mapping[str, str]]) -> SceneState:
+        """Return the scene with the objects that its world shows.
 
         Args:
             ruled_out: names that objects cannot have, with the reasons, by their numbers.
