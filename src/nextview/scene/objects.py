@@ -126,7 +126,7 @@ def objects_of(
         tops: support surfaces of each frame.
         ruled_out: names that objects cannot have, with the reasons, by their numbers.
     """
-    pairs = touching(world)
+    pairs = touching_pairs(world)
     return tuple(
         _object(world, thing, tops, pairs, ruled_out.get(thing.number, {}))
         for thing in sorted(world.things, key=lambda one: one.number)
@@ -215,7 +215,7 @@ def seen_points(world: World, number: int) -> Float:
     return np.concatenate(found)
 
 
-def touching(world: World) -> set[tuple[int, int]]:
+def touching_pairs(world: World) -> set[tuple[int, int]]:
     """Return the pairs of things that touch in some view, the smaller number first."""
     found = set()
     for view, owner in zip(world.views, world.owners, strict=True):
