@@ -237,8 +237,6 @@ def check_array(
     values: Any,
     kind: Any,
     shape: tuple[int | None, ...],
-    finite: bool = True,
-    empty: bool = False,
 ) -> None:
     """Check an array that was read from a file of weights.
 
@@ -247,8 +245,6 @@ def check_array(
         values: The array.
         kind: The kind of its numbers: ``np.floating``, ``np.integer`` or one dtype.
         shape: Its shape; None where any size but zero will do.
-        finite: Whether all values have to be finite.
-        empty: Whether a size of zero will do there, too.
 
     Raises:
         ModelError: it is none, or has other numbers or another shape, or a value is not finite.
@@ -258,12 +254,12 @@ def check_array(
 
     fits = values.ndim == len(shape)
     for wanted, there in zip(shape, values.shape, strict=False):
-        fits = fits and (there > 0 or empty if wanted is None else there == wanted)
+        fits = fits and (there > 0 if wanted is None else there == wanted)
     if not fits:
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
         raise ModelError(f"{what} have the shape {values.shape}, not ({sizes})")
 
-    if finite and not np.isfinite(values).all():
+    if not np.isfinite(values).all():
         raise ModelError(f"{what} are not all finite numbers")
 
 

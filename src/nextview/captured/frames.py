@@ -180,7 +180,7 @@ class Capture:
 
     Attributes:
         folder: or file from which they were read.
-        layout: one of ``captured.LAYOUTS``.
+        layout: one of ``captured.folders.FOLDER_LAYOUTS``.
         frames: in the folder's order, at least one.
         up: direction against gravity in the world; None if the layout does not define it.
         notes: assumptions and omissions, a phrase each.

@@ -74,41 +74,38 @@ def headlight(depth: Float32, intrinsics: Float) -> NDArray[np.uint8]:
 
 
 @lru_cache(maxsize=8)
-def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
+def pixel_order(pixels: int) -> NDArray[np.int32]:
     """Return a fixed shuffle of an image's pixels, by which points are drawn.
 
     Args:
         pixels: number of pixels of the image.
-        seed: of the shuffle.
 
     Returns:
         Indices of the pixels, (pixels,) int32; earlier ones are preferred.
     """
-    return np.random.default_rng(seed).permutation(pixels).astype(np.int32)
+    return np.random.default_rng(0).permutation(pixels).astype(np.int32)
 
 
 def visible_points(
     depth: Float32,
     pose: Float,
     intrinsics: Float,
-    seed: int = 0,
 ) -> Float32:
     """Draw points on the visible surface.
 
-    The draw is uniform over the pixels that show the object. It depends on the seed and these
-    pixels alone, and few pixels repeat.
+    The draw is uniform over the pixels that show the object. It depends on these pixels alone,
+    and few repeat.
 
     Args:
         depth: (H, W) float32; 0 where there is no object.
         pose: camera-to-world, (4, 4), OpenCV axes, in the unit of the depth.
         intrinsics: pinhole matrix, (3, 3), pixels.
-        seed: of the draw.
 
     Returns:
         Points, (1024, 3) float32, object frame; all zero if nothing is visible.
     """
     flat = object_depth(depth).ravel()
-    order = pixel_order(flat.size, seed)
+    order = pixel_order(flat.size)
     # most often the beginning of the order holds enough
     for first in (4 * CLOUD_POINTS, 8 * CLOUD_POINTS, 16 * CLOUD_POINTS, flat.size):
         visible = np.flatnonzero(flat[order[:first]])

@@ -254,7 +254,8 @@ def load_mesh(
         The mesh.
 
     Raises:
-        MeshError: the file cannot be used.
+        MeshError: the file, ``up`` or ``unit`` cannot be used.
+        UsageError: ``max_faces`` is no whole number from 1 on.
 
     Example:
         >>> nextview.load_mesh("samples/chair.off").faces.shape  # doctest: +SKIP

@@ -139,7 +139,7 @@ class Observation:
 
     @cached_property
     def visible(self) -> int:
-        """Pixels that show the object."""
+        """Number of pixels that show the object."""
         return int(np.count_nonzero(self.depth))
 
     @cached_property
@@ -194,7 +194,11 @@ class Camera(Protocol):
     """
 
     def observe(self, pose: Float) -> Observation:
-        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
+        """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii.
+
+        Raises:
+            NoViewLeftError: no view is left, which ends the session.
+        """
 
 
 def checked_pose(pose: Any) -> Float:

@@ -272,6 +272,9 @@ class Directions(Viewpoints):
         """Spread n views evenly over the upper hemisphere.
 
         They lie on a Fibonacci lattice (Swinbank and Purser, QJRMS 132, 2006).
+
+        Raises:
+            UsageError: n is below 1 or above MOST_VIEWPOINTS.
         """
         whole(n, "the number of viewpoints", 1, MOST_VIEWPOINTS)
         height = (np.arange(n) + 0.5) / n
@@ -315,6 +318,9 @@ class ViewSphere(Viewpoints):
         """Return a layout of the thesis: "40" (5 rings of 8) or "12" (one ring at 45 degrees).
 
         See section 4.1.1.
+
+        Raises:
+            UsageError: there is no such layout.
         """
         if name not in VIEW_LAYOUTS:
             raise UsageError(
@@ -394,7 +400,7 @@ class ViewSphere(Viewpoints):
         return _fixed(np.hypot(rings, np.minimum(steps, self.azimuths - steps)))
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
-        """Return the ring and azimuth step of directions, with fractions.
+        """Return ring and azimuth step of directions, (..., 3), with fractions, (...) each.
 
         Beyond the last ring it is that ring.
         """

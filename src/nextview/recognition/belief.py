@@ -420,11 +420,6 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         return low, high
 
     @property
-    def largest(self) -> float:
-        """Radius of the largest objects of any class, but for rare ones, metres."""
-        return float(np.exp(self._usual[1].max()))
-
-    @property
     def smallest(self) -> float:
         """Radius of the smallest objects of any class, but for rare ones, metres."""
         return float(np.exp(self._usual[0].min()))

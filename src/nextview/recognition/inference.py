@@ -295,7 +295,18 @@ class Models:
         return tuple(self.classes.index(c) for c in valleys if c in self.classes)
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
-        """Evidence and maps of views from one camera."""
+        """Return what the recogniser and the maps say of views from one camera.
+
+        Args:
+            observations: B views.
+
+        Returns:
+            Their evidence, a row for each view.
+
+        Raises:
+            ObservationError: there is no view.
+            ModelError: a network fails.
+        """
         maps = {
             name: values
             for network in self.maps.values()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.depth import object_depth, slope
 from nextview.geometry.observation import Observation
-from nextview.types import Float, Float32, Index
+from nextview.types import Float, Float32
 
 InputKind = Literal["geometry", "image", "cloud"]
 CHANNELS = ("facing", "up", "height", "nearness")
@@ -92,7 +92,6 @@ def from_store(
     spec: InputSpec,
     store: Any,
     i: int,
-    chosen: Index | slice = slice(None),
 ) -> NDArray[Any]:
     """Compute the input of a network from the stored views of an object.
 
@@ -100,7 +99,6 @@ def from_store(
         spec: what the network takes.
         store: a ``ViewStore``.
         i: row of the object.
-        chosen: the views, (B,) int64; all by default.
 
     Returns:
         Input of the network, (B, ...).
@@ -112,8 +110,8 @@ def from_store(
     }
     return _network_input(
         spec,
-        reads[spec.kind](i)[chosen],
-        store.sphere.poses[chosen],
+        reads[spec.kind](i)[:],
+        store.sphere.poses,
         store.intrinsics,
     )
 

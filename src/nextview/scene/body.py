@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit, logit
 
-from nextview.recognition.poses import PoseCandidate, PoseUncertainty
+from nextview.recognition.poses import PoseUncertainty
 from nextview.scene.motion import BodyState, MotionModel, Rest
 from nextview.scene.objects import SceneObject
 from nextview.things.library import Library
@@ -103,18 +103,6 @@ class Body:
             return None
         posed = one.candidates[0]
         pose = posed.pose if motion is None else motion @ posed.pose
-        return cls._placed(one.number, library, posed, pose, model)
-
-    @classmethod
-    def _placed(
-        cls,
-        number: int,
-        library: Library,
-        posed: PoseCandidate,
-        pose: Float,
-        model: MotionModel,
-    ) -> Body:
-        """Start with a thing in a pose, (4, 4), metres, as uncertain as that of a candidate."""
         thing = library.names.index(posed.thing)
         surface = library.caster.surfaces[thing]
 
@@ -134,7 +122,7 @@ class Body:
         )
 
         return cls(
-            number, posed.thing, surface, thing, state, 0.0, Rest.at(state), state
+            one.number, posed.thing, surface, thing, state, 0.0, Rest.at(state), state
         )
 
     @property

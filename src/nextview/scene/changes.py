@@ -99,8 +99,8 @@ def changes(world: World, view: View, camera_stands: bool) -> Changes:
         return still
     if not camera_stands:
         view = corrected(world, view)
-    found = _named(world, view)
-    found += _unnamed(world, view, found)
+    found = _by_scan(world, view)
+    found += _by_measured_surface(world, view, found)
 
     moved = [one for one in found if one.now == "moved"]
     gone = tuple(one.thing for one in found if one.now == "gone")
@@ -180,15 +180,17 @@ def _clear(one: Thing) -> bool:
     return one.row >= 0 and one.share >= CLEAR_SHARE
 
 
-def _named(world: World, view: View) -> list[_Compared]:
-    """Compare the things with clear names."""
+def _by_scan(world: World, view: View) -> list[_Compared]:
+    """Compare the things with clear names, by their scans."""
     things = [one for one in world.things if _clear(one)]
     rows = np.array([one.row for one in things], np.int64)
     there = world.hypotheses[rows]
     return _compared(world, view, things, world.library, there, ()) if things else []
 
 
-def _unnamed(world: World, view: View, others: Sequence[_Compared]) -> list[_Compared]:
+def _by_measured_surface(
+    world: World, view: View, others: Sequence[_Compared]
+) -> list[_Compared]:
     """Compare the surfaces that were measured of all other things.
 
     Args:

@@ -343,10 +343,10 @@ def elsewhere_value(tops: Sequence[TableTop], views: Candidates) -> Float:
         views: the candidates.
     """
     earlier = [top.frame.camera_to_world[:3, 2] for top in tops]
-    return UNKNOWN_WORTH * _turned(views.poses[:, :3, 2], earlier) / np.pi
+    return UNKNOWN_WORTH * _nearest_angle(views.poses[:, :3, 2], earlier) / np.pi
 
 
-def _turned(towards: Float, earlier: Sequence[Float]) -> Float:
+def _nearest_angle(towards: Float, earlier: Sequence[Float]) -> Float:
     """Return the angle from unit vectors, (V, 3), to the nearest of earlier ones, radians, (V,)."""
     return np.min([angle_between(towards, before) for before in earlier], axis=0)
 
@@ -378,12 +378,12 @@ def _from_another_side(
 ) -> Float:
     """Return the value of each view by its distance from the views of one object, nats, (V,)."""
     places = [tops[number].frame.camera_to_world[:3, 3] for number in one.pixels]
-    earlier = [_towards(place - one.place) for place in places]
-    towards = _towards(views.poses[:, :3, 3] - one.place)
+    earlier = [_unit(place - one.place) for place in places]
+    towards = _unit(views.poses[:, :3, 3] - one.place)
     worth = one.confidence * SURE_WORTH + (1 - one.confidence) * UNKNOWN_WORTH
-    return worth * _turned(towards, earlier) / np.pi
+    return worth * _nearest_angle(towards, earlier) / np.pi
 
 
-def _towards(ways: Float) -> Float:
+def _unit(ways: Float) -> Float:
     """Return vectors, (..., 3), at unit length."""
     return np.asarray(ways / np.linalg.norm(ways, axis=-1, keepdims=True))

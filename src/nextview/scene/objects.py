@@ -32,6 +32,7 @@ from nextview.types import Float, Mask
 UNKNOWN_NAME = "unknown"
 SETTLED_OBJECT_VIEWS = 2  # views after which an unknown object is settled
 TOUCHING = 0.015  # metres of depth between two objects that touch
+SEEN_POINTS = 400  # of an object, that a frame adds at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +114,6 @@ class SceneObject:
         )
 
 
-SEEN_POINTS = 400  # of an object, that a frame adds at most
-
-
 def objects_of(
     world: World,
     tops: Sequence[TableTop],
@@ -128,7 +126,7 @@ def objects_of(
         tops: support surfaces of each frame.
         ruled_out: names that objects cannot have, with the reasons, by their numbers.
     """
-    pairs = touching(world)
+    pairs = touching_pairs(world)
     return tuple(
         _object(world, thing, tops, pairs, ruled_out.get(thing.number, {}))
         for thing in sorted(world.things, key=lambda one: one.number)
@@ -217,7 +215,7 @@ def seen_points(world: World, number: int) -> Float:
     return np.concatenate(found)
 
 
-def touching(world: World) -> set[tuple[int, int]]:
+def touching_pairs(world: World) -> set[tuple[int, int]]:
     """Return the pairs of things that touch in some view, the smaller number first."""
     found = set()
     for view, owner in zip(world.views, world.owners, strict=True):

@@ -34,7 +34,7 @@ class OpenPoint:
     in_sight: bool = True
 
     def __repr__(self) -> str:
-        """One line: ``3: belief 0.731, and a confident name needs 0.97``."""
+        """One line: ``3: few pixels show it; no view is left that shows it``."""
         why = (
             self.why if self.in_sight else f"{self.why}; no view is left that shows it"
         )

@@ -160,7 +160,9 @@ class Scene:
         rule: rules out names of objects, given all objects, see ``scene.rule.SceneRule``.
 
     Raises:
+        ModelError: the models cannot be used, or have no things of known geometry.
         PolicyError: there is no such policy, or it cannot be made.
+        UsageError: ``up``, ``distance``, ``reachable`` or ``travel_cost`` is not valid.
     """
 
     def __init__(
@@ -442,6 +444,7 @@ class Scene:
         Raises:
             ObservationError: the frame is invalid or has no pose, it shows no support plane, it
                 does not fit the known world, or ``segmentation`` returned no masks.
+            UsageError: ``segmentation`` or ``rule`` raises, or the rule returns no names.
         """
         with self._lock, one_blas_thread():
             if not isinstance(frame, Sequence):
@@ -537,6 +540,9 @@ class Scene:
         Args:
             path: output file, PNG, PDF or SVG; an existing file is replaced.
             title: of the figure.
+
+        Returns:
+            The figure.
 
         Raises:
             SessionError: there is no frame yet.
@@ -637,7 +643,7 @@ class Scene:
         gone = {one.number: one for one in told.gone}
         world, moved = _found_again(world, kept.world, gone)
         state = replace(kept, world=world, tops=(*kept.tops, top))
-        state = self._ruled(state.named({}))
+        state = self._ruled(state.with_objects({}))
         look = _look(kept, state, (*told.moved, *moved), gone)
         if look.moved and not (told.stand or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
@@ -670,7 +676,7 @@ class Scene:
                 number: {**state.ruled_out.get(number, {}), **new.get(number, {})}
                 for number in {*state.ruled_out, *new}
             }
-            state = state.named(ruled_out)
+            state = state.with_objects(ruled_out)
 
 
 def _library_of(system: System) -> Library:

@@ -16,7 +16,7 @@ from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplaine
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.things.world import Thing, World
+from nextview.things.world import World
 
 EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 UNSEEN_GROUND = ViewWarning(
@@ -43,12 +43,8 @@ class SceneState:
     objects: tuple[SceneObject, ...] = ()
     ruled_out: Mapping[int, Mapping[str, str]] = field(default_factory=dict)
 
-    def thing(self, number: int) -> Thing:
-        """Return the thing of the world that an object is."""
-        return self.world.thing(number)
-
-    def named(self, ruled_out: Mapping[int, Mapping[str, str]]) -> SceneState:
-        """Return the scene after a frame with its objects.
+    def with_objects(self, ruled_out: Mapping[int, Mapping[str, str]]) -> SceneState:
+        """Return the scene with the objects that its world shows.
 
         Args:
             ruled_out: names that objects cannot have, with the reasons, by their numbers.

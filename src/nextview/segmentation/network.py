@@ -138,19 +138,18 @@ class SegmentationNetwork:
         card: what its card says.
     """
 
-    def __init__(self, card: Path, threads: int = 0) -> None:
+    def __init__(self, card: Path) -> None:
         """Open a network.
 
         Args:
             card: path of its card; its file has the same name and ends in .onnx.
-            threads: of ONNX Runtime; 0 for one on each core.
 
         Raises:
             ModelError: card or file are missing or damaged, or do not belong together.
         """
         self.card = read_segmentation_card(card)
         self.path = card.with_suffix(".onnx")
-        self._session = open_onnx(self.path, self.card.sha256, threads)
+        self._session = open_onnx(self.path, self.card.sha256, 0)
         for ends, name, size in (
             (self._session.get_inputs(), PICTURE_INPUT, PICTURE_CHANNELS),
             (self._session.get_outputs(), PICTURE_OUTPUT, OUTPUTS),

@@ -181,7 +181,7 @@ def _contracted(
         count: of regions, with 0.
 
     Returns:
-        The label of each region, (count,).
+        The label of each region from 1 on, (count,); region 0 is none and keeps 0.
     """
     low = np.minimum(*pairs)
     high = np.maximum(*pairs)
@@ -220,23 +220,9 @@ def _contracted(
             if total > 0:
                 heappush(heap, (-total, one, third))
 
-    return _numbered(owner)
-
-
-def _numbered(owner: Index) -> Index:
-    """Number the groups of regions from 1 on; region 0 is none and keeps 0.
-
-    Args:
-        owner: region to which each region was joined, itself if to none, (R,).
-    """
-    count = len(owner)
-    roots_of = owner.copy()
-    while (roots_of != roots_of[roots_of]).any():
-        roots_of = roots_of[roots_of]
-    roots = np.unique(roots_of[1:])
-    number = np.zeros(count, np.int64)
-    number[roots] = np.arange(1, len(roots) + 1)
-    return number[roots_of]
+    while (owner != owner[owner]).any():
+        owner = owner[owner]
+    return _renumbered(owner, count)
 
 
 def sharpen(

@@ -48,7 +48,7 @@ LUMA = np.array([0.299, 0.587, 0.114])
 class Frame:
     """One frame of a depth camera; only depth and intrinsics are required.
 
-    An ObservationError names the likely mistake in invalid input. ``with_pose``, ``with_mask`` and
+    An ObservationError names the likely mistake in invalid input. ``with_pose`` and
     ``with_depth`` change one of its parts; ``dataclasses.replace`` loses ``colour``, as ``image``
     is stored in grey, and ``counted``.
 
@@ -152,12 +152,6 @@ class Frame:
         """Return the frame with another depth image, (H, W) float32, metres."""
         other = copy(self)  # skips validation
         object.__setattr__(other, "depth", depth)
-        return other
-
-    def with_mask(self, mask: Mask) -> "Frame":
-        """Return the frame with a mask of its object, (H, W) bool, with some valid depth."""
-        other = copy(self)  # skips validation
-        object.__setattr__(other, "mask", mask)
         return other
 
     @property

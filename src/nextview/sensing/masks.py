@@ -158,7 +158,7 @@ def touching(frame: Frame, one: Mask, other: Mask) -> bool:
     Args:
         frame: of both masks.
         one: mask of one object, (H, W) bool.
-        other: mask of the other.
+        other: mask of the other one, (H, W) bool.
     """
     depth = frame.depth
     if not (depth[one] > 0).any():

@@ -60,7 +60,7 @@ def tolerance_of(depth: Float, noise: Noise, share: float = DEPTH_SHARE) -> Floa
 
 
 def deviations_of(motion: Float, covariance: Float) -> float:
-    """Return the length of a motion in standard deviations."""
+    """Return the length of a motion, (6,), in standard deviations, by its covariance, (6, 6)."""
     return float(np.sqrt(motion @ np.linalg.solve(covariance, motion)))
 
 

@@ -69,7 +69,7 @@ class View:
         camera: camera-to-world as it is believed, (4, 4) float64: the pose of the frame, without
             its error.
         noise: of the depth.
-        labels: number of the thing that each pixel shows, (H, W) int32; 0 for none.
+        labels: number of the instance that each pixel shows, (H, W) int32; 0 for none.
         pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
         surface: pixels of what carries things, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.

@@ -1,1 +1,1 @@
-"""Taught things as surfaces: registration with depth images and verification of every pixel."""
+"""Taught things as surfaces: registration with depth images and comparison of every pixel."""

@@ -260,23 +260,6 @@ class SurfaceCaster:
             self._scenes[thing] = embree_scene([(surface.vertices, surface.faces)])
         return self._scenes[thing]
 
-    def depths(self, thing: int, origins: Float32, directions: Float32) -> Float32:
-        """Cast P rays from each of N origins at one surface.
-
-        Args:
-            thing: number of the surface.
-            origins: origins in the frame of the surface, (N, 3) float32, metres.
-            directions: directions of the rays, of any length, (N, P, 3) float32.
-
-        Returns:
-            Distance to the first hit, in lengths of the ray, (N, P) float32; infinity for a miss.
-        """
-        rays = np.ascontiguousarray(directions.reshape(-1, 3))
-        starts = np.repeat(origins, directions.shape[1], 0)
-        hits = self._scene(thing).run(starts, rays, output=1)
-        depth = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
-        return depth.reshape(directions.shape[:2]).astype(np.float32)
-
     def from_all_sides(
         self, thing: int, origins: Float32, directions: Float32
     ) -> tuple[Float32, Float32]:

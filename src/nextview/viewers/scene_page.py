@@ -22,7 +22,7 @@ from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.types import Float
 from nextview.viewers.scene_card import scene_card
-from nextview.viewers.scene_shapes import colour_of, named, placed_shape, points_of
+from nextview.viewers.scene_shapes import colour_of, name_of, placed_shape, points_of
 
 with extras():
     import viser
@@ -200,7 +200,7 @@ def _draw_object(server: viser.ViserServer, scene: Scene, thing: SceneObject) ->
         )
 
     top = thing.place + np.array([0.0, 0.0, thing.size[2] / 2 + 0.02])
-    server.scene.add_label(f"{name}/name", named(thing), position=tuple(top))
+    server.scene.add_label(f"{name}/name", name_of(thing), position=tuple(top))
 
 
 def _draw_frame(

@@ -13,7 +13,7 @@ from nextview.figures.style import ACCENT, GREY, INK, rgb
 from nextview.files import new_file
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.viewers.scene_shapes import colour_of, named, placed_shape, seen_points
+from nextview.viewers.scene_shapes import colour_of, name_of, placed_shape, seen_points
 
 with extras():
     import rerun as rr
@@ -138,7 +138,7 @@ class SceneRecorder:
         top = thing.place + np.array([0, 0, thing.size[2] / 2 + LABEL_ABOVE])
         label = rr.Points3D(
             [top],
-            labels=[named(thing)],
+            labels=[name_of(thing)],
             colors=rgb(colour_of(thing)),
             radii=0.002,
         )

@@ -78,7 +78,7 @@ def colour_of(thing: SceneObject) -> str:
     )
 
 
-def named(thing: SceneObject) -> str:
+def name_of(thing: SceneObject) -> str:
     """Return the name of an object, with a question mark if it is not confident."""
     doubt = "" if thing.confident or thing.name == UNKNOWN_NAME else "?"
     return thing.name.replace("_", " ") + doubt

@@ -1,9 +1,8 @@
 """Expected log-likelihood ratios of two hypotheses in views that were not taken yet.
 
 If a hypothesis is true, the measured depth is that of its surface with the noise of the sensor, and
-with holes where the surface is seen at grazing incidence. ``verification.likelihood`` then
-evaluates this depth under each other hypothesis. This module computes the mean of that result
-without sampling images.
+with holes where the surface is seen at grazing incidence. ``things.score`` then compares this depth
+with each other hypothesis. This module computes the mean of that result without sampling images.
 
 Both directions of a difference count: a handle that only the rival has is missing surface, and a
 handle that only the leading hypothesis has is surface that the rival does not explain.
@@ -342,8 +341,8 @@ class _Judged:
 def _match_table(outlier: float) -> Float32:
     """Expected log-likelihood of a depth by its residual in standard deviations.
 
-    It is the expectation of the mixture of ``verification.likelihood`` over Gaussian noise, by
-    Gauss-Hermite quadrature, with one entry for every 1 / TABLE_STEPS.
+    It is the expectation over Gaussian noise of the gain of a pixel in ``things.score``, less that
+    of an exact match, by Gauss-Hermite quadrature, with one entry for every 1 / TABLE_STEPS.
     """
     nodes, shares = np.polynomial.hermite_e.hermegauss(40)
     deviations = np.arange(int(LARGEST_DEVIATION * TABLE_STEPS) + 1) / TABLE_STEPS

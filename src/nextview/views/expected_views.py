@@ -190,7 +190,6 @@ def expected_views(
     surroundings: SeenSurroundings | None = None,
     taken: int = 1,
     model: ExpectedModel = ExpectedModel(),
-    side: int = RENDERED_SIDE,
     covariance: Float | None = None,
 ) -> ExpectedViews:
     """Predict the information of candidate views.
@@ -205,7 +204,6 @@ def expected_views(
         taken: number of views so far. Further views have less weight, see
             ``ExpectedModel.correlation``.
         model: of the pixels and the cameras.
-        side: rows and columns of the rendered images.
         covariance: covariance of rotation and translation of the first hypothesis, (6, 6), if the
             reduction of its pose error is requested.
 
@@ -214,7 +212,7 @@ def expected_views(
     """
     cameras = np.asarray(cameras, np.float64)
     scene = SeenSurroundings.nothing() if surroundings is None else surroundings
-    rendered = rendered_images(caster, hypotheses, cameras, scene, side)
+    rendered = rendered_images(caster, hypotheses, cameras, scene, RENDERED_SIDE)
     weight = model.geometry / (1 + model.correlation * taken)
     moved = gaps_after_alignment(rendered, sensor, model)
     divergence, different = divergences(rendered, moved, sensor, model)
@@ -357,13 +355,12 @@ class Outlook:
             self.distance,
         )
 
-    def rivals(self, camera: Float, side: int = PICTURE_SIDE) -> RivalPictures | None:
+    def rivals(self, camera: Float) -> RivalPictures | None:
         """Render the two leading hypotheses, of different things if there are any, and their
         difference.
 
         Args:
             camera: camera-to-world pose, (4, 4), object frame, metres.
-            side: rows and columns of the pictures.
 
         Returns:
             The pictures; None if there is only one hypothesis.
@@ -380,7 +377,7 @@ class Outlook:
             two,
             camera[None],
             self.surroundings,
-            side,
+            PICTURE_SIDE,
         )
 
         shows = np.isfinite(images.depth[0])
@@ -388,8 +385,8 @@ class Outlook:
         different = different_pixels(images, self.sensor, self.model)[0]
         return RivalPictures(
             two.things,
-            pictures.reshape(2, side, side),
-            different.reshape(side, side),
+            pictures.reshape(2, PICTURE_SIDE, PICTURE_SIDE),
+            different.reshape(PICTURE_SIDE, PICTURE_SIDE),
         )
 
     def expect(self, cameras: Float, goal: Goal = "thing") -> ExpectedViews:

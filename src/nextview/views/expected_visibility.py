@@ -86,22 +86,16 @@ class Occupancy:
     cells: NDArray[np.uint8]
 
     @classmethod
-    def unseen(cls, grid: VoxelGrid, region: Mask | None = None) -> "Occupancy":
+    def unseen(cls, grid: VoxelGrid) -> "Occupancy":
         """Return the occupancy before the first frame.
 
         Args:
             grid: the voxels.
-            region: unknown voxels, (n, n, n) bool; all others are free. None for all.
 
         Returns:
             The occupancy.
         """
-        return cls(
-            grid,
-            np.full((grid.n,) * 3, UNSEEN)
-            if region is None
-            else np.where(region, UNSEEN, FREE),
-        )
+        return cls(grid, np.full((grid.n,) * 3, UNSEEN))
 
     def seen(
         self,
@@ -277,20 +271,16 @@ class SeenScene:
 def expected_visibility(
     seen: SeenScene,
     positions: Floats,
-    density: float = DENSITY,
-    unseen_part: float = UNSEEN_PART,
 ) -> Float:
     """Return the expected visible share of the object from each position.
 
     The object consists of its observed voxels and, with a lower weight, the unseen voxels of its
     unit ball above the table. It does not occlude itself. Elsewhere, a line of sight passes through
-    a length s of unseen space with probability exp(-density * s).
+    a length s of unseen space with probability exp(-DENSITY * s).
 
     Args:
         seen: the scene so far.
         positions: of the cameras, (V, 3), object frame, object radii.
-        density: of occluders in unseen space, per object radius.
-        unseen_part: weight of unseen voxels that may belong to the object.
 
     Returns:
         Share of the object with a free line of sight, (V,) float64.
@@ -299,7 +289,7 @@ def expected_visibility(
         seen.occupancy.grid,
         np.asarray(positions, np.float64).tobytes(),
     )
-    return lines.visibility(seen, density, unseen_part)
+    return lines.visibility(seen)
 
 
 @lru_cache(maxsize=64)
@@ -379,25 +369,11 @@ class SightLines:
             shape=(len(ends) - 1, grid.n**3),
         )
 
-    @cached_property
-    def asked(self) -> Mask:
-        """Voxels that affect the visibility, (n, n, n)."""
-        found = self.own.copy()
-        found.reshape(-1)[self.passed.indices] = True
-        return found
-
-    def visibility(
-        self,
-        seen: SeenScene,
-        density: float,
-        unseen_part: float,
-    ) -> Float:
+    def visibility(self, seen: SeenScene) -> Float:
         """Return the expected visibility; see ``expected_visibility``.
 
         Args:
             seen: the scene so far.
-            density: of occluders in unseen space, per object radius.
-            unseen_part: weight of unseen voxels that may belong to the object.
 
         Returns:
             The visible share from each position, (V,) float64.
@@ -412,7 +388,7 @@ class SightLines:
             for what in (OBJECT, UNSEEN)
         )
         # expected share of the object in each part
-        weights = (known + unseen_part * maybe)[self.parts]
+        weights = (known + UNSEEN_PART * maybe)[self.parts]
         if not weights.any():
             return np.ones(len(self.positions))
         cost = ((cells == UNSEEN) & ~own).astype(np.float32)
@@ -421,5 +397,5 @@ class SightLines:
         passed = (self.passed @ cost.reshape(-1)).reshape(len(weights), -1)
         free = passed < SOLID
         share = weights / weights.sum()
-        veil = np.exp(-density * self.grid.pitch * np.where(free, passed, 0)) * free
+        veil = np.exp(-DENSITY * self.grid.pitch * np.where(free, passed, 0)) * free
         return np.asarray(share @ veil, np.float64)
