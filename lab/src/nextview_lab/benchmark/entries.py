@@ -131,6 +131,20 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
 
+def check_entry(name: str, specs: EpisodeSpecs) -> None:
+    """Refuse an entry that cannot be made, before any is run.
+
+    Args:
+        name: of the entry.
+        specs: the episodes.
+
+    Raises:
+        EntryError, PolicyError: there is no such entry, or the predictions lack what it needs.
+    """
+    if fixed_views(name, specs, np.random.default_rng(0)) is None:
+        entry_policy(name, specs)
+
+
 def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """Create the policy of a benchmark entry.
 
