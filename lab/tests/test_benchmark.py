@@ -104,7 +104,9 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
     assert set(found.settings["failures"]) == {"test_replay:Raises"}
 
 
-@pytest.mark.parametrize("name", ["test_replay:Nowhere", "lcm", "best-99", "randum"])
+@pytest.mark.parametrize(
+    "name", ["test_replay:Nowhere", "lcm", "best-99", "randum", "geometry"]
+)
 def test_a_policy_that_cannot_be_made_is_refused_before_any_is_run(
     name, results, tmp_path, capsys
 ):

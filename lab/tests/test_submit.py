@@ -224,6 +224,14 @@ def test_names_are_text_in_tables_and_terminals(archive, submitted, tmp_path, ca
     assert "<script" not in tables
 
 
+def test_a_policy_that_does_not_exist_is_refused_with_those_that_do(
+    archive, tmp_path, capsys
+):
+    out = tmp_path / "out.json"
+    said = refused(capsys, "submit", archive, out, "--policy", "geometri")
+    assert all(name in said for name in ("'geometri'", "geometry", "ring", "MODULE"))
+
+
 def test_the_page_names_all_that_a_method_reads_and_writes():
     page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
     cells = [row.split("|")[1] for row in page.splitlines() if row.startswith("| `")]
