@@ -558,7 +558,6 @@ arm = Arm(nextview.load_mesh("samples/chair.off"), np.random.default_rng(0))
 }
 PREPARED = {  # what a page takes as made before, by commands or pages that it names
     "docs/add_a_measure.md": "mkdir models; python own_recogniser.py models/recogniser",
-    "docs/add_a_policy.md": "cp -r views.zarr modelnet10.zarr",
     "docs/add_a_recogniser.md": (
         "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear"
     ),

@@ -16,7 +16,7 @@ from PIL import Image
 
 from nextview.errors import DatasetError, ResultsError
 from nextview_lab.benchmark.frozen import FrozenArchive
-from nextview_lab.benchmark.methods import CommandMethod
+from nextview_lab.benchmark.methods import CommandMethod, FrozenLook, MethodAnswer
 from nextview_lab.benchmark.standings import leaderboard_of
 from nextview_lab.benchmark.submit import SubmitOptions, run_episode, submit
 from nextview_lab.cli.benchmark_tables import print_compared
@@ -222,6 +222,22 @@ def test_names_are_text_in_tables_and_terminals(archive, submitted, tmp_path, ca
         assert not set(text) & {"\x1b", "\u202e"}
         assert "# two" not in text.splitlines()
     assert "<script" not in tables
+
+
+def test_a_policy_that_does_not_exist_is_refused_with_those_that_do(
+    archive, tmp_path, capsys
+):
+    out = tmp_path / "out.json"
+    said = refused(capsys, "submit", archive, out, "--policy", "geometri")
+    assert all(name in said for name in ("'geometri'", "geometry", "ring", "MODULE"))
+
+
+def test_the_page_names_all_that_a_method_reads_and_writes():
+    page = (ROOT / "docs/submit.md").read_text(encoding="utf-8")
+    cells = [row.split("|")[1] for row in page.splitlines() if row.startswith("| `")]
+    named = set(re.findall(r"`(\w+)`", " ".join(cells)))
+    for record in (FrozenLook, MethodAnswer):
+        assert set(record.__struct_fields__) <= named
 
 
 def test_the_method_of_the_page_runs(archive, tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from lab_programs import main
+from lab_programs import main, refused
 
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record
@@ -109,6 +109,47 @@ def test_another_policy_takes_part_in_the_same_episodes(knobs, results, settings
         "policy == @own and measure == 'travel, rad' and views == 2"
     )
     assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
+
+
+class Fails(FarAzimuth):
+    """A policy of a user that breaks a rule of the page, named by a class below."""
+
+    def next_views(self, state, rng):
+        return {
+            "Raises": lambda: state.nothing,
+            "Scalar": lambda: 3,
+            "Repeats": lambda: state.current,
+            "Outside": lambda: state.current + 40,
+        }[type(self).__name__]()
+
+
+class Raises(Fails):
+    pass
+
+
+class Scalar(Fails):
+    pass
+
+
+class Repeats(Fails):
+    pass
+
+
+class Outside(Fails):
+    pass
+
+
+@pytest.mark.parametrize("policy", [Raises, Scalar, Repeats, Outside])
+def test_a_policy_of_ones_own_that_fails_is_named_with_the_thing(
+    policy, knobs, knobs_memory, results, capsys
+):
+    own = f"{__name__}:{policy.__name__}"
+    line = f"benchmark things {knobs} {results} --models {knobs_memory} --views 1 2"
+    more = f"--policies {own} --repeats 1 --workers 0"
+    sentence = refused(capsys, *f"{line} {more}".split())
+    assert f"policy {own} " in sentence
+    assert "(object can)" in sentence
+    assert ("test_thing_benchmark.py:" in sentence) == (policy is Raises)
 
 
 def scaled(scans, unit, folder):

@@ -393,7 +393,7 @@ class ViewSphere(Viewpoints):
     def travel(self) -> Float:
         """Distance between views in grid cells, (V, V) float64.
 
-        It is Euclidean over ring and azimuth (table 9).
+        It is Euclidean over ring and azimuth (thesis, table 9).
         """
         rings = self.ring[:, None] - self.ring[None, :]
         steps = np.abs(self.azimuth_index[:, None] - self.azimuth_index[None, :])

@@ -90,6 +90,8 @@ class EpisodeState:
 class Policy(Protocol):
     """Chooses the next views of many episodes at once; rows must not depend on each other.
 
+    MODULE:CLASS names one of your own in commands; it is created with the viewpoints alone.
+
     Example:
 
         >>> policy = nextview.make_policy("furthest", nextview.ViewSphere.named("40"))

@@ -20,7 +20,7 @@ from nextview_lab.benchmark.class_tables import (
     ClassTables,
     summarise,
 )
-from nextview_lab.benchmark.entries import default_entries
+from nextview_lab.benchmark.entries import check_entry, default_entries
 from nextview_lab.benchmark.jobs import Settings
 from nextview_lab.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview_lab.benchmark.results import RECORD, write_results
@@ -85,8 +85,8 @@ def benchmark_classes(
         overwrite: replace earlier results.
 
     Raises:
-        UsageError, RiskError, EntryError: settings are invalid, a risk cannot be guaranteed, or all
-            policies fail.
+        UsageError, RiskError: settings are invalid, or a risk cannot be guaranteed.
+        EntryError, PolicyError: a named policy cannot be made, or all policies fail.
     """
     check_new(out, overwrite, folder=True)
     grid, names, promised = _prepare(predictions, settings)
@@ -162,6 +162,8 @@ def _prepare(
         *map(str, cards.values()),
     ]
     names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
+    for name in names if s.policies else ():
+        check_entry(name, specs)
     thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
 
     return (

@@ -29,6 +29,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
 from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, map_name
 from nextview.recognition.model_card import DISCRIMINATE
 from nextview.types import Float, Floats, Index
+from nextview_lab.benchmark.thing_policies import OF_MEMORIES
 from nextview_lab.benchmark.true_maps import TRUE, known_maps, true_measure
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.errors import EntryError
@@ -131,6 +132,20 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
 
+def check_entry(name: str, specs: EpisodeSpecs) -> None:
+    """Refuse an entry that cannot be made, before any is run.
+
+    Args:
+        name: of the entry.
+        specs: the episodes.
+
+    Raises:
+        EntryError, PolicyError: there is no such entry, or the predictions lack what it needs.
+    """
+    if fixed_views(name, specs, np.random.default_rng(0)) is None:
+        entry_policy(name, specs)
+
+
 def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """Create the policy of a benchmark entry.
 
@@ -210,10 +225,9 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
             p.classes,
             p.maps,
         )
-    if plain == DISCRIMINATE:
+    if plain == DISCRIMINATE or plain in OF_MEMORIES:
         raise EntryError(
-            "the policy discriminate is for taught things; nextview-lab benchmark things compares"
-            " it"
+            f"the policy {plain} is for taught things; nextview-lab benchmark things compares it"
         )
 
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]

@@ -142,6 +142,7 @@ def differences(tables: Tables, tests: pd.DataFrame, what: str) -> Figure:
         axes.plot(100 * row.difference, y, "o", clip_on=False, **dot)
     axes.axvline(0, color=INK, linewidth=0.9)
     axes.set_yticks(np.arange(len(policies)), [as_text(name) for name in policies])
+    axes.set_ylim(-0.5, len(policies) - 0.5)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
     reference = as_text(tables.reference)

@@ -19,13 +19,14 @@ import numpy as np
 
 from nextview import __version__
 from nextview.checks import did_you_mean, one_line
-from nextview.errors import ObservationError, ResultsError, UsageError
+from nextview.errors import ObservationError, PolicyError, ResultsError, UsageError
 from nextview.files import decode_record
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import Directions, Viewpoints, ViewSphere
 from nextview.policies.base import Policy
-from nextview.policies.registry import make_policy_anywhere
+from nextview.policies.registry import make_policy_anywhere, policy_names
 from nextview.recognition.belief import Stopping
+from nextview.recognition.model_card import DISCRIMINATE
 from nextview.sensing.frame import Frame, check_pose
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.limits import Limits
@@ -212,6 +213,13 @@ class NextviewMethod:
         known = rules_of(sphere, self._sphere)
         if self._policy in known:
             return known[self._policy]()
+        plain = self._policy.partition("@")[0]
+        others = (*policy_names(), DISCRIMINATE)
+        if plain not in others and ":" not in plain and not plain.endswith(".json"):
+            raise PolicyError(
+                f"no policy is called {self._policy!r}; there are {', '.join(known)}, and"
+                " MODULE:CLASS for your own"
+            )
         return make_policy_anywhere(
             self._policy, sphere, (), self._system.models.classes
         )

@@ -13,10 +13,10 @@ from zlib import crc32
 import msgspec
 import numpy as np
 
-from nextview.checks import number, one_of, whole
+from nextview.checks import number, one_of, plugin_errors, whole
 from nextview.errors import DatasetError, PolicyError, UsageError
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
-from nextview.policies.base import Policy
+from nextview.policies.base import EpisodeState, Policy
 from nextview.simulation.sensor import sensor_named
 from nextview_lab.benchmark.jobs import Job, Settings
 from nextview_lab.benchmark.thing_episodes import (
@@ -75,6 +75,7 @@ class EpisodeRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def run(
     episode: ThingEpisode,
+    name: str,
     policy: Policy,
     count: int,
     rng: np.random.Generator,
@@ -83,12 +84,16 @@ def run(
 
     Args:
         episode: the thing.
+        name: of the policy, for messages.
         policy: chooses all views but the first.
         count: number of views.
         rng: for random policies.
 
     Returns:
         The results after each view.
+
+    Raises:
+        PolicyError: the policy raises an error, or chooses no free view.
     """
     views = [episode.start]
     made: dict[str, list[Any]] = {
@@ -107,11 +112,29 @@ def run(
         begun = time.process_time()
         # the CPU time of a choice includes the prediction of views
         state = episode.state(views, policy.needs)
-        view = int(policy.next_views(state, rng)[0])
+        view = _choice(name, policy, state, rng)
         made["decision"].append(time.process_time() - begun)
-        if not state.free[0, view]:
-            raise PolicyError(f"a policy chose the view {view}, which was taken before")
         views.append(view)
+
+
+def _choice(
+    name: str, policy: Policy, state: EpisodeState, rng: np.random.Generator
+) -> int:
+    """Return the view that a policy chooses in one episode; PolicyError if it is none."""
+    with plugin_errors(lambda said: PolicyError(f"policy {name} raised {said}")):
+        chosen = np.asarray(policy.next_views(state, rng))
+    if chosen.shape != (1,) or not np.issubdtype(chosen.dtype, np.integer):
+        raise PolicyError(
+            f"policy {name} has to return one integer for each episode, in an array"
+        )
+    view = int(chosen[0])
+    if not 0 <= view < state.free.shape[1]:
+        raise PolicyError(
+            f"policy {name} chose view {view}, which is not on the sphere"
+        )
+    if not state.free[0, view]:
+        raise PolicyError(f"policy {name} chose view {view}, which was visited before")
+    return view
 
 
 def policies_in(runs: Sequence[EpisodeRuns]) -> tuple[str, ...]:
@@ -203,7 +226,7 @@ class ThingJob(Job):
 
 
 def work(job: ThingJob) -> None:
-    """Run the policies of a job, and write the results."""
+    """Run the policies of a job, and write the results; PolicyError if one fails."""
     how: ThingSettings = job.settings
     things = things_of(job.models, how.recogniser)
     chosen = policies_of(job.policies, things)
@@ -222,10 +245,13 @@ def work(job: ThingJob) -> None:
             (how.seed, job.thing, job.draw, crc32(name.encode()))
         )
         times = how.repeats if name == "random" else 1
-        runs[name] = [
-            run(episode, chosen[name](episode), how.views[-1], rng)
-            for _ in range(times)
-        ]
+        try:
+            runs[name] = [
+                run(episode, name, chosen[name](episode), how.views[-1], rng)
+                for _ in range(times)
+            ]
+        except PolicyError as error:
+            raise PolicyError(f"{error} (object {things.names[job.thing]})") from error
     job.write(EpisodeRuns(things.names[job.thing], job.draw, runs))
 
 

@@ -181,10 +181,10 @@ def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
     spent = ("decision, ms, median", "decision, ms, 95 %")
     return (
         *right,
-        Column(until, (until,), 0, 2, "until confident"),
+        Column(until, (until,), 0, 2, until),
         Column("confident", ("confident",)),
         Column(wrong, (wrong,), short="wrong"),
-        Column(f"travel to view {last}, rad", ("travel, rad",), last, 2, "travel"),
+        Column(f"travel to view {last}, rad", ("travel, rad",), last, 2, "travel, rad"),
         Column(way, (way,), 0, 2),
         *poses,
         Column("choice, ms of CPU: median, 95 %", spent, 0, 0, "choice, ms of CPU"),
