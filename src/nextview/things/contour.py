@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from nextview.sensing.view import LEAST_ERROR, View
 from nextview.things.library import Hypotheses, Library
-from nextview.things.score import FARTHEST, LEFT_OVER, OUTLIER, PIXEL_GAIN
+from nextview.things.score import FARTHEST, LEFT_OVER, OUTLIER, PIXEL_GAIN, cast
 from nextview.types import Float, Float32, Index, Mask
 
 ACROSS = 32  # pixels of the image that shows a hypothesis, along each side
@@ -131,17 +131,9 @@ class _Images:
         half = BORDER * radius / np.sqrt(away**2 - radius**2)
         lines = half[:, None] * np.linspace(-1, 1, ACROSS)
         x, y = (middle[:, side, None] / away[:, None] + lines for side in (0, 1))
-        rays = np.ones((len(some), ACROSS, ACROSS, 3), np.float32)
-        rays[..., 0] = x[:, None]
-        rays[..., 1] = y[:, :, None]
-        # a ray of a stretched thing, in its own axes
-        turn = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
-        start = np.einsum(
-            "mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres
+        _, depth, _ = cast(
+            library, view, some, x.astype(np.float32), y.astype(np.float32)
         )
-        start = start / some.sizes + library.centres[some.things]
-        rays = rays.reshape(len(some), -1, 3) @ turn.astype(np.float32)
-        depth, _ = library.caster.cast(some.things, start, rays)
         return cls(x, y, depth.reshape(len(some), ACROSS, ACROSS), away)
 
 

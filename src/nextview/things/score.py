@@ -374,16 +374,7 @@ def _rendered(
     columns = window.left[:, None] + np.arange(window.width)
     x = grid.x[columns].astype(np.float32)
     y = grid.y[lines].astype(np.float32)
-    # a ray of a stretched thing, in its own axes
-    axes = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
-    turn = axes.astype(np.float32)[:, :, None]
-    across = x[..., None] * turn[:, 0]
-    down = y[..., None] * turn[:, 1] + turn[:, 2]
-    rays = (down[:, :, None] + across[:, None]).reshape(len(some), -1, 3)
-    start = np.einsum("mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres)
-    start = start / some.sizes + library.centres[some.things]
-    depth, normals = library.caster.cast(some.things, start, rays)
-
+    rays, depth, normals = cast(library, view, some, x, y)
     shown = np.isfinite(depth)
     pixels = np.flatnonzero(shown)
     row, place = np.divmod(pixels, shown.shape[1])
@@ -397,6 +388,34 @@ def _rendered(
     cosine = (against / length / far).clip(STEEPEST, 1)
     shape = (len(some), window.height, window.width)
     return shown.reshape(shape), depth.ravel()[pixels], cosine
+
+
+def cast(
+    library: Library, view: View, some: Hypotheses, x: Float32, y: Float32
+) -> tuple[Float32, Float32, Float32]:
+    """Cast rays of a view at M hypotheses.
+
+    Args:
+        library: the things.
+        view: the view.
+        some: M hypotheses.
+        x: slope x/z of each column for each, (M, w) float32.
+        y: slope y/z of each row for each, (M, h) float32.
+
+    Returns:
+        The rays in the axes of the scan, (M, h * w, 3) float32; depth along the axis of the camera,
+        (M, h * w) float32, metres, infinite where nothing is hit; and unit normals of the scan,
+        (M, h * w, 3) float32.
+    """
+    # a ray of a stretched thing, in its own axes
+    axes = view.camera[:3, :3].T @ some.rotations / some.sizes[:, None]
+    turn = axes.astype(np.float32)[:, :, None]
+    across = x[..., None] * turn[:, 0]
+    down = y[..., None] * turn[:, 1] + turn[:, 2]
+    rays = (down[:, :, None] + across[:, None]).reshape(len(some), -1, 3)
+    start = np.einsum("mji,mj->mi", some.rotations, view.camera[:3, 3] - some.centres)
+    start = start / some.sizes + library.centres[some.things]
+    return rays, *library.caster.cast(some.things, start, rays)
 
 
 def total(scores: Sequence[Score | None]) -> float:
