@@ -17,7 +17,7 @@ from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
 from nextview.session.target import view_of
 from nextview.things.fusion import cell_of
-from nextview.things.library import Library, near_turns
+from nextview.things.library import Library, closed, near_turns
 from nextview.things.memory import open_memory
 from nextview.things.naming import named, pose_candidates, why_in_doubt
 from nextview.things.world import World, aligned
@@ -72,7 +72,11 @@ class VerifiedRecogniser(NetworkRecogniser):
             thing.name: near_turns(thing.near_symmetries, thing.symmetries)
             for thing in about.things
         }
-        self.library = Library(surfaces, symmetries, near, threads)
+        turns = {
+            thing.name: closed(near_turns(thing.near_symmetries, ()))
+            for thing in about.things
+        }
+        self.library = Library(surfaces, symmetries, near, turns, threads)
         self._last: tuple[tuple[Observation, ...], World] | None = None
 
     def __getstate__(self) -> dict[str, Any]:

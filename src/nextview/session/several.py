@@ -104,6 +104,7 @@ class SeveralRecognisers:
         surfaces: list[Surface] = []
         symmetries: dict[str, Any] = {}
         near: dict[str, Float] = {}
+        turns: dict[str, Float] = {}
         first = 0
         for memory in self.memories:
             for surface, label in zip(
@@ -112,10 +113,11 @@ class SeveralRecognisers:
                 name = self.classes[first + int(label)]
                 symmetries[name] = memory.library.symmetries.get(surface.name)
                 near[name] = memory.library.near[surface.name]
+                turns[name] = memory.library.turns[surface.name]
                 surfaces.append(replace(surface, name=name))
             first += len(memory.classes)
         aim, place = self.memories[0].library.camera
-        return Library(surfaces, symmetries, near).for_cameras(place, aim)
+        return Library(surfaces, symmetries, near, turns).for_cameras(place, aim)
 
     def without(self, names: Collection[str]) -> SeveralRecognisers:
         """The same recogniser for an object that is none of some taught things.

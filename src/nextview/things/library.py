@@ -27,6 +27,7 @@ TURNS = 24  # rotations that are tried of what is nearly round
 HALF_TURNS = np.array(
     [np.diag(one) for one in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
 )
+SAME_TURN = 2.97  # trace of the rotation between two that are one: 10 degrees
 PARALLEL = 0.99  # cosine of the angle between two axes that are one
 
 
@@ -58,6 +59,7 @@ class Library:
         symmetries: of each thing, by its name.
         near: rotations about the centroid after which each thing looks nearly the same, by its
             name, (N, 3, 3) float64.
+        turns: those after which it may look the same, and products of them, by its name, (N, 3, 3).
         caster: casts rays at their surfaces.
         visible: what cameras in all directions see of them.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
@@ -72,6 +74,7 @@ class Library:
         surfaces: Sequence[Surface],
         symmetries: Mapping[str, Any] = MappingProxyType({}),
         near: Mapping[str, Float] = MappingProxyType({}),
+        turns: Mapping[str, Float] = MappingProxyType({}),
         threads: int = 1,
         directions: Float | None = None,
     ) -> None:
@@ -81,6 +84,7 @@ class Library:
             surfaces: of the things, with their names.
             symmetries: of each thing, by its name.
             near: rotations of each thing, by its name.
+            turns: the same, see above.
             threads: number of threads; 0 for one on each core.
             directions: from a thing to the cameras that see it, unit vectors, (D, 3); None for all
                 around.
@@ -88,6 +92,7 @@ class Library:
         self.names = tuple(surface.name for surface in surfaces)
         self.symmetries = symmetries
         self.near = near
+        self.turns = turns
         self.caster = SurfaceCaster(surfaces)
         self.camera = CAMERA_ERROR
 
@@ -178,6 +183,17 @@ def near_turns(near: Sequence[Symmetry], exact: Sequence[Symmetry]) -> Float:
     return np.asarray(Rotation.from_rotvec(np.array(vectors)).as_matrix())
 
 
+def closed(turns: Float) -> Float:
+    """Return rotations and their products, none twice and not the identity, (N, 3, 3)."""
+    if len(turns) > TURNS:  # a ball
+        return turns
+    kept = [np.eye(3)]
+    for one in np.concatenate([turns, (turns[:, None] @ turns).reshape(-1, 3, 3)]):
+        if max(np.trace(one.T @ other) for other in kept) < SAME_TURN:
+            kept.append(one)
+    return np.array(kept[1:]).reshape(-1, 3, 3)
+
+
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
     """M hypotheses, each that a thing lies in a pose.
@@ -240,6 +256,20 @@ class Hypotheses:
         rotations = turns @ self.rotations[:, None]
         each = self[np.repeat(np.arange(len(self)), len(turns))]
         return replace(each, rotations=rotations.reshape(-1, 3, 3))
+
+    def turned_alike(self, library: Library) -> tuple[Hypotheses, Index]:
+        """Return these after turns of their things, and the row of each that it is made of."""
+        turns = [
+            library.turns.get(library.names[thing], np.zeros((0, 3, 3)))
+            for thing in self.things
+        ]
+        row = np.repeat(np.arange(len(self)), list(map(len, turns)))
+        each = self[row]
+        rotations = each.rotations @ np.concatenate(turns)
+        # the middles stay where they are
+        middles = library.principal.middles[each.things][..., None]
+        moved = ((each.rotations - rotations) @ middles)[..., 0]
+        return replace(each, rotations=rotations, centres=each.centres + moved), row
 
     def in_other_sizes(self) -> Hypotheses:
         """Return eight of each: larger and smaller, as a whole and along each axis."""

@@ -237,12 +237,19 @@ class World:
 
         # of each the best one, if it is better
         some = self.hypotheses[np.array(sorted(rows), np.int64)]
+        turned = some.turned(RESTART)
+        of = np.arange(len(turned)) // (len(turned) // len(some))
+        if len(self.views) > 1:  # another view may show which side is in front
+            alike, its = some.turned_alike(self.library)
+            turned = Hypotheses.joined([turned, alike])
+            of = np.append(of, its)
         closer = (0.12, 0.08, 0.06, 0.04, 0.03, 0.02)
-        new = register(self.library, self.views, some.turned(RESTART), closer, 96)
-        gains = self._coarse_totals(new).reshape(len(some), -1)
-        first = gains.shape[1] * np.arange(len(some))
-        better = gains.max(1) > self._coarse_totals(some)
-        return self.with_hypotheses(new[(first + gains.argmax(1))[better]]).chosen()
+        new = register(self.library, self.views, turned, closer, 96)
+        totals = self._coarse_totals(new)
+        order = np.lexsort((-totals, of))
+        first = order[np.unique(of[order], return_index=True)[1]]
+        better = totals[first] > self._coarse_totals(some)
+        return self.with_hypotheses(new[first[better]]).chosen()
 
     def with_other_sizes(self) -> World:
         """Return the world with new or doubtful things in another size, that which fits best."""
@@ -264,7 +271,11 @@ class World:
             for one in self.things
             if one.row >= 0
             and not _settled(one.scores)
-            and (int(self.keys[one.row]) not in self.given or one.share < SURE_SHARE)
+            and (
+                self.alone
+                or int(self.keys[one.row]) not in self.given
+                or one.share < SURE_SHARE
+            )
         ]
         return np.array(rows, np.int64)
 
