@@ -82,6 +82,17 @@ def test_all_things_are_found_named_and_placed_in_one_frame(first_look, ycb_mesh
         assert add_s < 0.1 * diameter
 
 
+def test_the_uncertainty_of_a_pose_includes_that_of_the_camera(first_look):
+    camera, scene, _ = first_look
+    rough = nextview.Scene(nextview.load("ycb", camera_accuracy=(20, 0.5)))
+    rough.update(camera.again().frame(view(20)))
+    usual, more = by_name(scene), by_name(rough)
+    assert usual.keys() == more.keys() != set()
+    for name, thing in usual.items():
+        assert thing.pose_uncertainty.millimetres < 20
+        assert more[name].pose_uncertainty.millimetres > 20
+
+
 def test_objects_keep_their_numbers_and_masks_from_frame_to_frame(ycb, ycb_meshes):
     camera = camera_over(list(ycb_meshes.values()), sensor="wrist")
     scene = nextview.Scene(ycb)

@@ -18,7 +18,6 @@ from nextview.recognition.poses import (
 )
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
-from nextview.things.library import CAMERA_ERROR
 from nextview.things.naming import (
     CONFIDENT,
     LIKELY,
@@ -58,6 +57,7 @@ class SceneObject:
         doubt: why the name is not confident, in words; "" if it is, or if there is none.
         ruled_out: names that it cannot have, with the reasons, see ``scene.rule.SceneRule``.
         warnings: likely problems of the frames that show the object; usually empty.
+        camera_error: standard deviation of the places of the cameras along each axis, millimetres.
     """
 
     number: int
@@ -75,6 +75,7 @@ class SceneObject:
     doubt: str = ""
     ruled_out: tuple[tuple[str, str], ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
+    camera_error: float = field(default=0.0, repr=False)
 
     @property
     def pose(self) -> Float | None:
@@ -85,7 +86,7 @@ class SceneObject:
     def pose_uncertainty(self) -> PoseUncertainty | None:
         """Uncertainty of ``pose``; None without a pose."""
         same = [one for one in self.candidates if one.thing == self.name]
-        return uncertainty_of(same, 1000 * CAMERA_ERROR[1]) if same else None
+        return uncertainty_of(same, self.camera_error) if same else None
 
     @property
     def symmetry(self) -> Any:
@@ -165,6 +166,7 @@ def _object(
         (),
         ruled_out=tuple(ruled_out.items()),
         warnings=tuple(dict.fromkeys(warnings)),
+        camera_error=1000 * world.library.camera[1],
     )
 
     # from what explains it to a name

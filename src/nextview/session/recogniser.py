@@ -19,7 +19,7 @@ from nextview.session.target import view_of
 from nextview.things.fusion import cell_of
 from nextview.things.library import Library, closed, near_turns
 from nextview.things.memory import open_memory
-from nextview.things.naming import named, pose_candidates, why_in_doubt
+from nextview.things.naming import LIKELY, named, pose_candidates, why_in_doubt
 from nextview.things.world import World, aligned
 from nextview.types import Floats, Index, Mask
 from nextview.views.expected_views import Outlook
@@ -185,7 +185,7 @@ class VerifiedRecogniser(NetworkRecogniser):
             poses=pose_candidates(world, found, self.labels),
             camera_error=1000 * self.library.camera[1] if moves else 0.0,
             p_value=found.right,
-            doubt=why_in_doubt(world, found) if found.right < 0.5 else "",
+            doubt=why_in_doubt(world, found) if found.right < LIKELY else "",
             found=(world, thing, found.beliefs(world)),
         )
 

@@ -321,12 +321,7 @@ class Recognition:
 
     @property
     def joint_doubt(self) -> str:
-        """Reason of the recogniser why no answer is confident whatever its belief; "" for none.
-
-        A taught thing is confident as "this thing in this pose": its scan is not below the ground,
-        it occludes the background, it fits without being scaled, its orientation is determined, and
-        it covers enough pixels.
-        """
+        """Reason of the recogniser why no answer is confident whatever its belief; "" for none."""
         joint = self._joint
         return "" if joint is None else joint.doubt
 

@@ -53,6 +53,7 @@ MOVED_SHARE = (
 )
 MOST_VIEWS = 6  # that are kept
 SETTLED_VIEWS = 3  # views after which poses are not refined, and names not searched
+SAME_DEPTH = 0.03  # metres between the points of one stranger in two views
 SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 _Rows = tuple[tuple[Score | None, ...], ...]
@@ -814,9 +815,6 @@ def _expected(world: World, row: Sequence[Score | None], view: View) -> Index:
     column, line, z = column[inside], line[inside], seen[inside, 2]
     there = np.abs(grid.depth[line, column] - z) < SAME_DEPTH
     return np.unique(line[there] * width + column[there])
-
-
-SAME_DEPTH = 0.03  # metres between the points of one stranger in two views
 
 
 def world_points(world: World, row: Sequence[Score | None]) -> Float:
