@@ -254,7 +254,7 @@ def _compared(
 
     known = [total(one.scores) for one in things] if whole else totals(there)
     stays = known, scores(view, there)
-    better = register(library, [*world.views, view], there, (0.06, 0.03, 0.02), 96)
+    better = register(library, [*world.views, view], there, (0.06, 0.03, 0.02))
     refined = totals(better), scores(view, better)
     stand = [
         max(
@@ -279,7 +279,7 @@ def _compared(
         centres.append(there.centres[left] + place - np.reshape(middles, (-1, 3)))
     every = np.concatenate(rows)
     starts = replace(there[every], centres=np.concatenate(centres))
-    tried = register(library, [view], starts, ALONE, 96)
+    tried = register(library, [view], starts, ALONE)
     shown = scores(view, tried)
     values = np.array([total([each]) for each in shown])
     apart = _displaced(library, view, there[every], tried)

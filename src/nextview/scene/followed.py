@@ -15,13 +15,12 @@ from nextview.sensing.view import LEVEL, View
 from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import PIXELS_ALIKE
-from nextview.things.register import normal_equations
+from nextview.things.register import POINTS, normal_equations
 from nextview.things.score import score
 from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float
 
 SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousand moves
-POINTS = 96  # of a thing that are compared
 INDEPENDENT_POINTS = 60.0  # of them, whose errors are not alike
 # error of the expected pose that is left before each step, as a share
 ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
@@ -88,7 +87,7 @@ def followed(library: Library, view: View, body: Body) -> Followed:
         left_over = share * body.displaced
         reach = min(float(np.hypot(left_over, error)) / radius, WIDEST)
         left, right = normal_equations(
-            library, view, some, reach, POINTS, hidden=share < HIDDEN_FROM
+            library, view, some, reach, hidden=share < HIDDEN_FROM
         )
         edges = contour_equations(
             library, view, some, np.array([2 * np.hypot(left_over, error)])

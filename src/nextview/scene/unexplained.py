@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from nextview.geometry.axes import upright_axes
 from nextview.sensing.masks import inside_box
 from nextview.sensing.object_frame import Box
-from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
+from nextview.sensing.tabletop import TableTop
 from nextview.things.world import World
 from nextview.types import Float, Mask
 
@@ -30,6 +30,11 @@ EDGE_WIDTH = 2  # pixels of the grid around an object that may show it
 PATCH_POINTS = 400  # sampled points of a patch
 GROUND_POINTS = 2000  # sampled points of the ground, for its convex hull
 REGION_CELL = 0.02  # metres, side of a cell of the ground in a region
+LOWEST_SHARE = 0.012  # of the distance: least height of an object, for noisy depth
+# metres, least width of an object at its thickest part, to exclude edges
+THINNEST = 0.006
+# metres, height above the plane within which pixels are likely to belong to it
+NEAR_TABLE = 0.015
 SEEN_OF_REGION = 0.5  # least share of cells with visible ground for a visible ground
 
 

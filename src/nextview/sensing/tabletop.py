@@ -21,13 +21,6 @@ NO_SUPPORT = (
 )
 # metres, least height of an object above the plane, to exclude stains
 LOWEST_TOP = 0.008
-# the same relative to the distance, for noisy depth
-LOWEST_SHARE = 0.012
-THINNEST = (
-    0.006  # metres, least width of an object at its thickest part, to exclude edges
-)
-# metres, height above the plane within which pixels are likely to belong to it
-NEAR_TABLE = 0.015
 
 
 @dataclass(frozen=True, eq=False)

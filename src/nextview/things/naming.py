@@ -148,7 +148,7 @@ def pose_candidates(
     some = world.hypotheses[rows]
     left = np.zeros((len(rows), 6, 6))
     for view in world.views:
-        left += normal_equations(world.library, view, some, 0.03, 96)[0]
+        left += normal_equations(world.library, view, some, 0.03)[0]
     radius = world.library.radii[some.things]
     left *= 1 / MATCHING_ERROR**2 / ALIKE_POINTS
     for number, view in enumerate(world.views):

@@ -92,10 +92,10 @@ def _of_segment(
 
     # fewer closer, then by their score
     closer = (0.15, 0.1, 0.08, 0.06, 0.05, 0.04)
-    found = register(library, [view], found, closer, 96, instances)
+    found = register(library, [view], found, closer, outline=instances)
     totals = total_scores(library, view, found, COARSEST)
     some = best(library, found, totals, RESTARTED, RESTARTED_OF_ONE)
-    some = register(library, [view], some.turned(RESTART), closer, 96, instances)
+    some = register(library, [view], some.turned(RESTART), closer, outline=instances)
     found = Hypotheses.joined([found, some])
     totals = np.append(totals, total_scores(library, view, some, COARSEST))
     found = best(library, found, totals, SCORED, SCORED_OF_ONE)

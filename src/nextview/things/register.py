@@ -22,6 +22,7 @@ from nextview.things.library import Hypotheses, Library
 from nextview.things.score import NOT_MEASURED, OUTLIER
 from nextview.types import Float, Float32, Floats, Mask
 
+POINTS = 96  # of each thing that are compared with a view
 LARGEST_TURN = 0.3  # radians in one step
 LARGEST_SHIFT = 0.25  # radii of the thing in one step
 LEAST_REACH = 0.003  # metres within which a measured point belongs to one of a thing
@@ -157,7 +158,7 @@ def register(
     views: Sequence[View],
     some: Hypotheses,
     reaches: Sequence[float],
-    count: int,
+    count: int = POINTS,
     outline: Outline | None = None,
 ) -> Hypotheses:
     """Move hypotheses to where they fit best, from where they are.
@@ -178,9 +179,7 @@ def register(
     return some
 
 
-def camera_error(
-    library: Library, view: View, some: Hypotheses, count: int = 96
-) -> View:
+def camera_error(library: Library, view: View, some: Hypotheses) -> View:
     """Correct the pose of a camera by things that are known to stand where they are.
 
     Args:
@@ -195,7 +194,7 @@ def camera_error(
     told = np.repeat(np.array(library.camera) ** -2.0, 3)
     moved = np.zeros(6)
     for reach in (0.15, 0.1, 0.06, 0.04, 0.03):
-        left, right = normal_equations(library, view, some, reach, count)
+        left, right = normal_equations(library, view, some, reach)
         # a motion of each thing about its centre, as one of the world about the camera
         left, right = (each.sum(0) for each in _about_camera(view, some, left, right))
         weight = 1 / MATCHING_ERROR**2 / ALIKE_POINTS
@@ -211,16 +210,13 @@ def camera_error(
     return view
 
 
-def seen_by_camera(
-    library: Library, view: View, some: Hypotheses, count: int = 96
-) -> Hypotheses:
+def seen_by_camera(library: Library, view: View, some: Hypotheses) -> Hypotheses:
     """Move each hypothesis to where the view shows it, as far as errors of its camera reach.
 
     Args:
         library: the things.
         view: the view.
         some: M hypotheses, of which one holds.
-        count: number of points of each.
     """
     # the pose is from a view with an error of its own: their difference has twice the variance
     told = np.repeat(np.array(library.camera) ** -2.0, 3) / 2
@@ -235,9 +231,7 @@ def seen_by_camera(
     radius = library.radii[some.things]
     for number, share in enumerate(CAMERA_ERRORS_LEFT):
         reach = np.maximum(share * error / radius, LEAST_CAMERA_REACH)
-        left, right = normal_equations(
-            library, view, some, reach, count, hidden=share <= 1
-        )
+        left, right = normal_equations(library, view, some, reach, hidden=share <= 1)
         left, right = (one / MATCHING_ERROR**2 / ALIKE_POINTS for one in (left, right))
         if number:  # a contour is sought where its depth is known
             reach = CONTOUR_REACH * share * error
@@ -255,7 +249,7 @@ def seen_by_camera(
             centres=place + np.einsum("mij,mj->mi", turn, arm) + step[:, 3:],
         )
     # the contour has a bias; in the directions that points tell, they are more exact
-    return register(library, [view], some, (0.03, 0.02), count)
+    return register(library, [view], some, (0.03, 0.02))
 
 
 def _about_camera(
@@ -309,7 +303,7 @@ def normal_equations(
     view: View,
     some: Hypotheses,
     reach: float | Float,
-    count: int,
+    count: int = POINTS,
     outline: Outline | None = None,
     hidden: bool = False,
 ) -> tuple[Float, Float]:

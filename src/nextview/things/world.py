@@ -137,7 +137,7 @@ class World:
         some = self.hypotheses
         views = (*self.views, view)
         if len(self.views) < SETTLED_VIEWS and len(some):
-            some = register(self.library, views, some, (0.03, 0.02), 96)
+            some = register(self.library, views, some, (0.03, 0.02))
             columns = [self._column(one, some) for one in self.views]
             scores = [
                 # what came later says nothing of an earlier view
@@ -245,7 +245,7 @@ class World:
             turned = Hypotheses.joined([turned, alike])
             of = np.append(of, its)
         closer = (0.12, 0.08, 0.06, 0.04, 0.03, 0.02)
-        new = register(self.library, self.views, turned, closer, 96)
+        new = register(self.library, self.views, turned, closer)
         totals = self._coarse_totals(new)
         order = np.lexsort((-totals, of))
         first = order[np.unique(of[order], return_index=True)[1]]
@@ -259,7 +259,7 @@ class World:
             return self
         for _ in range(RESIZED):
             new = some.in_other_sizes()
-            new = register(self.library, self.views, new, (0.06, 0.04, 0.03), 96)
+            new = register(self.library, self.views, new, (0.06, 0.04, 0.03))
             totals = self._coarse_totals(new).reshape(len(some), -1)
             some = new[totals.argmax(1) + totals.shape[1] * np.arange(len(some))]
         other = some[np.flatnonzero(~some.taught)]
@@ -290,7 +290,7 @@ class World:
         if not groups:
             return self
         new = Hypotheses.joined(groups)
-        new = register(self.library, self.views, new, (0.2, 0.15, 0.1, 0.06, 0.03), 96)
+        new = register(self.library, self.views, new, (0.2, 0.15, 0.1, 0.06, 0.03))
         totals = self._coarse_totals(new)
         ends = np.cumsum([len(one) for one in groups])
         some = [
