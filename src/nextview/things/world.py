@@ -240,7 +240,9 @@ class World:
         some = self.hypotheses[np.array(sorted(rows), np.int64)]
         turned = some.turned(RESTART)
         of = np.arange(len(turned)) // (len(turned) // len(some))
-        if len(self.views) > 1:  # another view may show which side is in front
+        if (
+            self.alone and len(self.views) > 1
+        ):  # another view may show which side it was
             alike, its = some.turned_alike(self.library)
             turned = Hypotheses.joined([turned, alike])
             of = np.append(of, its)
