@@ -1,13 +1,15 @@
 """Contours tell where things are, and that each view has an error of its own camera."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from drawn_views import camera, drawn, library, standing
+from scipy.spatial.transform import Rotation
 
 from nextview.things.contour import contour_equations
-from nextview.things.library import Hypotheses
+from nextview.things.library import Hypotheses, closed
 from nextview.things.register import normal_equations, seen_by_camera
 from nextview.things.world import World, aligned
 
@@ -46,6 +48,44 @@ def test_a_contour_tells_a_shift_along_a_plate(things):
     reach = np.array([0.015])
     assert told(*contour_equations(things, view, off, reach))[1] == pytest.approx(
         -0.006, abs=0.001
+    )
+
+
+def test_a_contour_ends_where_nothing_is_measured(things):
+    box = things.caster.surfaces[0]
+    pose = standing(box, 0, 0)
+    view = drawn([(box, pose)], FRONT)
+    far = replace(view.frame, depth=np.where(view.surface, 0, view.depth))
+    view = replace(view, frame=far, surface=np.zeros_like(view.surface))
+    off = shifted(placed(things, 0, pose), 0.0, 0.006, 0.0)
+    equations = contour_equations(things, view, off, np.array([0.015]))
+    assert told(*equations)[1] == pytest.approx(-0.006, abs=0.001)
+
+
+def test_turns_and_their_products_leave_the_middle_where_it_is(things):
+    quarters, half = (
+        Rotation.from_rotvec(np.pi * np.array(vectors)).as_matrix()
+        for vectors in (
+            [[0, 0, 0.5], [0, 0, 1], [0, 0, -0.5]],
+            [[1, 0, 0]],
+        )
+    )
+    turns = closed(np.concatenate([quarters, half]))
+    assert len(turns) == 7  # of the eight of a square prism, without the identity
+    turning = copy(things)
+    turning.turns = {"box": turns}
+    pose = standing(things.caster.surfaces[0], 0.1, 0.2, 30)
+    some = Hypotheses.joined([placed(things, number, pose) for number in (1, 0)])
+    alike, row = some.turned_alike(turning)
+    assert (row == 1).all()
+    for one in range(7):
+        turn = alike.rotations[one].T @ some.rotations[1]
+        assert min(np.abs(turn - other).max() for other in turns) < 1e-9
+    middle = things.principal.middles[0]
+    np.testing.assert_allclose(
+        alike.rotations @ middle + alike.centres,
+        np.tile(some.rotations[1] @ middle + some.centres[1], (7, 1)),
+        atol=1e-9,
     )
 
 
