@@ -195,7 +195,7 @@ class World:
         strange = before.copy()
         for row in self.strangers:
             last = row[-1]
-            if last is not None and any(row[:-1]):
+            if last is not None and any(row[:-1]) and not self.alone:
                 strange.ravel()[last.cells] = True
                 if _settled(row):
                     before.ravel()[last.cells] = True
