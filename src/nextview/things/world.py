@@ -181,8 +181,8 @@ class World:
         """Return the world with names for what the last view shows unexplained.
 
         What an earlier view from the same place has shown alike was searched before. A stranger
-        that an earlier view has shown is neither joined to others nor cut again, and after some
-        views it is not searched any more.
+        among other things that an earlier view has shown is neither joined to them nor cut again,
+        and after some views it is not searched any more.
 
         Args:
             among: things that may be there, (T,) bool.
