@@ -58,7 +58,7 @@ def test_a_contour_ends_where_nothing_is_measured(things):
     far = replace(view.frame, depth=np.where(view.surface, 0, view.depth))
     view = replace(view, frame=far, surface=np.zeros_like(view.surface))
     off = shifted(placed(things, 0, pose), 0.0, 0.006, 0.0)
-    equations = contour_equations(things, view, off, np.array([0.015]))
+    equations = contour_equations(things, view, off, np.array([0.015]), alone=True)
     assert told(*equations)[1] == pytest.approx(-0.006, abs=0.001)
 
 

@@ -24,6 +24,8 @@ SURPRISE = 6.9  # nats that make a move as likely as none: one thing in a thousa
 INDEPENDENT_POINTS = 60.0  # of them, whose errors are not alike
 # error of the expected pose that is left before each step, as a share
 ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
+# of the contour in each step, which is less accurate than points
+CONTOUR_WEIGHTS = (1.0, 1.0, 0.5, 0.25, 0.15)
 HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a point
 LONGEST_STEP = 0.5  # radians, or radii
 
@@ -82,7 +84,7 @@ def followed(library: Library, view: View, body: Body) -> Followed:
     weight = INDEPENDENT_POINTS / POINTS / error**2
     motion = np.zeros(6)
     told = np.zeros((6, 6))
-    for share in ERRORS_LEFT:
+    for share, of_contour in zip(ERRORS_LEFT, CONTOUR_WEIGHTS, strict=True):
         some = _pose(body, state)
         left_over = share * body.displaced
         reach = min(float(np.hypot(left_over, error)) / radius, WIDEST)
@@ -92,8 +94,8 @@ def followed(library: Library, view: View, body: Body) -> Followed:
         edges = contour_equations(
             library, view, some, np.array([2 * np.hypot(left_over, error)])
         )
-        told = weight * left[0] + edges[0][0]
-        shown = weight * right[0] + edges[1][0]
+        told = weight * left[0] + of_contour * edges[0][0]
+        shown = weight * right[0] + of_contour * edges[1][0]
         change = np.linalg.solve(told + information, shown - information @ motion)
         longest = np.abs(change / np.repeat([1.0, radius], 3)).max()
         state = state.displaced(

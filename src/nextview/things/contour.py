@@ -59,7 +59,11 @@ class _Contours:
 
 
 def contour_equations(
-    library: Library, view: View, some: Hypotheses, reach: Float
+    library: Library,
+    view: View,
+    some: Hypotheses,
+    reach: Float,
+    alone: bool = False,
 ) -> tuple[Float, Float]:
     """Return the normal equations of contours for a small motion of each hypothesis.
 
@@ -68,6 +72,8 @@ def contour_equations(
         view: the view.
         some: M hypotheses.
         reach: how far each may be from where it is expected, (M,), metres.
+        alone: whether a contour ends, too, where nothing is measured: that is far away, or in the
+            shadow of the thing, and of nothing else.
 
     Returns:
         Left side, (M, 6, 6), and right side, (M, 6), float64: rotation about the centre and shift,
@@ -76,7 +82,7 @@ def contour_equations(
     axes, place = view.camera[:3, :3], view.camera[:3, 3]
     middle = (some.centres - place) @ axes
     contours = _expected(library, view, some, middle, reach)
-    shift, found = _found(library, view, some, contours)
+    shift, found = _found(library, view, some, contours, alone)
     found &= np.bincount(contours.row[found], minlength=len(some))[contours.row] >= (
         FEWEST_POINTS
     )
@@ -194,7 +200,7 @@ def _expected(
 
 
 def _found(
-    library: Library, view: View, some: Hypotheses, contours: _Contours
+    library: Library, view: View, some: Hypotheses, contours: _Contours, alone: bool
 ) -> tuple[Float, Mask]:
     """Return how far outwards each point of a contour is seen, pixels, and whether it is, (N,)."""
     steps = np.arange(-SHIFTS - DEEP, SHIFTS + DEEP)  # along the normal, outwards
@@ -237,7 +243,8 @@ def _found(
     each = np.arange(len(best))
     close = np.abs(depths + 0.5) < 3
     behind = (measured > depth + margin) | (carries & (measured > depth - margin))
-    behind |= inside & (measured == 0)  # far away, or in a shadow
+    if alone:
+        behind |= inside & (measured == 0)
     shows = (on & counted & close)[each, best].sum(1) >= SHOWN
     ends = (behind[:, None] & (depths < 0) & close)[each, best].sum(1) >= SHOWN
     shift = shifts[best] * contours.step

@@ -235,7 +235,7 @@ def seen_by_camera(library: Library, view: View, some: Hypotheses) -> Hypotheses
         left, right = (one / MATCHING_ERROR**2 / ALIKE_POINTS for one in (left, right))
         if number:  # a contour is sought where its depth is known
             reach = CONTOUR_REACH * share * error
-            edges = contour_equations(library, view, some, reach)
+            edges = contour_equations(library, view, some, reach, alone=True)
             left, right = left + edges[0], right + edges[1]
         left, right = _about_camera(view, some, left, right)
         right = right - told * moved
