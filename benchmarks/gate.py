@@ -250,12 +250,12 @@ def single(bench: Bench) -> Iterator[Row]:
         session = system.session()
         for frame in range(len(seen.depth)):
             mask = seen.labels[frame] > 0
-            if not mask.any():
-                continue
-            told, cost = updated(session, frame_of(seen, frame, mask))
+            cost: Row = {"refused": 0, "seconds": []}
+            if mask.any() and not session.done:
+                _, cost = updated(session, frame_of(seen, frame, mask))
             found = []
-            if told is not None and session.result.answer is not None:
-                said = session.result
+            said = session.result if session.views else None
+            if said is not None and said.answer is not None:
                 found.append(
                     SimpleNamespace(
                         name=said.answer, confident=said.confident, pose=said.pose
