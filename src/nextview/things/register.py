@@ -186,7 +186,6 @@ def camera_error(library: Library, view: View, some: Hypotheses) -> View:
         library: the things.
         view: the view.
         some: hypotheses that hold.
-        count: number of points of each.
 
     Returns:
         The view with another ``camera``.
