@@ -20,7 +20,7 @@ from nextview.things.fusion import cell_of
 from nextview.things.library import Library, closed, near_turns
 from nextview.things.memory import open_memory
 from nextview.things.naming import LIKELY, named, pose_candidates, why_in_doubt
-from nextview.things.world import World, aligned
+from nextview.things.world import World, aligned, balanced
 from nextview.types import Floats, Index, Mask
 from nextview.views.expected_views import Outlook
 
@@ -202,6 +202,7 @@ class VerifiedRecogniser(NetworkRecogniser):
             # what is looked at is an object, and no piece of a wall
             world = replace(world.with_view(view_of(observation)), flat=())
             world = aligned(aligned(world).searched(among)).numbered()
+        world = balanced(world)
         self._last = (seen, world)
         return world
 

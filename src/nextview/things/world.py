@@ -164,7 +164,7 @@ class World:
             ),
             owners=(*self.owners, held),
         )
-        return _balanced(world).chosen()
+        return balanced(world).chosen()
 
     def _column(self, view: View, some: Hypotheses) -> list[Score | None]:
         """Score hypotheses in a view; if all show one thing, with the error of its camera."""
@@ -588,7 +588,7 @@ def aligned(world: World) -> World:
     return replace(world, views=tuple(views))
 
 
-def _balanced(world: World) -> World:
+def balanced(world: World) -> World:
     """Return the world, moved as a whole, so that the mean error of its cameras is zero.
 
     Each camera errs as much as the first one. All that was compared stays as it is.
