@@ -149,7 +149,7 @@ class SegmentationNetwork:
         """
         self.card = read_segmentation_card(card)
         self.path = card.with_suffix(".onnx")
-        self._session = open_onnx(self.path, self.card.sha256, 0)
+        self._session = open_onnx(self.path, self.card.sha256)
         for ends, name, size in (
             (self._session.get_inputs(), PICTURE_INPUT, PICTURE_CHANNELS),
             (self._session.get_outputs(), PICTURE_OUTPUT, OUTPUTS),

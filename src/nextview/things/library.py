@@ -59,7 +59,7 @@ class Library:
         symmetries: of each thing, by its name.
         near: rotations about the centroid after which each thing looks nearly the same, by its
             name, (N, 3, 3) float64.
-        turns: those after which it may look the same, and products of them, by its name, (N, 3, 3).
+        turns: the same, with those of exact symmetries, and products of them, (N, 3, 3) float64.
         caster: casts rays at their surfaces.
         visible: what cameras in all directions see of them.
         centres: centre of each in the frame of its scan file, (T, 3) float64, metres.
@@ -84,7 +84,7 @@ class Library:
             surfaces: of the things, with their names.
             symmetries: of each thing, by its name.
             near: rotations of each thing, by its name.
-            turns: the same, see above.
+            turns: rotations of each thing, exact ones and products among them, by its name.
             threads: number of threads; 0 for one on each core.
             directions: from a thing to the cameras that see it, unit vectors, (D, 3); None for all
                 around.

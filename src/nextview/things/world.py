@@ -240,9 +240,8 @@ class World:
         some = self.hypotheses[np.array(sorted(rows), np.int64)]
         turned = some.turned(RESTART)
         of = np.arange(len(turned)) // (len(turned) // len(some))
-        if (
-            self.alone and len(self.views) > 1
-        ):  # another view may show which side it was
+        # another view may show which side of one thing it was
+        if self.alone and len(self.views) > 1:
             alike, its = some.turned_alike(self.library)
             turned = Hypotheses.joined([turned, alike])
             of = np.append(of, its)
