@@ -4,7 +4,14 @@ from copy import copy
 
 import numpy as np
 import pytest
-from factories import camera_over, meshes_of, view, without
+from factories import (
+    PlacedThing,
+    SimulatedTable,
+    camera_over,
+    meshes_of,
+    view,
+    without,
+)
 from scipy.spatial.transform import Rotation
 from test_scene_changes import shifted
 
@@ -180,6 +187,33 @@ def test_a_thing_that_was_taken_away_is_lost_and_followed_again_after_the_scene(
     scene.update(frame)
     tracker.follow(scene)
     assert off(camera, tracker.update(frame))["banana"] < 0.004
+
+
+def exchanged(table, name, other):
+    """The same table with another thing around the middle of one."""
+    (mesh,) = meshes_of([other]).values()
+    metres = mesh.vertices * mesh.radius + mesh.centre
+    things = list(table.things)
+    row = [thing.name for thing in things].index(name)
+    pose = things[row].pose.copy()
+    pose[:3, 3] = things[row].placed.mean(0) - pose[:3, :3] @ metres.mean(0)
+    things[row] = PlacedThing(other, metres, mesh.faces, pose)
+    return SimulatedTable(tuple(things))
+
+
+def test_a_thing_that_is_exchanged_for_one_that_looks_alike_loses_its_name(watched):
+    camera, scene = watched
+    tracker = nextview.Tracker(scene)
+    seconds = iter(range(100))
+    for _ in NAMES:
+        tracked = tracker.update(camera.frame(view(155)), next(seconds))
+        assert all(one.name_probability > 0.9 for one in tracked)
+
+    camera.change(exchanged(camera.table, "tuna_fish_can", "gelatin_box"))
+    for _ in NAMES:
+        tracked = tracker.update(camera.frame(view(155)), next(seconds))
+    unlikely = {one.name for one in tracked if one.name_probability < 0.5}
+    assert unlikely == {"tuna_fish_can"}
 
 
 def test_what_is_out_of_view_keeps_its_place(watched):

@@ -51,8 +51,12 @@ class Follower:
 
     @property
     def found(self) -> list[Tracked]:
-        """Those that are not lost."""
-        return [thing for thing in self.things if not thing.lost]
+        """Those that are not lost, and whose name is likely."""
+        return [
+            thing
+            for thing in self.things
+            if not thing.lost and thing.name_probability >= 0.5
+        ]
 
     def begin(self, scene: nextview.Scene) -> None:
         """Forget what was followed, and follow the things of a scene."""

@@ -11,6 +11,7 @@ from nextview.recognition.poses import PoseUncertainty
 from nextview.scene.motion import BodyState, MotionModel, Rest
 from nextview.scene.objects import SceneObject
 from nextview.things.library import Library
+from nextview.things.naming import CONFIDENT
 from nextview.things.surface import Surface
 from nextview.types import Float
 
@@ -40,6 +41,8 @@ class Tracked:
         visible: share of the pixels on it that nothing in front hides, 0 to 1.
         probability: that the pose is right, and the thing is not lost.
         lost: whether it is probably not where it is expected, or may be anywhere.
+        name_probability: that its name is right, against all that looks nearly the same, in the
+            last frame in which they were compared: about once a second while it is visible.
     """
 
     number: int
@@ -50,6 +53,7 @@ class Tracked:
     visible: float
     probability: float
     lost: bool
+    name_probability: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +73,8 @@ class Body:
         probability: that the pose is right.
         adrift: whether it may be anywhere: it moved, and was hidden too long to be registered from
             where it is expected. It is then expected where it was seen last.
+        name_probability: that its name is right, in the last frame in which it was compared.
+        uncompared: time since then, seconds.
     """
 
     number: int
@@ -82,6 +88,8 @@ class Body:
     visible: float = 1.0
     probability: float = 1.0
     adrift: bool = False
+    name_probability: float = CONFIDENT
+    uncompared: float = 0.0
 
     @classmethod
     def of(
@@ -161,6 +169,7 @@ class Body:
             self.visible,
             self.probability,
             self.lost,
+            self.name_probability,
         )
 
     def after(self, seconds: float, model: MotionModel) -> Body:
@@ -175,6 +184,7 @@ class Body:
             self,
             rest=self.rest.after(seconds, model),
             unseen=unseen,
+            uncompared=self.uncompared + seconds,
         )
         if body.rests and body.probability >= 0.5:
             # it may begin to move now, whenever it was seen last

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit, logit
 
 from nextview.scene.body import WIDEST, Body
 from nextview.scene.motion import BodyState
@@ -14,9 +15,10 @@ from nextview.sensing.planes import Plane
 from nextview.sensing.view import LEVEL, View
 from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
-from nextview.things.naming import PIXELS_ALIKE
-from nextview.things.register import POINTS, normal_equations
-from nextview.things.score import score
+from nextview.things.naming import CONFIDENT, PIXELS_ALIKE, TOTAL_ERROR
+from nextview.things.propose import RESTART
+from nextview.things.register import POINTS, normal_equations, register
+from nextview.things.score import score, total_scores
 from nextview.things.surface import SCAN_ERROR
 from nextview.types import Float
 
@@ -28,6 +30,8 @@ ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
 CONTOUR_WEIGHTS = (1.0, 1.0, 0.5, 0.25, 0.15)
 HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a point
 LONGEST_STEP = 0.5  # radians, or radii
+# how far from a thing what is measured belongs to it, radii, as its name is compared with others
+NAME_REACHES = 0.2, 0.1, 0.06, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +125,29 @@ def followed(library: Library, view: View, body: Body) -> Followed:
         evidence,
         visible,
     )
+
+
+def name_probability(library: Library, view: View, body: Body) -> float:
+    """Compare a thing with all that looks nearly the same in its place.
+
+    Args:
+        library: with the thing.
+        view: of a frame that shows it.
+        body: the thing in the pose that was found.
+
+    Returns:
+        Probability of its name, which was confident before the frame.
+    """
+    itself = _pose(body, body.state)
+    (others,) = itself.lookalikes(library, np.ones(len(library), bool))
+    some = Hypotheses.joined([itself, itself.turned(RESTART), others])
+    some = register(library, (view,), some, NAME_REACHES)
+    totals = np.maximum(total_scores(library, view, some, 1), 0)
+    scale = PIXELS_ALIKE + TOTAL_ERROR * totals.max()
+    mine = some.things == body.thing
+    lead = totals[mine].max() - totals[~mine].max(initial=0)
+    odds = logit(CONFIDENT) + lead / scale
+    return float(expit(odds))
 
 
 def _pose(body: Body, state: BodyState) -> Hypotheses:

@@ -8,13 +8,19 @@ pixels on it, against that without it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from nextview.checks import number
 from nextview.errors import SessionError, UsageError
 from nextview.scene.body import Body, Tracked
-from nextview.scene.followed import SURPRISE, followed, view_to_follow
+from nextview.scene.followed import (
+    SURPRISE,
+    followed,
+    name_probability,
+    view_to_follow,
+)
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
 from nextview.sensing.facets import Noise
@@ -23,6 +29,7 @@ from nextview.sensing.planes import Plane
 from nextview.sensing.view import View
 
 FRAME_SECONDS = 1 / 30  # between frames without a time
+NAME_SECONDS = 1.0  # after which a name is compared again
 LATEST_TIME = 1e11  # seconds: since 1970, the year 5138
 LONGEST_PAUSE = 1e5  # seconds, a day: nothing is followed so long without a frame
 
@@ -37,7 +44,8 @@ class Tracker:
 
     A thing that stands is expected to stay while something hides it. One that moves is expected
     where its velocity would bring it, until that is too uncertain; then it is lost, unless it
-    comes back to where it was seen last. Update the scene with a frame and ``follow`` it again.
+    comes back to where it was seen last. One whose ``name_probability`` falls may have been
+    exchanged, or named wrongly. Update the scene with a frame and ``follow`` it again.
 
     Args:
         scene: with at least one frame; its things with confident names are followed.
@@ -141,6 +149,17 @@ class Tracker:
         view = view_to_follow(frame, self._noise, self._ground)
         for key, body in bodies.items():
             bodies[key] = self._followed(body, seconds, view)
+
+        # one name a frame is compared with others, as this takes longer than to follow a thing
+        due = [
+            key
+            for key, body in bodies.items()
+            if body.uncompared >= NAME_SECONDS and body.visible > 0 and not body.lost
+        ]
+        if due:
+            key = max(due, key=lambda key: bodies[key].uncompared)
+            chance = name_probability(self._library, view, bodies[key])
+            bodies[key] = replace(bodies[key], name_probability=chance, uncompared=0.0)
         self._bodies = bodies
         return self.things
 

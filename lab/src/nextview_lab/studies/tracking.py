@@ -369,6 +369,7 @@ def follow(
                 "mm": off[0],
                 "degrees": off[1],
                 "lost": bool(mine.lost),
+                "name": mine.name_probability,
                 "visible": visible,
                 "seconds": spent,
                 "things": len(every),
@@ -393,15 +394,20 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     wrong = [one for one in every if _is_off(one) and one["visible"] > 0.3]
     said.append(
         f"off while visible: {len(wrong)} of {len(seen)} frames,"
-        f" {sum(not one['lost'] for one in wrong)} of them not told lost"
+        f" {sum(not one['lost'] for one in wrong)} of them not reported lost"
     )
 
     kept = [one for one in seen if not one["lost"]]
+    said.append(
+        f"name unlikely: {sum(one['name'] < 0.5 for one in kept)} of {len(kept)} frames"
+        " that are not reported lost"
+    )
     for unit in ("mm", "degrees"):
         share = np.mean([one[unit] <= 1 for one in kept])
-        said.append(f"of those not told lost: {100 * share:.0f} % within 1 {unit}")
+        said.append(f"of those not reported lost: {100 * share:.0f} % within 1 {unit}")
     said.append(
-        f"told lost while on the thing: {sum(one['lost'] and not _is_off(one) for one in every)}"
+        f"reported lost while on the thing:"
+        f" {sum(one['lost'] and not _is_off(one) for one in every)}"
     )
 
     spent = np.array([one["seconds"] / one["things"] for one in every])
@@ -426,7 +432,7 @@ def _of_trajectory(thing: str, steps: Sequence[dict[str, Any]]) -> str:
         f"{thing}: median {middle[0]:.1f} mm, {middle[1]:.1f} degrees;"
         f" 95 % {high[0]:.1f} mm, {high[1]:.1f} degrees;"
         f" {sum(map(_is_off, steps))} frames off,"
-        f" {sum(one['lost'] for one in steps)} told lost,"
+        f" {sum(one['lost'] for one in steps)} reported lost,"
         f" at the end {'off' if _is_off(steps[-1]) else 'on'} the thing"
     )
 
