@@ -20,7 +20,7 @@ from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
 from nextview.session.ranked import rank_views
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.session.target import view_of
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
@@ -219,7 +219,7 @@ def test_what_is_none_of_the_hypotheses_is_looked_at_from_the_other_side():
 
 
 def test_something_unknown_has_an_outlook_as_large_as_it_is(knobs_memory, knobs):
-    recogniser = VerifiedRecogniser(knobs_memory / "memory.json", 1)
+    recogniser = ThingRecogniser(knobs_memory / "memory.json", 1)
     library = recogniser.library
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3))
@@ -232,7 +232,7 @@ def test_something_unknown_has_an_outlook_as_large_as_it_is(knobs_memory, knobs)
 
 
 def test_an_outlook_combines_the_views_and_what_explains_them(knobs_memory, knobs):
-    recogniser = VerifiedRecogniser(knobs_memory / "memory.json", 1)
+    recogniser = ThingRecogniser(knobs_memory / "memory.json", 1)
     mesh = load_mesh(knobs / "knob.ply", unit="m")
     sensor = replace(SENSORS["none"], radius=mesh.metres, distance=AWAY)
     block = trimesh.creation.box((0.2, 1.0, 1.5))

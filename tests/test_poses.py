@@ -20,7 +20,7 @@ from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import share_of_likeliest
 from nextview.sensing import Frame
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.teaching.learn import learn
 
 ORIGIN = np.array([0.3, -0.1, 0.2])  # of the scans, far from the things
@@ -95,8 +95,8 @@ def system(known):
     return nextview.load(models=known, threads=1)
 
 
-def recogniser_of(known) -> VerifiedRecogniser:
-    return VerifiedRecogniser(known / "memory.json", 1)
+def recogniser_of(known) -> ThingRecogniser:
+    return ThingRecogniser(known / "memory.json", 1)
 
 
 def placed(name: str, yaw: float, at=SPOT) -> np.ndarray:

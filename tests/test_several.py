@@ -13,12 +13,12 @@ from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError
 from nextview.geometry.mesh import make_mesh
 from nextview.recognition.inference import Models, NetworkRecogniser
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.session.several import SeveralRecognisers
 
 
-def memory_of(folder) -> VerifiedRecogniser:
-    return VerifiedRecogniser(folder / "memory.json", 1)
+def memory_of(folder) -> ThingRecogniser:
+    return ThingRecogniser(folder / "memory.json", 1)
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ from nextview.session.reach import (
     as_reachable,
     as_travel_cost,
 )
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.session.several import SeveralRecognisers
 from nextview.session.surroundings import Surroundings
 from nextview.session.system import System, load
@@ -686,7 +686,7 @@ def _library_of(system: System) -> Library:
         ModelError: it has none.
     """
     recogniser = system.models.recogniser
-    if not isinstance(recogniser, VerifiedRecogniser | SeveralRecognisers):
+    if not isinstance(recogniser, ThingRecogniser | SeveralRecognisers):
         raise ModelError(
             f"{recogniser.name}: a scene needs things of known geometry, and these models have"
             " none; a session recognises one object by its class"

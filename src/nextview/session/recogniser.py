@@ -30,7 +30,7 @@ NOTHING_FITS = "no taught thing explains the views"
 OTHER_SIZE = 5.0  # times smaller or larger than all things are: it is none of them
 
 
-class VerifiedRecogniser(NetworkRecogniser):
+class ThingRecogniser(NetworkRecogniser):
     """Recognises taught things in all views together: by what explains their pixels best.
 
     The evidence of single views is that of the size alone.
@@ -88,7 +88,7 @@ class VerifiedRecogniser(NetworkRecogniser):
         shape = len(observations), len(self.classes)
         return Evidence(np.zeros(shape, np.float32))
 
-    def without(self, names: Collection[str]) -> VerifiedRecogniser:
+    def without(self, names: Collection[str]) -> ThingRecogniser:
         """The same recogniser for an object that is none of some classes.
 
         Args:
@@ -104,7 +104,7 @@ class VerifiedRecogniser(NetworkRecogniser):
         other._last = None
         return other
 
-    def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
+    def for_cameras(self, place: float, aim: float) -> ThingRecogniser:
         """The same recogniser for cameras with another pose accuracy.
 
         Args:
@@ -237,4 +237,4 @@ def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
     """
     if find_card(model).memory is None:
         return NetworkRecogniser(model, threads)
-    return VerifiedRecogniser(model, threads)
+    return ThingRecogniser(model, threads)

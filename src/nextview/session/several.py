@@ -18,7 +18,7 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_of
 from nextview.recognition.protocol import JointBelief, least_p_value
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.things.library import Library
 from nextview.things.surface import Surface
 from nextview.types import Float, Floats
@@ -54,10 +54,10 @@ class SeveralRecognisers:
         Raises:
             ModelError: there are two networks, or no memory.
         """
-        memories: dict[str, VerifiedRecogniser] = {}
+        memories: dict[str, ThingRecogniser] = {}
         networks: dict[str, NetworkRecogniser] = {}
         for name, member in members.items():
-            if isinstance(member, VerifiedRecogniser):
+            if isinstance(member, ThingRecogniser):
                 memories[name] = member
             else:
                 networks[name] = member
@@ -135,14 +135,12 @@ class SeveralRecognisers:
             shown = zip(self.classes[first:last], member.classes, strict=True)
             own = [alone for as_told, alone in shown if as_told in names]
             first = last
-            if own and not isinstance(member, VerifiedRecogniser):
+            if own and not isinstance(member, ThingRecogniser):
                 raise ModelError(
                     f"{own[0]} is a class of a network; only taught things are ruled out"
                 )
             members[name] = (
-                member.without(own)
-                if isinstance(member, VerifiedRecogniser)
-                else member
+                member.without(own) if isinstance(member, ThingRecogniser) else member
             )
         return SeveralRecognisers(members)
 
@@ -158,7 +156,7 @@ class SeveralRecognisers:
         """
         members: dict[str, NetworkRecogniser] = {}
         for name, member in self._collections.items():
-            if isinstance(member, VerifiedRecogniser):
+            if isinstance(member, ThingRecogniser):
                 members[name] = member.for_cameras(place, aim)
             else:
                 members[name] = member

@@ -46,7 +46,7 @@ from nextview.recognition.protocol import (
 from nextview.segmentation.instances import Segmenter
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.limits import Limits
-from nextview.session.recogniser import VerifiedRecogniser, open_recogniser
+from nextview.session.recogniser import ThingRecogniser, open_recogniser
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
 from nextview.session.several import SeveralRecognisers
@@ -501,7 +501,7 @@ def _for_cameras(recogniser: Recogniser, accuracy: Any) -> Recogniser:
             f"{what} is (millimetres, degrees), not {one_line(repr(accuracy))}"
         )
     place, aim = (number(value, what, 0) for value in accuracy)
-    if not isinstance(recogniser, VerifiedRecogniser | SeveralRecognisers):
+    if not isinstance(recogniser, ThingRecogniser | SeveralRecognisers):
         raise ModelError(
             f"{recogniser.name}: {what} counts for taught things of known geometry alone"
         )

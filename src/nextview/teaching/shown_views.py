@@ -16,7 +16,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.belief import Stopping
-from nextview.session.recogniser import VerifiedRecogniser
+from nextview.session.recogniser import ThingRecogniser
 from nextview.simulation.sensed_camera import SensedCamera
 
 VIEWS_SHOWN = (1, 2, 3)  # numbers of views after which things are named
@@ -131,13 +131,13 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
 
 
 @lru_cache(maxsize=1)
-def _opened(card: Path) -> VerifiedRecogniser:
+def _opened(card: Path) -> ThingRecogniser:
     """A memory, opened once."""
-    return VerifiedRecogniser(card, threads=1)
+    return ThingRecogniser(card, threads=1)
 
 
 def _views(
-    recogniser: VerifiedRecogniser, thing: int, sensor: str, rng: Generator
+    recogniser: ThingRecogniser, thing: int, sensor: str, rng: Generator
 ) -> list[Observation]:
     """Random views of a thing that show it.
 

@@ -28,7 +28,7 @@ from nextview.recognition.protocol import (
     Recogniser,
     log_evidence_of_views,
 )
-from nextview.session.recogniser import VerifiedRecogniser, open_recogniser
+from nextview.session.recogniser import ThingRecogniser, open_recogniser
 from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
@@ -58,7 +58,7 @@ class KnownThings:
         self.recogniser = recogniser
         self._order = np.argsort(recogniser.classes, kind="stable")
         self.names = tuple(recogniser.classes[k] for k in self._order)
-        self.memory = recogniser if isinstance(recogniser, VerifiedRecogniser) else None
+        self.memory = recogniser if isinstance(recogniser, ThingRecogniser) else None
 
     def surface(self, thing: int) -> Surface | None:
         """Return the taught surface of a thing; None for a recogniser of your own."""
@@ -117,7 +117,7 @@ def things_of(models: str, given: str | None) -> KnownThings:
     if given is not None:
         return KnownThings(own_recogniser(given))
     recogniser = open_recogniser(find_models(models).recogniser, threads=1)
-    if not isinstance(recogniser, VerifiedRecogniser):
+    if not isinstance(recogniser, ThingRecogniser):
         raise UsageError(
             f"{models}: knows the geometry of no thing; teach it with --unit"
         )
