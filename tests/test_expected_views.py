@@ -110,7 +110,7 @@ def expected(divergence, belief, things) -> ExpectedViews:
     hypotheses = hypotheses_of(things, belief)
     some = np.ones(len(divergence))
     return ExpectedViews(
-        hypotheses, divergence, np.zeros_like(divergence), some, 0 * some
+        hypotheses, divergence, np.zeros_like(divergence), some, some, 0 * some
     )
 
 

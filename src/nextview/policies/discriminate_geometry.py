@@ -88,23 +88,19 @@ class DiscriminateGeometry:
         if not len(some):
             return values
 
+        # what is none of the hypotheses shows most in views far from those so far
+        new = self._apart(some, visited)
         information = np.zeros(len(some))
-        found = np.ones(len(some))
         if outlook is not None:
             cameras = outlook.cameras(self.viewpoints.directions[some])
             expected = outlook.expect(cameras, self.goal)
-            found = expected.found
-            # what is none of the hypotheses is told by what was not seen yet
-            unknown = outlook.unknown
-            information = (1 - unknown) * expected.worth(self.goal)
-            information += (
-                unknown * found * self._apart(some, visited) / LEAST_INFORMATION
-            )
+            new = new * expected.pixels / max(expected.pixels.max(), 1.0)
             # views that show little of it are worse than is foreseen
-            information = found * information
+            known = expected.found * expected.worth(self.goal)
+            information = (1 - outlook.unknown) * known + outlook.unknown * new
         best = information.max()
         if best < LEAST_INFORMATION:
-            information = found * self._apart(some, visited)
+            information = LEAST_INFORMATION * new
             best = LEAST_INFORMATION
         way = travel[some]
         nearer = nearer_first(information, way, best)
@@ -112,8 +108,7 @@ class DiscriminateGeometry:
         return values
 
     def _apart(self, views: Index, visited: Mask) -> Float:
-        """Return values below LEAST_INFORMATION by the distance from all visited views, (N,)."""
+        """Return the distance from the nearest visited view, (N,), half turns."""
         if not visited.any():
             return np.zeros(len(views))
-        nearest = self.viewpoints.arc[views][:, visited].min(1)
-        return LEAST_INFORMATION * nearest / np.pi
+        return self.viewpoints.arc[views][:, visited].min(1) / np.pi

@@ -53,6 +53,7 @@ class ExpectedViews:
             noise, (V, H, H) float64.
         found: share of the information that each view is trusted to give, (V,) float64, 0 to 1. A
             view with few pixels of the thing is more likely to miss it.
+        pixels: of the thing that each view is expected to show, (V,) float64.
         sharper: reduction of the pose error, see ``expected_pose.sharper_poses``, (V,) float64;
             zeros if it was not requested.
     """
@@ -61,6 +62,7 @@ class ExpectedViews:
     divergence: Float
     different: Float
     found: Float
+    pixels: Float
     sharper: Float
 
     def information(self, goal: Goal = "thing") -> Float:
@@ -216,8 +218,9 @@ def expected_views(
     weight = model.geometry / (1 + model.correlation * taken)
     moved = gaps_after_alignment(rendered, sensor, model)
     divergence, different = divergences(rendered, moved, sensor, model)
-    pixels_shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
-    found = rendered.sight * pixels_shown / (pixels_shown + HALF_FOUND)
+    shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
+    pixels = rendered.sight * shown
+    found = pixels / (shown + HALF_FOUND)
     sharper = np.zeros(len(cameras))
 
     if covariance is not None:
@@ -233,7 +236,9 @@ def expected_views(
             taken,
         )
 
-    return ExpectedViews(hypotheses, weight * divergence, different, found, sharper)
+    return ExpectedViews(
+        hypotheses, weight * divergence, different, found, pixels, sharper
+    )
 
 
 @dataclass(frozen=True, eq=False)
