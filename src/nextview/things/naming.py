@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import expit, softmax
 
 from nextview.recognition.poses import PoseCandidate, distinct
-from nextview.things.register import ALIKE_POINTS, MATCHING_ERROR, normal_equations
+from nextview.things.register import POINT_INFORMATION, normal_equations
 from nextview.things.score import PIXEL_GAIN
 from nextview.things.world import STRANGER_GAIN, Thing, World
 from nextview.types import Float, Index
@@ -150,7 +150,7 @@ def pose_candidates(
     for view in world.views:
         left += normal_equations(world.library, view, some, 0.03)[0]
     radius = world.library.radii[some.things]
-    left *= 1 / MATCHING_ERROR**2 / ALIKE_POINTS
+    left *= POINT_INFORMATION
     for number, view in enumerate(world.views):
         # what is not hidden of its outline lies within pixels of the grid
         scores = [world.scores[row][number] for row in rows]

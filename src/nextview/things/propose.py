@@ -15,7 +15,7 @@ import numpy as np
 from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import Outline, Projected, register
-from nextview.things.score import total_scores
+from nextview.things.score import NEAREST, total_scores
 from nextview.types import Float, Float32, Mask
 
 PROPOSED = 600  # poses that pairs of points propose, at most
@@ -167,7 +167,7 @@ def matched(
 
     # number of pixels that the hypothesis would show, and how much of the segment it covers
     side = 2 * np.sqrt(25 / 24) * library.radii[some.things]
-    side *= view.frame.pinhole.fx / np.maximum(seen.middle[:, 2], 0.05)
+    side *= view.frame.pinhole.fx / np.maximum(seen.middle[:, 2], NEAREST)
     covered = (
         seen.fill * side**2 * (match & own).mean(1) / max(1, np.count_nonzero(mask))
     )
@@ -190,7 +190,7 @@ def _beside(
         to the segment, (M, N) bool; and whether anything is measured, (M, N) bool.
     """
     height, width = view.frame.shape
-    pixels = aside * view.frame.pinhole.fx / np.maximum(seen.middle[:, 2:], 0.05)
+    pixels = aside * view.frame.pinhole.fx / np.maximum(seen.middle[:, 2:], NEAREST)
     step = np.rint(pixels).astype(np.int32)
     off = np.full(seen.row.shape, np.inf, np.float32)
     own = np.zeros(seen.row.shape, bool)

@@ -27,7 +27,7 @@ from nextview.things.propose import (
     propose,
 )
 from nextview.things.register import camera_error, register, seen_by_camera
-from nextview.things.score import PIXEL_GAIN, Score, score, total, total_scores
+from nextview.things.score import NEAREST, PIXEL_GAIN, Score, score, total, total_scores
 from nextview.types import Float, Float32, Index, Mask
 
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
@@ -39,8 +39,8 @@ EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 AS_LIKELY = (
     0.5  # of what the best hypothesis of a place explains: of others that are kept
 )
-RIVALS_OF_ONE = 2  # hypotheses of one thing at one place that are kept
-LOOKALIKES, LOOKALIKES_OF_ONE = 4, 2  # of a new or doubtful thing that are kept
+OF_ONE = 2  # hypotheses of one thing at one place that are kept
+LOOKALIKES = 4  # of a new or doubtful thing that are kept
 RESTARTED = 3  # hypotheses of a place that are registered from other starts, at most
 RESIZED = 3  # times that a thing is tried larger or smaller
 CLEAR_SHARE = 0.5  # share of the possible gain from which on pixels are explained
@@ -295,7 +295,7 @@ class World:
         totals = self._coarse_totals(new)
         ends = np.cumsum([len(one) for one in groups])
         some = [
-            best(self.library, new[rows], totals[rows], LOOKALIKES, LOOKALIKES_OF_ONE)
+            best(self.library, new[rows], totals[rows], LOOKALIKES, OF_ONE)
             for rows in np.split(np.arange(len(new)), ends[:-1])
         ]
         return self.with_hypotheses(Hypotheses.joined(some)).chosen()
@@ -508,7 +508,7 @@ class World:
             again = same & (angle + apart / radii[row] < SAME_POSE)
 
             most = totals[places][near].max(initial=0.0)
-            few = same.sum() < RIVALS_OF_ONE and not again.any()
+            few = same.sum() < OF_ONE and not again.any()
             if row in kept or (few and totals[row] > AS_LIKELY * most):
                 kept.add(row)
                 places.append(row)
@@ -805,7 +805,7 @@ def _expected(world: World, row: Sequence[Score | None], view: View) -> Index:
     points = world_points(world, row)
     camera = view.camera
     seen = (points - camera[:3, 3]) @ camera[:3, :3]
-    seen = seen[seen[:, 2] > 0.05]
+    seen = seen[seen[:, 2] > NEAREST]
     if not len(seen):
         return np.zeros(0, np.int64)
     grid = view.grid()
