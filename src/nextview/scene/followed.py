@@ -16,7 +16,7 @@ from nextview.sensing.view import LEVEL, View
 from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
 from nextview.things.naming import CONFIDENT, PIXELS_ALIKE, TOTAL_ERROR
-from nextview.things.propose import RESTART
+from nextview.things.propose import COARSEST, RESTART
 from nextview.things.register import POINTS, normal_equations, register
 from nextview.things.score import score, total_scores
 from nextview.things.surface import SCAN_ERROR
@@ -32,6 +32,7 @@ HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a p
 LONGEST_STEP = 0.5  # radians, or radii
 # how far from a thing what is measured belongs to it, radii, as its name is compared with others
 NAME_REACHES = 0.2, 0.1, 0.06, 0.03
+MOST_LOOKALIKES = 64  # poses of other things that are registered to compare a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +141,8 @@ def name_probability(library: Library, view: View, body: Body) -> float:
     """
     itself = _pose(body, body.state)
     (others,) = itself.lookalikes(library, np.ones(len(library), bool))
+    totals = total_scores(library, view, others, COARSEST)
+    others = others[np.argsort(-totals)[:MOST_LOOKALIKES]]
     some = Hypotheses.joined([itself, itself.turned(RESTART), others])
     some = register(library, (view,), some, NAME_REACHES)
     totals = np.maximum(total_scores(library, view, some, 1), 0)
