@@ -31,8 +31,6 @@ OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
 NEIGHBOURS_APART = 0.015  # metres of depth between the pixels of two parts of one thing
 STEEPEST_SLOPE = 6.0  # depth over width of the steepest surface that is measured
-FEWEST_NEIGHBOURS = 12  # pixels along which two parts of one thing touch, at least
-MOST_PARTED = 0.9  # share of an instance above which a piece is the instance
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +231,7 @@ class View:
         for mask in _parts(labels, 6 * self.fewest):
             owner = int(np.bincount(self.labels[mask]).argmax())
             whole = np.count_nonzero(self.labels == owner)
-            if not owner or np.count_nonzero(mask) <= MOST_PARTED * whole:
+            if not owner or np.count_nonzero(mask) < whole:
                 yield mask
 
     def unions(self) -> Iterator[Mask]:
@@ -247,7 +245,7 @@ class View:
         group = np.arange(len(sizes))
         while True:
             smaller = np.sqrt(np.minimum(sizes[:, None], sizes))
-            close = np.where(touching >= FEWEST_NEIGHBOURS, touching / (smaller + 1), 0)
+            close = touching / (smaller + 1)
             low, high = np.unravel_index(close.argmax(), close.shape)
             if close[low, high] <= 0:
                 return

@@ -27,7 +27,6 @@ from nextview.types import Float, Float32, Floats, Mask
 TRIPLES = 48  # planes through three pixels that are tried in each segment
 LEAST_FLAT = 0.25  # share of a segment that a plane explains, at least
 SHADOW = 12  # pixels of the widest shadow beside an edge
-FACES = 3  # planes of one segment, at most
 
 
 def planes(view: View) -> tuple[Score, ...]:
@@ -59,7 +58,7 @@ def _of_segment(
     """Return the planes of a segment, and the pixels that they continue in."""
     rng = np.random.default_rng(0)
     left = own
-    for _ in range(FACES):
+    while True:
         cells = np.flatnonzero(left)
         if len(cells) < 12 or len(cells) < LEAST_FLAT * np.count_nonzero(own):
             return
