@@ -25,8 +25,8 @@ from nextview.things.surface import Surface
 from nextview.things.visible_points import ALL_AROUND
 from nextview.things.world import (
     CLEAR_SHARE,
+    EXPLAINED,
     NEW_OBJECT,
-    SAME_SEGMENT,
     STRANGER_GAIN,
     Thing,
     World,
@@ -321,7 +321,7 @@ def _free(view: View, taken: Mask) -> Iterator[Float]:
     stride = view.stride
     for mask in view.instances():
         cells = np.flatnonzero(mask[::stride, ::stride])
-        if len(cells) and taken[cells].mean() < SAME_SEGMENT:
+        if len(cells) and taken[cells].mean() < EXPLAINED:
             yield view.points(cells).mean(0)
 
 

@@ -32,6 +32,9 @@ from nextview.types import Float, Float32, Index, Mask
 
 NEW_OBJECT = 20.0  # nats that an object has to explain to be one
 STRANGER_GAIN = 0.45  # nats, of a pixel of something without a model
+EXPLAINED = (
+    0.3  # share of a segment that is explained, from which on it is not searched
+)
 EXPLAINS = 0.5  # nats of a pixel from which on it is explained
 AS_LIKELY = (
     0.5  # of what the best hypothesis of a place explains: of others that are kept
@@ -51,9 +54,7 @@ MOVED_SHARE = (
 MOST_VIEWS = 6  # that are kept
 SETTLED_VIEWS = 3  # views after which poses are not refined, and names not searched
 SAME_DEPTH = 0.03  # metres between the points of one stranger in two views
-# share of the pixels of a segment that something explains, or that another segment of a stranger
-# has, from which on it is the same
-SAME_SEGMENT = 0.5
+SAME_SEGMENT = 0.5  # share of the pixels of two segments that are one stranger
 
 _Rows = tuple[tuple[Score | None, ...], ...]
 
@@ -207,7 +208,7 @@ class World:
             (view.fragments, CLEAR_SHARE, strange),
         ):
             shown = world.explained(share) | view.enlarged(known)
-            left = [mask for mask in segments() if shown[mask].mean() < SAME_SEGMENT]
+            left = [mask for mask in segments() if shown[mask].mean() < EXPLAINED]
             world = world._with_proposals(left, among)
 
         shown = world.explained(CLEAR_SHARE) | view.enlarged(strange)
