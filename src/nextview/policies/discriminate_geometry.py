@@ -24,9 +24,9 @@ class DiscriminateGeometry:
     """Chooses the view with the most expected information about the object's identity.
 
     The leading hypotheses are rendered from each candidate view, see ``views.expected_views``.
-    Among views of similar value, the one with the shortest travel is taken. If no view is
-    informative, or nothing can be predicted, the view farthest from all visited ones is taken, as
-    it tests the belief most.
+    Among views of similar value, the one with the shortest travel is taken. As far as the object is
+    probably none of the hypotheses, and if no view is informative, a view is worth its distance
+    from all visited ones times the pixels of the object that it is expected to show.
 
     Attributes:
         viewpoints: the candidates, with any positions.
@@ -88,7 +88,7 @@ class DiscriminateGeometry:
         if not len(some):
             return values
 
-        # what is none of the hypotheses shows most in views far from those so far
+        # how much a view is expected to show that no visited one has shown
         new = self._apart(some, visited)
         information = np.zeros(len(some))
         if outlook is not None:

@@ -15,7 +15,7 @@ from nextview.sensing.planes import Plane
 from nextview.sensing.view import LEVEL, View
 from nextview.things.contour import contour_equations
 from nextview.things.library import Hypotheses, Library
-from nextview.things.naming import CONFIDENT, PIXELS_ALIKE, TOTAL_ERROR
+from nextview.things.naming import CONFIDENT, PIXELS_ALIKE, score_error
 from nextview.things.propose import COARSEST, RESTART
 from nextview.things.register import POINTS, normal_equations, register
 from nextview.things.score import score, total_scores
@@ -30,7 +30,7 @@ ERRORS_LEFT = (1.0, 0.5, 0.25, 0.1, 0.1)
 CONTOUR_WEIGHTS = (1.0, 1.0, 0.5, 0.25, 0.15)
 HIDDEN_FROM = 0.5  # share of the error from which on what is in front hides a point
 LONGEST_STEP = 0.5  # radians, or radii
-# how far from a thing what is measured belongs to it, radii, as its name is compared with others
+# radii within which measured points belong to a thing, in each step before its name is compared
 NAME_REACHES = 0.2, 0.1, 0.06, 0.03
 MOST_LOOKALIKES = 64  # poses of other things that are registered to compare a name
 
@@ -141,15 +141,18 @@ def name_probability(library: Library, view: View, body: Body) -> float:
     """
     itself = _pose(body, body.state)
     (others,) = itself.lookalikes(library, np.ones(len(library), bool))
+    # in a large library, those that explain most as they lie
     totals = total_scores(library, view, others, COARSEST)
     others = others[np.argsort(-totals)[:MOST_LOOKALIKES]]
+
+    # a pose that is some degrees off does not tell against the name
     some = Hypotheses.joined([itself, itself.turned(RESTART), others])
     some = register(library, (view,), some, NAME_REACHES)
     totals = np.maximum(total_scores(library, view, some, 1), 0)
-    scale = PIXELS_ALIKE + TOTAL_ERROR * totals.max()
+
     mine = some.things == body.thing
     lead = totals[mine].max() - totals[~mine].max(initial=0)
-    odds = logit(CONFIDENT) + lead / scale
+    odds = logit(CONFIDENT) + lead / score_error(float(totals.max()))
     return float(expit(odds))
 
 

@@ -64,6 +64,11 @@ class Named:
         }
 
 
+def score_error(total: float) -> float:
+    """Return the error of a score, nats: of alike pixels, and of the pose and the scan."""
+    return PIXELS_ALIKE + TOTAL_ERROR * total
+
+
 def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | None:
     """Return what is believed of a thing with a hypothesis; None if every name is ruled out.
 
@@ -90,7 +95,7 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
 
     seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
     every = np.append(totals, [resized, STRANGER_GAIN * seen])
-    beliefs = softmax(every / (PIXELS_ALIKE + TOTAL_ERROR * totals[0]))
+    beliefs = softmax(every / score_error(float(totals[0])))
     probabilities = beliefs[:-2]
     alike = beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
