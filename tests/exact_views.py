@@ -8,9 +8,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from nextview.geometry.mesh import Mesh, make_mesh
-from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.sensing.facets import noise_of
+from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import ObjectFrame
+from nextview.sensing.observation import Observation
+from nextview.sensing.planes import Plane
+from nextview.sensing.sighting import sighting_of
 from nextview.session.target import view_of
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.library import Library, near_turns
@@ -75,25 +80,40 @@ def standing_view(
     target = seen.depth > 0
     depth = 1 / np.where(target, seen.depth, table)
     depth += noise * seen.radius * np.random.default_rng(0).normal(size=depth.shape)
-    scene = SceneView(
-        (1 / depth).astype(np.float32),
-        target,
-        seen.pose,
-        seen.intrinsics,
-        support=np.array([0.0, 0.0, 1.0, -bottom]),
-    )
+    table = Plane(np.array([0.0, 0.0, 1.0]), -bottom * seen.radius)
     pose = np.eye(4)
     pose[:3, :3] = turn
     pose[:3, 3] = -(turn @ mesh.centre + shown.centre)
-    return replace(seen, scene=scene), pose
+    return framed(seen, (1 / depth).astype(np.float32), target, table), pose
 
 
 def before_a_wall(observation: Observation) -> Observation:
     """The same view with a wall five radii away behind the thing."""
+    return framed(observation, *wall_behind(observation))
+
+
+def wall_behind(observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    """Depth with a wall five radii away behind the thing, radii; and the pixels of the thing."""
     target = observation.depth > 0
-    depth = np.where(target, observation.depth, 5.0).astype(np.float32)
-    scene = SceneView(depth, target, observation.pose, observation.intrinsics)
-    return replace(observation, scene=scene)
+    return np.where(target, observation.depth, 5.0).astype(np.float32), target
+
+
+def framed(
+    observation: Observation,
+    depth: np.ndarray,
+    target: np.ndarray,
+    plane: Plane | None = None,
+) -> Observation:
+    """The same view in a frame of which some pixels show the object; depth in radii."""
+    object_frame = ObjectFrame(np.zeros(3), observation.radius, np.eye(3))
+    frame = Frame(
+        depth * np.float32(observation.radius),
+        observation.intrinsics,
+        object_frame.pose_in_world(observation.pose),
+        pixel_centre=0.5,
+    )
+    sighting = sighting_of(frame, target, plane, noise_of(frame), denoise=False)
+    return replace(observation, sighting=sighting, object_frame=object_frame)
 
 
 def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, float]:

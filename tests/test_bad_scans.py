@@ -1,23 +1,22 @@
 """Scans with faults, things of one shape, and frames that show a part: right, or not sure."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
 from exact_views import (
-    before_a_wall,
     cup,
     explained,
+    framed,
     l_block,
     library_of,
     off_by,
     turned_views,
+    wall_behind,
 )
 
 from nextview.geometry.mesh import Mesh, make_mesh
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import rotation_z
+from nextview.sensing.observation import Observation
 from nextview.things.naming import CONFIDENT
 
 YAW = rotation_z(0.3)
@@ -85,15 +84,10 @@ def test_a_scan_with_faults_is_recognised(thing, fault):
 
 def cut(observation: Observation, share: float) -> Observation:
     """The same view in a picture that ends within the thing: a share of its columns is missing."""
-    scene = before_a_wall(observation).scene
-    columns = np.flatnonzero(scene.target.any(0))
+    depth, target = wall_behind(observation)
+    columns = np.flatnonzero(target.any(0))
     last = int(columns[-1] - share * (columns[-1] - columns[0]))
-    return replace(
-        observation,
-        scene=replace(
-            scene, depth=scene.depth[:, :last], target=scene.target[:, :last]
-        ),
-    )
+    return framed(observation, depth[:, :last], target[:, :last])
 
 
 @pytest.fixture(scope="module")

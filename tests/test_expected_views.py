@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from exact_views import mesh_of
+from exact_views import framed, mesh_of
 
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
-from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import (
     ViewSphere,
     angle_between,
@@ -142,12 +141,12 @@ def test_a_view_is_expected_to_tell_where_the_score_tells(shown, side):
     depth = found.depth
     noise = SENSOR.noise * depth**2 * found.radius * rng.standard_normal(depth.shape)
     measured = np.where(depth > 0, depth + noise, 5.0).astype(np.float32)
-    scene = SceneView(measured, depth > 0, found.pose, found.intrinsics)
+    seen = framed(found, measured, depth > 0)
 
     library = Library([Surface.from_mesh(one, str(k)) for k, one in enumerate(meshes)])
     centres = library.centres - mesh.centre
     both = Hypotheses.of(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), centres)
-    said = score(library, view_of(replace(found, scene=scene)), both)
+    said = score(library, view_of(seen), both)
     ratio = said[shown].total - said[1 - shown].total
 
     poses = np.tile(np.eye(4), (2, 1, 1))
@@ -249,7 +248,7 @@ def test_an_outlook_combines_the_views_and_what_explains_them(knobs_memory, knob
     # its camera is corrected within its accuracy
     assert outlook.distance == pytest.approx(AWAY, abs=0.004)
     assert outlook.sensor.pitch == pytest.approx(
-        1 / observations[0].scene.intrinsics[0, 0]
+        1 / observations[0].sighting.frame.intrinsics[0, 0]
     )
     assert outlook.hypotheses.belief.sum() == pytest.approx(1)
     around = outlook.surroundings
@@ -291,8 +290,8 @@ def test_what_is_not_the_object_explains_nothing_and_costs_nothing():
     )
 
     def said(target):
-        scene = SceneView(found.depth, target, found.pose, found.intrinsics)
-        return score(library, view_of(replace(found, scene=scene)), there)[0]
+        seen = framed(found, found.depth, target)
+        return score(library, view_of(seen), there)[0]
 
     part, whole = said(half), said(shown)
     assert half.ravel()[part.cells[part.gain > 0]].all()

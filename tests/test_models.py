@@ -11,10 +11,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from nextview.errors import ModelError
 from nextview.files import sha256_of
-from nextview.geometry.observation import Observation, pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import bundled_cards, read_card, write_card
+from nextview.sensing.observation import Observation
 
 CLASSES = [f"class{k}" for k in range(10)]
 

@@ -11,10 +11,11 @@ from scipy.special import softmax
 import nextview
 from nextview import SimulatedCamera, Stopping, ViewSphere
 from nextview.data.samples import sample_mesh
-from nextview.geometry.observation import Observation, pinhole
+from nextview.geometry.camera import pinhole
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Unidirectional
 from nextview.recognition.belief import Calibration
+from nextview.sensing.observation import Observation
 from nextview.session.episode import Episodes
 from nextview.session.session import Session
 

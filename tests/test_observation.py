@@ -12,13 +12,9 @@ from hypothesis.extra import numpy as npst
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
-from nextview.geometry.observation import (
-    LEAST_PIXELS,
-    LEAST_VISIBLE_SHARE,
-    Observation,
-    pinhole,
-)
+from nextview.geometry.camera import pinhole
 from nextview.geometry.viewsphere import ViewSphere
+from nextview.sensing.observation import LEAST_PIXELS, LEAST_VISIBLE_SHARE, Observation
 from nextview.simulation.simulated import SimulatedCamera
 
 POSE = ViewSphere.named("40").poses[13]

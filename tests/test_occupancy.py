@@ -7,7 +7,7 @@ from factories import ball_depth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nextview.geometry.observation import pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.views.expected_visibility import (
     FREE,

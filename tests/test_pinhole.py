@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nextview.geometry.observation import pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.pinhole import PinholeCamera
 
 MATRIX = np.array([[610.0, 0, 301.5], [0, 590.0, 260.25], [0, 0, 1]])

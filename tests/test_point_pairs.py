@@ -154,7 +154,7 @@ def test_almost_empty_views_give_no_proposals(library):
     observations, _ = turned_views(THINGS[0], np.eye(3))
     depth = np.zeros_like(observations[0].depth)
     depth[64:66, 64:67] = 3
-    speck = replace(observations[0], depth=depth, scene=None)
+    speck = replace(observations[0], depth=depth, sighting=None)
     assert not len(proposed(library, view_of(speck))[0])
     assert explained(library, [speck]) is None
 

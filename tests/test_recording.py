@@ -9,7 +9,7 @@ from rerun.chunk import RrdReader
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.geometry.observation import Observation
+from nextview.sensing.observation import Observation
 from nextview.session.system import simulated
 from nextview.viewers.recording import Recorder
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nextview.geometry.observation import pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview_lab.data.measures import MeasuredView
 from nextview_lab.data.predictions import Predictions

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from pipeline import SPHERE, some_predictions
 
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration, RiskBounds
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import read_card
+from nextview.sensing.observation import Observation
 from nextview_lab.data.predicting import predict
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.rendering import render

@@ -27,7 +27,6 @@ from nextview.errors import (
 
 if TYPE_CHECKING:
     from nextview.geometry.mesh import Mesh, load_mesh
-    from nextview.geometry.observation import Camera, Observation
     from nextview.geometry.viewsphere import Directions, ViewSphere
     from nextview.policies.base import EpisodeState, Evidence, Policy
     from nextview.policies.registry import make_policy
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from nextview.recognition.inference import Models
     from nextview.scene.scene import Scene
     from nextview.scene.tracker import Tracker
+    from nextview.sensing.observation import Camera, Observation
     from nextview.session.result import Recognition
     from nextview.session.session import Session
     from nextview.session.system import System, load, recognise
@@ -84,13 +84,13 @@ __all__ = [
 
 # imported when they are used: NumPy, SciPy and the networks make the start of a command slow
 _HOMES = {
-    "Camera": "geometry.observation",
+    "Camera": "sensing.observation",
     "Directions": "geometry.viewsphere",
     "EpisodeState": "policies.base",
     "Evidence": "policies.base",
     "Mesh": "geometry.mesh",
     "Models": "recognition.inference",
-    "Observation": "geometry.observation",
+    "Observation": "sensing.observation",
     "Policy": "policies.base",
     "Recognition": "session.result",
     "Scene": "scene.scene",

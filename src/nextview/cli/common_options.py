@@ -11,7 +11,7 @@ from nextview.cli.progress import console
 from nextview.errors import UsageError
 from nextview.files import LONGEST_PATH, check_new
 from nextview.geometry.mesh import MAX_FACES, load_mesh, mesh_warnings
-from nextview.geometry.observation import Camera
+from nextview.sensing.observation import Camera
 from nextview.session.session import FrameCamera
 from nextview.session.system import is_frames, simulated
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 
 from nextview.figures.style import GROUND, WOOD, rgb
-from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene
+from nextview.sensing.observation import Observation
 from nextview.types import Floats
 
 # a larger depth step between neighbouring pixels separates surfaces, object radii

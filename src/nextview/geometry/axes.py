@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import points
 from nextview.errors import UsageError
-from nextview.geometry.observation import LARGEST_ENTRY
+from nextview.geometry.camera import LARGEST_ENTRY
 from nextview.types import Float
 
 

@@ -7,9 +7,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from nextview.errors import PolicyError
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Floats, Index, Mask
 from nextview.views.expected_views import Outlook
 

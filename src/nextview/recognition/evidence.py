@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.recognition.novelty import ViewScore
+from nextview.sensing.observation import Observation
 from nextview.types import Floats, Mask
 
 

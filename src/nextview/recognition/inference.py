@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE_SUFFIX, maps_among
@@ -29,6 +28,7 @@ from nextview.recognition.novelty import (
 )
 from nextview.recognition.protocol import Recogniser
 from nextview.runtime import InputShape, check_end, open_onnx, ort, run_onnx
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Float32
 
 INPUT = "input"

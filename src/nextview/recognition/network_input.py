@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.depth import object_depth, slope
-from nextview.geometry.observation import Observation
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Float32
 
 InputKind = Literal["geometry", "image", "cloud"]

@@ -19,7 +19,7 @@ from scipy.ndimage import binary_erosion, minimum_filter
 from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
-from nextview.geometry.observation import Observation, SceneView
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 # in the file of a novelty score
@@ -215,23 +215,25 @@ def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
             score.value = float(value)
             score.judge = None
     return [
-        s.value - whole * NOVELTY_OF_HIDING * hidden_share(s.observation.scene)
+        s.value - whole * NOVELTY_OF_HIDING * hidden_share(s.observation)
         for s in scores
     ]
 
 
-def hidden_share(scene: SceneView | None) -> float:
+def hidden_share(observation: Observation) -> float:
     """Return the share of an object's outline that borders on something nearer.
 
     The border of the picture counts as well; 0 to 1.
     """
-    if scene is None:
+    if observation.sighting is None:
         return 0.0
-    outline = scene.target & ~binary_erosion(scene.target)
-    others = np.where(scene.target | (scene.depth == 0), np.inf, scene.depth)
+    depth = observation.picture_around[0]
+    target = observation.sighting.mask
+    outline = target & ~binary_erosion(target)
+    others = np.where(target | (depth == 0), np.inf, depth)
     hidden = outline & (
         minimum_filter(others, OCCLUDER_WINDOW, mode="constant", cval=0)
-        < scene.depth - OCCLUDER_STEP
+        < depth - OCCLUDER_STEP
     )
     return float(hidden.sum() / max(outline.sum(), 1))
 

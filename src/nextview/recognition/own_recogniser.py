@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from nextview.checks import one_line, plugin, plugin_errors, whole
 from nextview.errors import ModelError, NextviewError, UsageError
-from nextview.geometry.observation import Observation
 from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import check_candidate
 from nextview.recognition.protocol import JointBelief, Recogniser
+from nextview.sensing.observation import Observation
 from nextview.types import Floats
 
 LEAST_CLASS_BELIEF = 1e-12  # in a class, where the logarithm of a belief is taken

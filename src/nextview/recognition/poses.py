@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-from nextview.geometry.observation import RIGID
+from nextview.geometry.camera import RIGID
 from nextview.types import Float, Float32
 
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one

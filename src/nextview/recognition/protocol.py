@@ -10,12 +10,12 @@ import numpy as np
 
 from nextview.checks import number
 from nextview.errors import UsageError
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import MUCH, Calibration, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Floats
 
 # factor by which an object is larger or smaller than a taught thing of which half may be hidden,

@@ -25,8 +25,8 @@ from scipy.spatial import cKDTree
 from nextview.checks import number, one_line, plugin_errors, whole
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import read_record, write_record
+from nextview.geometry.camera import checked_pose
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.observation import checked_pose
 from nextview.geometry.ray_caster import embree_scene
 from nextview.scene.objects import SceneObject
 from nextview.sensing.object_frame import Box

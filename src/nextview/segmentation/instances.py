@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from nextview.checks import one_line, plugin_errors
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.axes import upright_axes
-from nextview.geometry.observation import array_of
+from nextview.geometry.camera import array_of
 from nextview.segmentation.features import features, quarter_turns, shrink, turned
 from nextview.segmentation.network import SegmentationNetwork, load_network
 from nextview.segmentation.parting import (

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
-from nextview.geometry.observation import LARGEST_ENTRY, array_of, numbers
+from nextview.geometry.camera import LARGEST_ENTRY, array_of, numbers
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
 from nextview.types import Float, Float32, Floats, Index, Mask

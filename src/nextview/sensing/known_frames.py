@@ -16,11 +16,11 @@ import numpy as np
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import VISITED_ANGLE, angle_between, direction_of
 from nextview.sensing.agreement import SurfaceView, compare
 from nextview.sensing.frame import Frame, one_stand, stands_still
 from nextview.sensing.mistakes import Mistake, PosedViews, Stored, mistakes
+from nextview.sensing.observation import Observation
 from nextview.sensing.planes import (
     POSE_SHIFT,
     TILT,

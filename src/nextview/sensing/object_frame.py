@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from nextview.checks import number, points
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.axes import three
-from nextview.geometry.observation import LARGEST_ENTRY
+from nextview.geometry.camera import LARGEST_ENTRY
 from nextview.types import Float
 
 

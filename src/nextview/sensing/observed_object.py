@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.axes import three, upright_axes
-from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.choosing import choose_instance
 from nextview.sensing.frame import Frame
@@ -23,6 +22,7 @@ from nextview.sensing.masks import (
     inside_sphere,
 )
 from nextview.sensing.object_frame import Box, ObjectFrame
+from nextview.sensing.observation import Observation
 from nextview.sensing.planes import Plane
 from nextview.sensing.plausibility import check_last_view, check_observation
 from nextview.sensing.registration import Displacement, displacement

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.mistakes import in_poses
+from nextview.sensing.observation import Observation
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
@@ -130,21 +130,19 @@ def _seen_through(first: Observation, second: Observation) -> float:
     if len(seen) == 0 or not second.depth.any():
         return 0.0
 
-    scene = second.scene
-    shown = second if scene is None else scene
-    depth = shown.depth
-    if scene is not None:
+    depth, pose, intrinsics = second.picture_around
+    if second.sighting is not None:
         depth = np.where(depth > 0, depth, -np.inf)
     points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]
-    points = (points - shown.pose[:3, 3]) @ shown.pose[:3, :3]
+    points = (points - pose[:3, 3]) @ pose[:3, :3]
     points = points[points[:, 2] > 0.1]
     if len(points) == 0:
         return 1.0
 
     height, width = depth.shape
-    at = PinholeCamera.of(shown.intrinsics, depth.shape).project(points)
+    at = PinholeCamera.of(intrinsics, depth.shape).project(points)
     # pixels, allowance for errors of the object frame
-    margin = max(2, width // 50) if scene is None else 2
+    margin = max(2, width // 50) if second.sighting is None else 2
     inside = ((at >= margin) & (at < np.array([width, height]) - margin)).all(1)
     if not inside.any():
         return 0.0

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.geometry.observation import Observation, SceneView, pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing.facets import SIZE, Facets
 from nextview.sensing.object_frame import ObjectFrame
+from nextview.sensing.observation import Observation
 from nextview.sensing.sighting import Sighting
 from nextview.types import Float, Float32, Index
 
@@ -42,7 +43,8 @@ def observation_of(
         pinhole(SIZE, CAMERA_DISTANCE),
         object_frame.radius if life_size else None,
         _resampled(sighting.frame.image, sighting.facets, facet),
-        _scene(sighting, pose, object_frame),
+        sighting,
+        object_frame,
         colour=_resampled(sighting.frame.colour, sighting.facets, facet),
     )
 
@@ -154,21 +156,3 @@ def _resampled(
     hit = facet >= 0
     shown[hit] = picture[facets.rows[facet[hit]], facets.columns[facet[hit]]]
     return shown
-
-
-def _scene(sighting: Sighting, pose: Float, object_frame: ObjectFrame) -> SceneView:
-    """Return the whole frame in the object frame and object radii."""
-    radius = object_frame.radius
-    plane = sighting.plane
-    support = None
-    if plane is not None:
-        height = float(plane.height(object_frame.centre)) / radius
-        support = np.append(object_frame.axes @ plane.normal, height)
-    return SceneView(
-        sighting.frame.depth / np.float32(radius),
-        sighting.mask,
-        pose,
-        sighting.frame.intrinsics,
-        camera=sighting.frame.camera,
-        support=support,
-    )

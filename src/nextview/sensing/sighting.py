@@ -23,7 +23,7 @@ GROUP_GAP = 6  # pixels between isolated groups of facets
 TOO_LITTLE = "too little is seen of the object"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sighting:
     """The object in one frame, with the noise of the frame.
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from nextview.checks import plugin_errors
 from nextview.errors import PolicyError, SessionError, UsageError
-from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.viewsphere import (
     SNAP,
     VISITED_ANGLE,
@@ -28,6 +27,7 @@ from nextview.recognition.belief import (
     log_evidence_of,
 )
 from nextview.recognition.protocol import JointBelief
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Floats, Index, Mask
 from nextview.views.expected_visibility import SeenScene, expected_visibility
 
@@ -164,7 +164,7 @@ class Episodes:
 
         self.steps: list[Step] = []
         self._last: Taken | None = None
-        self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
+        self._scenes: dict[int, tuple[list[Observation], SeenScene]] = {}
 
     def update(
         self,
@@ -501,25 +501,25 @@ class Episodes:
             self._observations(last, state.episodes),
             strict=True,
         ):
-            scenes = [seen.scene for seen in views if seen.scene is not None]
+            framed = [seen for seen in views if seen.sighting is not None]
             found.append(
                 expected_visibility(
-                    self._seen_scene(int(episode), scenes),
+                    self._seen_scene(int(episode), framed),
                     positions,
                 )
             )
 
         return np.stack(found)
 
-    def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
+    def _seen_scene(self, episode: int, views: list[Observation]) -> SeenScene:
         """Combine the frames of an episode; the combination of the earlier frames is cached."""
         known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
-        if any(old is not new for old, new in zip(known, scenes, strict=False)):
+        if any(old is not new for old, new in zip(known, views, strict=False)):
             known = []
             seen = SeenScene.unseen()
-        for scene in scenes[len(known) :]:
-            seen = seen.seen(scene)
-        self._scenes[episode] = scenes, seen
+        for view in views[len(known) :]:
+            seen = seen.seen(view)
+        self._scenes[episode] = views, seen
         return seen
 
     def _observations(

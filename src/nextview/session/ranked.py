@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
-from nextview.geometry.observation import checked_pose
+from nextview.geometry.camera import checked_pose
 from nextview.geometry.viewsphere import angle_between, direction_of
 from nextview.policies.base import nearer_first
 from nextview.types import Float, Index

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
-from nextview.session.target import view_of
+from nextview.sensing.observation import Observation
+from nextview.sensing.sighting import Sighting
+from nextview.session.target import into_object, view_of
 from nextview.things.fusion import cell_of
 from nextview.things.library import Library, closed, near_turns
 from nextview.things.memory import open_memory
@@ -77,7 +78,7 @@ class ThingRecogniser(NetworkRecogniser):
             for thing in about.things
         }
         self.library = Library(surfaces, symmetries, near, turns, threads)
-        self._last: tuple[tuple[Observation, ...], World] | None = None
+        self._last: tuple[tuple[Observation | Sighting, ...], World] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes without what was explained last."""
@@ -163,7 +164,7 @@ class ThingRecogniser(NetworkRecogniser):
                 alone,
                 p_value=0.0,
                 why_no_pose=NOTHING_FITS,
-                found=None if unknown is None else (world, unknown, {}),
+                found=None if unknown is None else (world, unknown, (), {}),
             )
         belief = np.zeros(classes)
         labels = self.labels[world.hypotheses.things[found.rows]]
@@ -180,25 +181,28 @@ class ThingRecogniser(NetworkRecogniser):
         moves = sum(
             view.frame.camera_to_world is not view.camera for view in world.views
         )
+        poses = pose_candidates(world, found, self.labels)
+        to_object = into_object(observations[-1])
         return JointBelief(
             belief / belief.sum(),
-            poses=pose_candidates(world, found, self.labels),
+            poses=tuple(one.moved(to_object) for one in poses),
             camera_error=1000 * self.library.camera[1] if moves else 0.0,
             p_value=found.right,
             doubt=why_in_doubt(world, found) if found.right < LIKELY else "",
-            found=(world, thing, found.beliefs(world)),
+            found=(world, thing, poses, found.beliefs(world)),
         )
 
     def explained(self, observations: Sequence[Observation]) -> World:
-        """Return what explains the object in some views best."""
+        """Return what explains the object in some views best, in the world of ``view_of``."""
         among: Mask = ~self.ruled_out[self.labels]
-        seen = tuple(observations)
+        # the object frame may change, and what was seen stays
+        seen = tuple(one.sighting or one for one in observations)
         known = 0
         world = World(self.library, alone=True)
         if self._last is not None and self._last[0] == seen[: len(self._last[0])]:
             known = len(self._last[0])
             world = self._last[1]
-        for observation in seen[known:]:
+        for observation in observations[known:]:
             # what is looked at is an object, and no piece of a wall
             world = replace(world.with_view(view_of(observation)), flat=())
             world = aligned(aligned(world).searched(among)).numbered()
@@ -218,8 +222,8 @@ class ThingRecogniser(NetworkRecogniser):
         """
         if joint.found is None:
             return None
-        world, thing, beliefs = joint.found
-        return Outlook.of(world, thing, joint.poses, beliefs, np.eye(4))
+        world, thing, poses, beliefs = joint.found
+        return Outlook.of(world, thing, poses, beliefs, into_object(observations[-1]))
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:

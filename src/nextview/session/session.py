@@ -22,7 +22,6 @@ from nextview.errors import (
     SessionError,
     UsageError,
 )
-from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import (
     Viewpoints,
     angle_between,
@@ -43,6 +42,7 @@ from nextview.recognition.protocol import (
 from nextview.segmentation.instances import Segmenter
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
+from nextview.sensing.observation import Camera, Observation
 from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.plausibility import check_last_view, check_observation
 from nextview.sensing.view_warning import ViewWarning

@@ -11,13 +11,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from nextview.errors import ModelError
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_of
 from nextview.recognition.protocol import JointBelief, least_p_value
+from nextview.sensing.observation import Observation
 from nextview.session.recogniser import ThingRecogniser
 from nextview.things.library import Library
 from nextview.things.surface import Surface

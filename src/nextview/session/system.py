@@ -20,7 +20,6 @@ from nextview.errors import (
     UsageError,
 )
 from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
-from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import (
     VIEW_LAYOUTS,
     Viewpoints,
@@ -44,6 +43,7 @@ from nextview.recognition.protocol import (
     tells_unknown,
 )
 from nextview.segmentation.instances import Segmenter
+from nextview.sensing.observation import Camera
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.limits import Limits
 from nextview.session.recogniser import ThingRecogniser, open_recogniser

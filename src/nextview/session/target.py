@@ -4,48 +4,61 @@ from __future__ import annotations
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.segmentation.instances import Instances
 from nextview.sensing.frame import Frame
+from nextview.sensing.observation import Observation
 from nextview.sensing.view import View
+from nextview.types import Float
 
 NOT_LEVEL = np.inf  # height of pixels of which no plane is known
 
 
 def view_of(observation: Observation) -> View:
-    """Return the view of an object that an observation shows, in metres.
+    """Return the view of an object that an observation was made of, in metres.
 
     Args:
         observation: a view of the object, with a scale; its pixels are the only segment, and all
-            others show what is known otherwise.
+            others show what is known otherwise. Without a frame, the world is the object frame.
     """
-    radius = float(observation.radius or 1.0)
-    scene = observation.scene
-    if scene is None:
-        depth = observation.depth
-        target = depth > 0
-        pose = observation.pose
-        intrinsics = observation.intrinsics
-        support = None
+    sighting = observation.sighting
+    if sighting is None:
+        frame = Frame(
+            observation.depth,
+            observation.intrinsics,
+            observation.pose,
+            pixel_centre=0.5,
+        )
     else:
-        depth = scene.depth
-        target = scene.target
-        pose = scene.pose
-        intrinsics = scene.intrinsics
-        support = scene.support
+        frame = sighting.frame
+    target = frame.depth > 0 if sighting is None else sighting.mask
+    plane = None if sighting is None else sighting.plane
 
-    # in metres
-    pose = pose.copy()
-    pose[:3, 3] *= radius
-    metres = np.where(np.isfinite(depth), depth, 0).astype(np.float32) * np.float32(
-        radius
-    )
-    frame = Frame(metres, intrinsics, pose, pixel_centre=0.5)
-    height = np.full(depth.shape, NOT_LEVEL, np.float32)
-    if support is not None:
-        height = frame.along(support[:3], float(support[3]) * radius)
+    scale = _scale(observation)
+    pose = frame.camera_to_world.copy()
+    pose[:3, 3] *= scale
+    frame = frame.with_pose(pose).with_depth(frame.depth * np.float32(scale))
+    height = np.full(frame.shape, NOT_LEVEL, np.float32)
+    if plane is not None:
+        height = frame.along(plane.normal, plane.offset * scale)
 
-    none = np.zeros(depth.shape, bool)
+    none = np.zeros(frame.shape, bool)
     measured = frame.depth > 0
     instances = Instances((target & measured,), none, none)
     return View.of(frame, instances, measured, height, np.inf, measured & ~target)
+
+
+def into_object(observation: Observation) -> Float:
+    """Return the motion from the world of ``view_of`` to the object frame, (4, 4), metres."""
+    found = np.eye(4)
+    if observation.object_frame is not None:
+        axes = observation.object_frame.axes
+        centre = observation.object_frame.centre * _scale(observation)
+        found[:3] = np.column_stack([axes, -axes @ centre])
+    return found
+
+
+def _scale(observation: Observation) -> float:
+    """Return the metres of a unit of the frame of an observation, or of an object radius."""
+    radius = observation.radius or 1.0
+    known = observation.object_frame
+    return radius if known is None else radius / known.radius

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import (
     Viewpoints,
     azimuth_of,
@@ -18,6 +17,7 @@ from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import ViewScore, values_of
 from nextview.recognition.protocol import JointBelief, Recogniser
+from nextview.sensing.observation import Observation
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Floats
 

@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError
+from nextview.geometry.camera import pinhole
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.observation import Observation, pinhole
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
 from nextview.sensing.facets import SIZE
 from nextview.sensing.frame import Part, spans, within
 from nextview.sensing.masks import inside_sphere
+from nextview.sensing.observation import Observation
 from nextview.sensing.resampling import virtual_pose
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.simulation.boxes import boxes_around

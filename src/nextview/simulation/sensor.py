@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from nextview.checks import number, whole
 from nextview.errors import UsageError
-from nextview.geometry.observation import pinhole
+from nextview.geometry.camera import pinhole
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing.frame import Part, within

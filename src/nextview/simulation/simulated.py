@@ -5,16 +5,12 @@ from functools import lru_cache
 import numpy as np
 
 from nextview.checks import whole
+from nextview.geometry.camera import checked_intrinsics, checked_pose, pinhole
 from nextview.geometry.depth import AMBIENT
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.observation import (
-    Observation,
-    checked_intrinsics,
-    checked_pose,
-    pinhole,
-)
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Float32
 
 EDGE_ON = 0.01

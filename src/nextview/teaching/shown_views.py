@@ -12,10 +12,10 @@ import numpy as np
 from numpy.random import Generator
 
 from nextview.geometry.mesh import make_mesh
-from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.belief import Stopping
+from nextview.sensing.observation import Observation
 from nextview.session.recogniser import ThingRecogniser
 from nextview.simulation.sensed_camera import SensedCamera
 

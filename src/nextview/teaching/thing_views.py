@@ -18,9 +18,9 @@ from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError, option
 from nextview.files import sha256_of
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.model_card import Symmetry
+from nextview.sensing.observation import Observation
 from nextview.sensing.tabletop import LOWEST_TOP
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from nextview.figures.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import ViewSphere, direction_of
 from nextview.recognition.poses import place_in_words
+from nextview.sensing.observation import Observation
 from nextview.session.view import View
 from nextview.types import Float, Mask
 from nextview.viewers.exploration import Walk

@@ -13,9 +13,9 @@ from nextview.data.folders import list_dataset
 from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
-from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import level_pose
 from nextview.recognition.belief import FixedLength
+from nextview.sensing.observation import Camera, Observation
 from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View

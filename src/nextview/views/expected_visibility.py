@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from nextview.checks import number, whole
 from nextview.geometry.depth import FARTHEST_SURFACE
-from nextview.geometry.observation import SceneView
+from nextview.sensing.observation import Observation
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 # states of a voxel; the maximum over all frames counts
@@ -205,7 +205,7 @@ class SeenScene:
         occupancy: state of each voxel.
         floor: height below which nothing belongs to the target; infinity at first.
 
-    >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
+    >>> seen = SeenScene.of(observations)                                       # doctest: +SKIP
     >>> expected_visibility(seen, sphere.poses[:, :3, 3])                       # doctest: +SKIP
     """
 
@@ -218,11 +218,13 @@ class SeenScene:
         return cls(Occupancy.unseen(grid))
 
     @classmethod
-    def of(cls, views: Iterable[SceneView], grid: VoxelGrid = VISIBILITY_GRID) -> Self:
+    def of(
+        cls, views: Iterable[Observation], grid: VoxelGrid = VISIBILITY_GRID
+    ) -> Self:
         """Combine some frames of a scene.
 
         Args:
-            views: the frames.
+            views: of the object, each with its sighting.
             grid: the voxels.
 
         Returns:
@@ -230,26 +232,28 @@ class SeenScene:
         """
         return reduce(cls.seen, views, cls.unseen(grid))
 
-    def seen(self, view: SceneView) -> Self:
+    def seen(self, view: Observation) -> Self:
         """Return the scene after one more frame."""
+        depth, pose, k = view.picture_around
+        target = depth > 0 if view.sighting is None else view.sighting.mask
         # pixels of half a voxel are fine enough
-        away = max(float(np.linalg.norm(view.pose[:3, 3])), 1.0)
-        focal = min(view.intrinsics[0, 0], view.intrinsics[1, 1])
+        away = max(float(np.linalg.norm(pose[:3, 3])), 1.0)
+        focal = min(k[0, 0], k[1, 1])
         step = max(1, int(self.occupancy.grid.pitch / 2 * focal / away))
         few = (slice(step // 2, None, step),) * 2
-        depth = view.depth[few]
-        k = view.intrinsics.copy()
+        depth = depth[few]
+        k = k.copy()
         k[:2] /= step
         k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
         occupancy = self.occupancy.seen(
-            depth, view.pose, k, view.target[few], view.background_free
+            depth, pose, k, target[few], background_free=False
         )
 
         rows, columns = np.nonzero(depth[::2, ::2])
         ahead = np.stack([2 * columns + 0.5, 2 * rows + 0.5, np.ones(len(rows))])
         heights = (
-            view.pose[2, :3] @ np.linalg.inv(k) @ ahead * depth[::2, ::2][rows, columns]
-            + view.pose[2, 3]
+            pose[2, :3] @ np.linalg.inv(k) @ ahead * depth[::2, ::2][rows, columns]
+            + pose[2, 3]
         )
         near = heights[np.abs(heights) <= 1.2]
         return type(self)(

@@ -14,7 +14,6 @@ import numpy as np
 
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.policies.base import EpisodeState
@@ -28,6 +27,7 @@ from nextview.recognition.protocol import (
     Recogniser,
     log_evidence_of_views,
 )
+from nextview.sensing.observation import Observation
 from nextview.session.recogniser import ThingRecogniser, open_recogniser
 from nextview.simulation.boxes import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
@@ -274,12 +274,11 @@ class ThingEpisode:
             return None
 
         seen = self.seen(views)
-        scene = self.observation(seen[-1]).scene
-        radius = self.observation(seen[-1]).radius
-        assert scene is not None
-        assert radius is not None
-        camera = scene.pose.copy()
-        camera[:3, 3] *= radius
+        observation = self.observation(seen[-1])
+        assert observation.sighting is not None
+        assert observation.object_frame is not None
+        pose = observation.sighting.frame.camera_to_world
+        camera = observation.object_frame.pose_in_metres(pose)
         points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._sensed(seen[-1])[1]
         return 1000 * add_s(points, np.linalg.inv(camera) @ poses[0], true)

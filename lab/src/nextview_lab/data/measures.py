@@ -13,8 +13,8 @@ from scipy.ndimage import find_objects
 
 from nextview.checks import plugin, plugin_errors, plugins
 from nextview.data.pool import counted
+from nextview.geometry.camera import depth_image
 from nextview.geometry.depth import object_depth
-from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
 from nextview.types import Float, Float32, Floats, Index, Mask
 from nextview_lab.data.store import DEPTH_UNIT, ViewStore, opened, writing

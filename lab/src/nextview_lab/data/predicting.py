@@ -12,10 +12,10 @@ import numpy as np
 from nextview.data.pool import counted
 from nextview.errors import DAMAGED
 from nextview.files import check_new, command, new_file, unfinished
-from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED_MODELS, ModelCard
 from nextview.recognition.network_input import from_store
+from nextview.sensing.observation import enough_shows
 from nextview.types import Float32, Index
 from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects

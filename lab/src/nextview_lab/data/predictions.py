@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from nextview.errors import DAMAGED, DatasetError, option
 from nextview.files import decode_record, new_file, regular_file
-from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.recognition.belief import (
@@ -23,6 +22,7 @@ from nextview.recognition.belief import (
     log_evidence_of,
     of_true_class,
 )
+from nextview.sensing.observation import enough_shows
 from nextview.types import Float, Float32, Index, Mask
 from nextview_lab.data.splits import deduplicated, duplicate_groups, some_objects
 from nextview_lab.data.store import ViewStore

@@ -23,9 +23,9 @@ from nextview.geometry.mesh import (
     Mesh,
     load_mesh,
 )
-from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, rotation_z
 from nextview.sensing.facets import SIZE
+from nextview.sensing.observation import Camera
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import SimulatedCamera

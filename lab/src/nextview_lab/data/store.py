@@ -21,9 +21,9 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from nextview.data.folders import Entry
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import decode_record, new_folder, only_one
+from nextview.geometry.camera import pinhole
 from nextview.geometry.depth import CLOUD_POINTS
 from nextview.geometry.mesh import UNITS
-from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float, Float32, Index, Mask
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from nextview.errors import DatasetError
-from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of
+from nextview.sensing.observation import Observation
 from nextview.types import Float
 from nextview.viewers.exploration import ShownObject
 from nextview_lab.data.store import ViewStore

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from nextview.data.folders import list_dataset
 from nextview.errors import DatasetError
 from nextview.files import sha256_of
+from nextview.geometry.camera import checked_pose, pinhole
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
-from nextview.geometry.observation import checked_pose, pinhole
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.simulation.simulated import SimulatedCamera

@@ -34,8 +34,8 @@ import tyro
 
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import MeshError, UsageError
+from nextview.geometry.camera import pinhole
 from nextview.geometry.mesh import load_mesh
-from nextview.geometry.observation import pinhole
 from nextview.geometry.ray_caster import RayCaster, embree_scene
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float

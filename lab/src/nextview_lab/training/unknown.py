@@ -16,11 +16,11 @@ from nextview.data.pool import WorkerDied, each
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import load_mesh
-from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import Features
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, as_stored, novelty_path
+from nextview.sensing.observation import Camera, Observation
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
