@@ -68,6 +68,7 @@ class View:
             its error.
         noise: of the depth.
         labels: number of the instance that each pixel shows, (H, W) int32; 0 for none.
+        parted: the same of instances that are parted where the depth jumps, (H, W) int32.
         pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
         surface: pixels of what carries things, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
@@ -77,6 +78,7 @@ class View:
     camera: Float
     noise: Noise
     labels: NDArray[np.int32]
+    parted: NDArray[np.int32]
     pieces: NDArray[np.int32]
     surface: Mask
     inside: Mask
@@ -117,15 +119,19 @@ class View:
         given = labels if instances.pieces is None else instances.pieces
         given = np.where(inside & (frame.depth > 0), given, 0).astype(np.int32)
         pieces = _not_large(frame, _connected(given, frame, sigma), LARGER * widest)
-        large = (labels > 0) & (alone == 0)
+        # a table of which little shows may be one instance with what lies on it
+        large = (labels > 0) & (alone == 0) & (pieces == 0)
         surface = level | large
         inside &= ~large
-        pieces[large] = 0
+        parted = alone
+        if instances.pieces is not None:
+            parted = _connected(alone, frame, sigma)
         return cls(
             frame,
             frame.camera_to_world,
             noise,
             alone,
+            parted,
             pieces,
             surface,
             inside,
@@ -213,6 +219,10 @@ class View:
     def instances(self) -> Iterator[Mask]:
         """Return what is likely to be one thing each, (H, W) bool."""
         return _parts(self.labels, self.fewest)
+
+    def strangers(self) -> Iterator[Mask]:
+        """Return what is one thing at most, (H, W) bool: something in front is another one."""
+        return _parts(self.parted, self.fewest)
 
     def fragments(self) -> Iterator[Mask]:
         """Return the pieces of instances: a thing that was joined to its neighbour is one."""

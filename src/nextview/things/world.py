@@ -765,7 +765,7 @@ def _seen_again(world: World, view: View) -> _Rows:
     """Return strangers after another view: those of before, and new ones."""
     stride = view.stride
     measured = view.grid().depth.ravel() > 0
-    masks = [mask[::stride, ::stride].ravel() & measured for mask in view.instances()]
+    masks = [mask[::stride, ::stride].ravel() & measured for mask in view.strangers()]
     sizes = np.array([np.count_nonzero(mask) for mask in masks])
     expected = [_expected(world, row, view) for row in world.strangers]
     shared = np.array(
