@@ -68,9 +68,9 @@ def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
         surface = (
             height < LEVEL * noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         )
-    labels = np.zeros(frame.shape, np.int32)
+    none = np.zeros(frame.shape, np.int32)
     camera = frame.camera_to_world
-    return View(frame, camera, noise, labels, labels, surface, frame.depth > 0)
+    return View(frame, camera, noise, none, none, none, surface, frame.depth > 0)
 
 
 def followed(library: Library, view: View, body: Body) -> Followed:
