@@ -85,5 +85,3 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
         assert (now.cells >= before.cells).all()
     shuffled = seen([frames[i] for i in order if i < len(frames)] + frames[:1])
     np.testing.assert_array_equal(shuffled[-1].cells, steps[-1].cells)
-    together = seen(frames[:1])[-1].and_also(seen(frames[1:])[-1])
-    np.testing.assert_array_equal(together.cells, steps[-1].cells)

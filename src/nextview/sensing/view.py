@@ -117,15 +117,13 @@ class View:
         # a table, a wall, a room: no thing is as large
         alone = _not_large(frame, labels, LARGER * widest)
         given = labels if instances.pieces is None else instances.pieces
-        given = np.where(inside & (frame.depth > 0), given, 0).astype(np.int32)
-        pieces = _not_large(frame, _connected(given, frame, sigma), LARGER * widest)
+        pieces = np.where(inside & (frame.depth > 0), given, 0).astype(np.int32)
+        pieces = _not_large(frame, _connected(pieces, frame, sigma), LARGER * widest)
         # a table of which little shows may be one instance with what lies on it
         large = (labels > 0) & (alone == 0) & (pieces == 0)
         surface = level | large
         inside &= ~large
-        parted = alone
-        if instances.pieces is not None:
-            parted = _connected(alone, frame, sigma)
+        parted = alone if given is labels else _connected(alone, frame, sigma)
         return cls(
             frame,
             frame.camera_to_world,

@@ -1,8 +1,7 @@
 """Occupancy grid around an object from depth frames, and its expected visibility."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -155,10 +154,6 @@ class Occupancy:
             cells[hit] = np.maximum(cells[hit], what)
         return Occupancy(grid, cells.reshape(self.cells.shape))
 
-    def and_also(self, other: "Occupancy") -> "Occupancy":
-        """Combine two occupancies of the same grid."""
-        return Occupancy(self.grid, np.maximum(self.cells, other.cells))
-
 
 def _in_front(
     points: Float32,
@@ -204,9 +199,6 @@ class SeenScene:
     Attributes:
         occupancy: state of each voxel.
         floor: height below which nothing belongs to the target; infinity at first.
-
-    >>> seen = SeenScene.of(observations)                                       # doctest: +SKIP
-    >>> expected_visibility(seen, sphere.poses[:, :3, 3])                       # doctest: +SKIP
     """
 
     occupancy: Occupancy
@@ -216,21 +208,6 @@ class SeenScene:
     def unseen(cls, grid: VoxelGrid = VISIBILITY_GRID) -> Self:
         """Return the scene before the first frame."""
         return cls(Occupancy.unseen(grid))
-
-    @classmethod
-    def of(
-        cls, views: Iterable[Observation], grid: VoxelGrid = VISIBILITY_GRID
-    ) -> Self:
-        """Combine some frames of a scene.
-
-        Args:
-            views: of the object, each with its sighting.
-            grid: the voxels.
-
-        Returns:
-            The scene.
-        """
-        return reduce(cls.seen, views, cls.unseen(grid))
 
     def seen(self, view: Observation) -> Self:
         """Return the scene after one more frame."""
@@ -262,13 +239,6 @@ class SeenScene:
                 self.floor,
                 float(np.quantile(near, LOW_POINTS)) if len(near) else np.inf,
             ),
-        )
-
-    def and_also(self, other: "SeenScene") -> Self:
-        """Combine two scenes on the same grid."""
-        return type(self)(
-            self.occupancy.and_also(other.occupancy),
-            min(self.floor, other.floor),
         )
 
 
