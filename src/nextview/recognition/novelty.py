@@ -227,7 +227,7 @@ def hidden_share(observation: Observation) -> float:
     """
     if observation.sighting is None:
         return 0.0
-    depth = observation.picture_around[0]
+    depth = observation.whole_frame[0]
     target = observation.sighting.mask
     outline = target & ~binary_erosion(target)
     others = np.where(target | (depth == 0), np.inf, depth)

@@ -106,7 +106,7 @@ class Observation:
             object.__setattr__(self, "radius", float(self.radius))
 
     @property
-    def picture_around(self) -> tuple[Float32, Float, Float]:
+    def whole_frame(self) -> tuple[Float32, Float, Float]:
         """Depth, pose and intrinsics of the whole frame, in object radii and the object frame."""
         if self.sighting is None or self.object_frame is None:
             return self.depth, self.pose, self.intrinsics

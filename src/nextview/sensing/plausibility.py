@@ -130,7 +130,7 @@ def _seen_through(first: Observation, second: Observation) -> float:
     if len(seen) == 0 or not second.depth.any():
         return 0.0
 
-    depth, pose, intrinsics = second.picture_around
+    depth, pose, intrinsics = second.whole_frame
     if second.sighting is not None:
         depth = np.where(depth > 0, depth, -np.inf)
     points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]

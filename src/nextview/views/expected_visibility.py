@@ -211,7 +211,7 @@ class SeenScene:
 
     def seen(self, view: Observation) -> Self:
         """Return the scene after one more frame."""
-        depth, pose, k = view.picture_around
+        depth, pose, k = view.whole_frame
         target = depth > 0 if view.sighting is None else view.sighting.mask
         # pixels of half a voxel are fine enough
         away = max(float(np.linalg.norm(pose[:3, 3])), 1.0)
