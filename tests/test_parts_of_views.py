@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from exact_views import before_a_wall, turned_views
 
+from nextview.geometry.camera import pinhole
 from nextview.geometry.mesh import load_mesh
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.segmentation.instances import Instances
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.view import View
 from nextview.session import recogniser as session_recogniser
 from nextview.session.recogniser import ThingRecogniser
+from nextview.simulation.simulated import SimulatedCamera
 
 K = np.array([[300.0, 0, 80], [0, 300, 60], [0, 0, 1]])
 ON_NO_PLANE = np.full((120, 160), np.inf, np.float32)
@@ -55,6 +58,16 @@ def test_a_small_piece_of_an_instance_that_is_too_large_stays_to_be_explained():
     assert view.inside[piece].all()
     assert view.surface[shown & ~piece].all()
     assert [mask.tolist() for mask in view.fragments()] == [piece.tolist()]
+
+
+def test_a_thing_is_recognised_by_a_camera_that_is_many_radii_away(knobs, knobs_memory):
+    """The view is in radii, and no depth camera measures 25 m."""
+    recogniser = ThingRecogniser(knobs_memory / "memory.json", 1)
+    mesh = load_mesh(knobs / "knob.ply", unit="m")
+    camera = SimulatedCamera(mesh, intrinsics=pinhole(300, 25.0), shape=(300, 300))
+    view = camera.observe(look_at_origin(np.radians(35), np.radians(20), 25.0))
+    found = recogniser.together([view], np.zeros(len(recogniser.classes)), 1)
+    assert recogniser.classes[found.belief.argmax()] == "knob"
 
 
 def test_a_better_object_frame_searches_no_view_again(knobs, knobs_memory, monkeypatch):

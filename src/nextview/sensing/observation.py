@@ -97,6 +97,9 @@ class Observation:
         }
         for name, value in checked.items():
             object.__setattr__(self, name, None if value is None else _own(value))
+
+        if (self.sighting is None) != (self.object_frame is None):
+            raise ObservationError("a sighting and its object frame are given together")
         if self.radius is not None:
             if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST_ENTRY):
                 shown = one_line(repr(self.radius))
@@ -108,7 +111,7 @@ class Observation:
     @property
     def whole_frame(self) -> tuple[Float32, Float, Float]:
         """Depth, pose and intrinsics of the whole frame, in object radii and the object frame."""
-        if self.sighting is None or self.object_frame is None:
+        if self.sighting is None or self.object_frame is None:  # both, or none
             return self.depth, self.pose, self.intrinsics
         frame = self.sighting.frame
         depth = frame.depth / np.float32(self.object_frame.radius)

@@ -21,26 +21,23 @@ def view_of(observation: Observation) -> View:
             others show what is known otherwise. Without a frame, the world is the object frame.
     """
     sighting = observation.sighting
-    if sighting is None:
-        frame = Frame(
-            observation.depth,
-            observation.intrinsics,
-            observation.pose,
-            pixel_centre=0.5,
-        )
-    else:
-        frame = sighting.frame
-    target = frame.depth > 0 if sighting is None else sighting.mask
-    plane = None if sighting is None else sighting.plane
-
     scale = _scale(observation)
-    pose = frame.camera_to_world.copy()
-    pose[:3, 3] *= scale
-    frame = frame.with_pose(pose).with_depth(frame.depth * np.float32(scale))
+    if sighting is None:
+        depth = observation.depth * np.float32(scale)
+        pose = _in_metres(observation.pose, scale)
+        frame = Frame(depth, observation.intrinsics, pose, pixel_centre=0.5)
+        target = depth > 0
+        plane = None
+    else:
+        depth = sighting.frame.depth * np.float32(scale)
+        pose = _in_metres(sighting.frame.camera_to_world, scale)
+        frame = sighting.frame.with_pose(pose).with_depth(depth)
+        target = sighting.mask
+        plane = sighting.plane
+
     height = np.full(frame.shape, NOT_LEVEL, np.float32)
     if plane is not None:
         height = frame.along(plane.normal, plane.offset * scale)
-
     none = np.zeros(frame.shape, bool)
     measured = frame.depth > 0
     instances = Instances((target & measured,), none, none)
@@ -54,6 +51,13 @@ def into_object(observation: Observation) -> Float:
         axes = observation.object_frame.axes
         centre = observation.object_frame.centre * _scale(observation)
         found[:3] = np.column_stack([axes, -axes @ centre])
+    return found
+
+
+def _in_metres(pose: Float, scale: float) -> Float:
+    """Return a pose, (4, 4), whose places are multiplied by a factor."""
+    found = pose.copy()
+    found[:3, 3] *= scale
     return found
 
 
