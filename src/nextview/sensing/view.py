@@ -68,7 +68,7 @@ class View:
             its error.
         noise: of the depth.
         labels: number of the instance that each pixel shows, (H, W) int32; 0 for none.
-        parted: the same of instances that are parted where the depth jumps, (H, W) int32.
+        parted: number of the part of an instance, which ends where the depth jumps, (H, W) int32.
         pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
         surface: pixels of what carries things, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
@@ -123,6 +123,7 @@ class View:
         large = (labels > 0) & (alone == 0) & (pieces == 0)
         surface = level | large
         inside &= ~large
+        # a mask that is given is one thing, wherever the depth jumps
         parted = alone if given is labels else _connected(alone, frame, sigma)
         return cls(
             frame,
@@ -219,7 +220,11 @@ class View:
         return _parts(self.labels, self.fewest)
 
     def strangers(self) -> Iterator[Mask]:
-        """Return what is one thing at most, (H, W) bool: something in front is another one."""
+        """Return the instances, parted where the depth jumps: another thing begins there.
+
+        Returns:
+            Pixels of each part, (H, W) bool.
+        """
         return _parts(self.parted, self.fewest)
 
     def fragments(self) -> Iterator[Mask]:
