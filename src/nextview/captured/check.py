@@ -11,9 +11,8 @@ from scipy.optimize import minimize
 from nextview.captured.frames import Capture, CapturedFrame
 from nextview.captured.late_poses import FEWEST_JUDGED, explains, find_late
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import Agreement, SurfaceView, compare
+from nextview.sensing.agreement import Agreement, SurfaceView, compare, in_one_place
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import in_one_place
 from nextview.sensing.mistakes import Mistake, PosedViews, Stored, in_poses, mistakes
 from nextview.sensing.registration import CameraOffset, camera_offsets
 from nextview.types import Float, Index

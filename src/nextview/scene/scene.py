@@ -38,14 +38,9 @@ from nextview.scene.view_policies import (
 )
 from nextview.segmentation.instances import Segmenter, instances_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import (
-    REPEATED,
-    KnownFrames,
-    check_mistakes,
-    check_sizes,
-    repeated,
-)
+from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
 from nextview.sensing.masks import inside_box
+from nextview.sensing.mistakes import check_mistakes
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
@@ -75,6 +70,10 @@ if TYPE_CHECKING:
 NOT_WHERE_THEY_WERE = (
     "this frame does not fit the others and is left out: most objects are not where they"
     " were"
+)
+WRONG_POSE = ViewWarning(
+    "pose",
+    f"{NOT_WHERE_THEY_WERE}, so its pose or that of an earlier frame is likely to be wrong",
 )
 NOTHING_AGAIN = (
     "this frame shows neither the plane that things stand on nor any object where they were: its"
@@ -468,17 +467,8 @@ class Scene:
         if nothing_new(before.world, frame):
             again = (*before.tops[-1].warnings, *before.remarks)
             return Look(True, warnings=again)
-        top, view = self._seen(frame, before.tops)
-        shown = top.plane if top.shows_ground else None
-        top = replace(top, warnings=(*top.warnings, *known.check(frame, shown)))
-        state, look = self._after(before, top, view)
-        self._state = state
+        self._state, look = self._after(before, frame)
         self._changed()
-        if look.taken:
-            sizes = [one.size for one in self.objects]
-            smallest = 2 * float(state.world.library.radii.min())
-            small = check_sizes(frame, sizes, smallest)
-            look = replace(look, warnings=(*look.warnings, *small))
         return look
 
     def grasps(
@@ -607,9 +597,12 @@ class Scene:
             seen = carried
         else:
             masks = carried.masks
-        warnings = tuple(check_mistakes(seen, self._known_frames))
+        known_frames = self._known_frames
+        warnings = tuple(check_mistakes(seen, known_frames))
         ground = None if earlier is None else earlier.plane
         top = TableTop.of(seen, self.up, ground, inside, self._widest, warnings)
+        shown = top.plane if top.shows_ground else None
+        warnings += tuple(known_frames.check(frame, shown))
         view = View.of(
             frame,
             replace(instances, masks=masks),
@@ -618,24 +611,29 @@ class Scene:
             self._widest,
             known,
         )
-        return top, view
+        return replace(top, warnings=warnings), view
 
-    def _after(
-        self, before: SceneState, top: TableTop, view: View
-    ) -> tuple[SceneState, Look]:
+    def _after(self, before: SceneState, frame: Frame) -> tuple[SceneState, Look]:
         """Return the scene after a frame; a frame that does not fit is left out.
 
         Raises:
-            ObservationError: neither the ground nor any known object is visible.
+            ObservationError: neither the ground nor any known object is visible, or the frame was
+                read with a mistake.
         """
+        top, view = self._seen(frame, before.tops)
         # the pose of a camera that has not moved is as right as before
-        stands = self._known_frames.stands(top.frame)
+        stands = self._known_frames.stands(frame)
         kept = before.with_room()
         told = changes(kept.world, view, stands)
         if before.tops and not (top.shows_ground or told.stand):
             raise ObservationError(NOTHING_AGAIN)
         if told.wrong_pose:
-            return before, Look(False, warnings=(self._why_wrong(top),))
+            camera = [
+                replace(one, message=f"{NOT_WHERE_THEY_WERE}: {one.message}")
+                for one in top.warnings
+                if one.name == "intrinsics"
+            ]
+            return before, Look(False, warnings=(*camera, WRONG_POSE)[:1])
 
         world = told.world.with_view(told.view, told.held)
         among = ~np.isin(world.library.names, self.system.ruled_out)
@@ -648,14 +646,6 @@ class Scene:
         if look.moved and not (told.stand or stands):
             look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
         return state, look
-
-    def _why_wrong(self, top: TableTop) -> ViewWarning:
-        """Say what is wrong with a frame in which most objects are not where they were."""
-        for told in top.warnings:
-            if told.name == "intrinsics":
-                return replace(told, message=f"{NOT_WHERE_THEY_WERE}: {told.message}")
-        why = "so its pose or that of an earlier frame is likely to be wrong"
-        return ViewWarning("pose", f"{NOT_WHERE_THEY_WERE}, {why}")
 
     def _ruled(self, state: SceneState) -> SceneState:
         """Return a scene without the names that the rule rules out."""

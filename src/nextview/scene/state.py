@@ -13,6 +13,7 @@ from nextview.geometry.axes import upright_axes
 from nextview.scene.next_view import TableGround
 from nextview.scene.objects import SceneObject, objects_of
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
+from nextview.sensing.known_frames import NEAR_RANGE
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
@@ -116,4 +117,24 @@ class SceneState:
             remarks.append(ViewWarning("unit", f"{what} is its unit right?", False))
         elif self.tops and not self.objects:
             remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)
-        return tuple(remarks)
+        return (*remarks, *self._near_and_small())
+
+    def _near_and_small(self) -> list[ViewWarning]:
+        """Warn if all that is seen is both too near and too small for what is known.
+
+        Either alone may be right: a camera for short distances, or a table of small strangers.
+        """
+        if not self.objects:
+            return []
+        middle = self.tops[-1].frame.depth_range[1]
+        largest = max(float(np.linalg.norm(one.size)) for one in self.objects)
+        smallest = 2 * float(self.world.library.radii.min())
+        # a thing may be seen from its small end
+        if not NEAR_RANGE[1] <= middle < NEAR_RANGE[0] or largest > smallest / 2:
+            return []
+        message = (
+            f"the depth has a median of {100 * middle:.0f} cm, and the largest object in sight"
+            f" measures {100 * largest:.1f} cm, the smallest known one {100 * smallest:.1f} cm: is"
+            " the depth several times too small, as by a wrong depth scale?"
+        )
+        return [ViewWarning("unit", message, holds=False)]

@@ -25,6 +25,7 @@ COLUMNS = 160  # of the image in which points are looked up, about
 DEVIATIONS = 2.4, 0.7
 CONFIRMED = 2.0  # nats of a surface that two frames see in the same place
 CONTRADICTED = -4.0  # nats of a surface that one frame sees through
+WORLD_CHANGED = np.log(0.05)  # nats of a world in which nothing need agree any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,3 +232,30 @@ def _looked_up(
     # Unless it is occluded, a point of the object must be inside the mask, even without depth.
     hidden = nearest < z - limit
     return agrees & on_object, np.where(on_object, looks_through, ~hidden)
+
+
+def agree(views: Sequence[SurfaceView], poses: Float) -> float:
+    """Return the evidence of the surfaces that two frames see in the same places, nats.
+
+    Args:
+        views: both frames.
+        poses: of their cameras, camera-to-world, (2, 4, 4).
+    """
+    found = compare(views, poses)
+    if found.judged < 100:  # they do not overlap
+        return 0.0
+    # two frames see some 15 independent surfaces, each point is compared twice
+    share = 15 / 2 / sum(len(view.points) for view in views)
+    return float(np.logaddexp(share * found.nats.sum(), WORLD_CHANGED))
+
+
+def in_one_place(poses: Float, middle: float) -> bool:
+    """Return True if all cameras are in one place, where rotations cannot be verified.
+
+    Args:
+        poses: camera-to-world, (N, 4, 4).
+        middle: median depth, metres.
+    """
+    places = poses[:, :3, 3]
+    apart = np.linalg.norm(places - np.median(places, 0), axis=1)
+    return bool(np.quantile(apart, 0.9) < 0.02 * middle)

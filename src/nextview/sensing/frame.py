@@ -165,6 +165,13 @@ class Frame:
         return np.eye(4) if self.pose is None else self.pose
 
     @property
+    def depth_range(self) -> Float:
+        """Nearest depth, without flying pixels, median and farthest depth, (3,), metres."""
+        few = self.depth[::4, ::4]
+        few = few[few > 0] if few.any() else self.depth[self.depth > 0]
+        return np.array([*np.quantile(few, [0.02, 0.5]), self.depth.max()])
+
+    @property
     def rays(self) -> tuple[Float32, Float32]:
         """x and y of the rays (x, y, 1) through the columns, (W,), and the rows, (H,), float32."""
         x, y = self.pinhole.image_slopes

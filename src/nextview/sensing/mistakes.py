@@ -1,10 +1,15 @@
-"""The mistakes with which depth and poses are read, each with the change that undoes it.
+"""The mistakes with which depth and poses are read, and the readings of a frame without them.
 
-Frames have several readings: as they were handed in, or with one of these mistakes undone. The
-reading that agrees best with all that is known tells which mistake was made: of a new frame of a
-session or a scene (``known_frames``), and of the frames of a folder (``captured.check``). To add a
-mistake, add an entry to ``mistakes``.
+To add a mistake, with the change that undoes it, add an entry to ``mistakes``. A folder of frames
+is checked by ``captured.check``.
+
+A frame has several readings: as it was handed in, or with one of the mistakes undone. The
+score of a reading is the sum of the evidence of several facts, in nats: the logarithm of how much
+likelier each is for a right reading than for one of which nothing is known. The scores and the
+prior probabilities of the mistakes give the probability that the frame is right as it is.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +18,13 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nextview.sensing.agreement import SurfaceView
-from nextview.sensing.frame import CAMERA_AXES
+from nextview.errors import ObservationError
+from nextview.sensing.agreement import WORLD_CHANGED, SurfaceView, agree, in_one_place
+from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.sensing.known_frames import KnownFrames
+from nextview.sensing.planes import TILT, Plane, find_plane, gain_as_range, steep
+from nextview.sensing.segmented_frame import SegmentedFrame
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
 UNITS = {
@@ -25,6 +35,13 @@ UNITS = {
     0.3048: "feet",
 }
 UNUSUAL = 1e-4  # prior of centimetres, and of a pose of which one half is inverse
+REFUSED = 0.01  # probability that a frame is right below which it is refused
+TOLD = np.log(10)  # nats of a fact that is told
+RARE_FACT = np.log(1e-4)  # of what few right frames show
+IMPOSSIBLE = np.log(1e-6)  # of what no right frame shows
+LEVEL_ERROR = np.radians(3.0)  # tilt of a level plane by errors of pose and depth
+# A camera sees its target, and moves, within so many times the farthest depth that it measures.
+TOO_FAR = 2.5
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -86,7 +103,7 @@ class Mistake:
             views = [view.with_focal_length(self.focal) for view in views]
         return PosedViews(views, self.right_poses(posed.poses))
 
-    def with_another(self, other: "Mistake") -> "Mistake":
+    def with_another(self, other: Mistake) -> Mistake:
         """Return both mistakes, of which this one is undone first."""
         return Mistake(
             f"{self.name}, {other.name}",
@@ -94,7 +111,7 @@ class Mistake:
             lambda poses: other.right_poses(self.right_poses(poses)),
         )
 
-    def of_single_pose(self, row: int, frame: str) -> "Mistake":
+    def of_single_pose(self, row: int, frame: str) -> Mistake:
         """Return the mistake in the pose of one frame alone.
 
         Args:
@@ -316,3 +333,332 @@ def _quaternions_rolled(poses: Float, steps: int) -> Float:
     # e.g. (x, y, z, w) as read are w, x, y, z: roll to the left by one
     right = Rotation.from_quat(np.roll(quaternions, -steps, axis=1)).as_matrix()
     return _changed(poses, right, poses[:, :3, 3])
+
+
+# The readings of a frame
+
+
+@dataclass(frozen=True)
+class Fact:
+    """What one fact tells about a reading.
+
+    Attributes:
+        nats: evidence for the reading.
+        words: what tells against it, if it does.
+        warning: name of the warning about it.
+    """
+
+    nats: float = 0.0
+    words: str = ""
+    warning: str = "pose"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One reading of a frame.
+
+    Attributes:
+        frame: as it was handed in.
+        known: what it is compared with.
+        plane: the largest plane, in the camera frame; None without.
+        depths: nearest, median and farthest depth, (3,), metres.
+        poses: of the last frame, or the identity, and of this one, camera-to-world, (2, 4, 4).
+        scale: number by which the depth is multiplied.
+        agreement: nats of the agreement with the last frame.
+        flatness: nats of the samples that lie on planes.
+        mistake: that is undone; None for none.
+    """
+
+    frame: Frame
+    known: KnownFrames
+    plane: Plane | None
+    depths: Float
+    poses: Float
+    scale: float = 1.0
+    agreement: float = 0.0
+    flatness: float = 0.0
+    mistake: Mistake | None = None
+
+    def facts(self) -> list[Fact]:
+        """Return what tells for and against this reading."""
+        _, middle, farthest = self.depths
+        last, place = self.poses[:, :3, 3]
+        # A robot's camera is near the origin of its world, or sees as far as it is away.
+        far = median_range = motion = Fact()
+        away = float(np.linalg.norm(place))
+        if away >= max(30, 20 * middle):
+            words = (
+                f"the camera is {away:.0f} m from the world's origin, and sees"
+                f" {middle:.2g} m far"
+            )
+            far = Fact(RARE_FACT, words, "far origin")
+        if middle >= 10:  # metres, range of most depth cameras
+            words = f"the depth has a median of {middle:.0f} m"
+            median_range = Fact(RARE_FACT, words, "unit")
+        if self.known.frames:  # a camera moves through what it sees
+            moved = float(np.linalg.norm(place - last))
+            reach = farthest + self.scale * float(self.known.frames[-1].depth.max())
+            if moved >= TOO_FAR * reach:
+                words = (
+                    f"the camera is {moved:.0f} m from where it was, and what it sees is"
+                    f" within {reach:.1f} m"
+                )
+                motion = Fact(IMPOSSIBLE, words)
+        return [
+            far,
+            median_range,
+            motion,
+            self._of_target(),
+            *self._of_plane(),
+            Fact(self.agreement, "the frame does not agree with the last one"),
+            Fact(self.flatness, "what is flat looks curved"),
+        ]
+
+    def _of_target(self) -> Fact:
+        """An object is in sight of the camera that looks at it, and not before all that is seen."""
+        known = self.known
+        if known.target is None or self.frame.mask is not None:
+            return Fact()
+        nearest, _, farthest = self.depths
+        pose = self.poses[1]
+        in_camera = pose[:3, :3].T @ (known.target - pose[:3, 3])
+        away = float(np.linalg.norm(in_camera))
+        if away - known.radius > TOO_FAR * farthest:
+            words = (
+                f"the target is {away:.0f} m away, and nothing in the frame is farther than"
+                f" {farthest:.1f} m"
+            )
+            return Fact(IMPOSSIBLE, words)
+
+        words = "nothing is seen where the target is"
+        if in_camera[2] <= 0:
+            return Fact(0.0, words)
+        column, row = self.frame.pinhole.project(in_camera[None])[0]
+        height, width = self.frame.shape
+        if not (0 <= column < width and 0 <= row < height):
+            return Fact(0.0, words)
+        top, left = max(0, int(row) - 4), max(0, int(column) - 4)
+        around = self.frame.depth[top : int(row) + 5, left : int(column) + 5]
+        if not around.any():
+            return Fact(0.0, words)
+        there = self.scale * float(np.median(around[around > 0]))
+        if min(there, nearest) < 1.2 * (in_camera[2] + known.radius):
+            return Fact(_coincidence(np.log(there / in_camera[2]), 0.15), words)
+        return Fact(RARE_FACT, "all that is seen is far behind the target", "unit")
+
+    def _of_plane(self) -> tuple[Fact, Fact]:
+        """The largest plane is mostly a floor, table or wall, and often level with the origin."""
+        plane = self.plane
+        if plane is None:
+            return Fact(), Fact()
+        pose = self.poses[1]
+        level = Fact()
+        normal = pose[:3, :3] @ plane.normal
+        up = normal if self.known.up is None else self.known.up
+        rise = float(normal @ up)
+        if self.known.up is not None:
+            sharpness = LEVEL_ERROR**-2
+            floor = sharpness * np.exp(sharpness * (rise - 1))
+            # few largest planes are neither level nor vertical
+            nats = float(np.log(floor + _normal(rise, LEVEL_ERROR) + 3e-4))
+            level = Fact(nats, "the largest plane in view is not level")
+
+        stands = float(pose[:3, 3] @ up)
+        lies = stands - plane.offset
+        where = f"{abs(lies):.2g} m {'above' if lies > 0 else 'below'}"
+        words = f"the largest plane in view lies {where} the world's origin"
+        if stands <= 0 or rise < TILT:
+            return level, Fact(np.log(0.5), words, "unit")
+        nats = _coincidence(np.log(stands / plane.offset), 0.03)
+        return level, Fact(nats, words, "unit")
+
+    def without(self, mistake: Mistake, views: Sequence[SurfaceView]) -> list[Reading]:
+        """Return the readings with a mistake undone.
+
+        A mistake in a pose may be in that of the new frame alone, a wrong unit also in that of the
+        last one. Depth and focal length of both frames are alike.
+
+        Args:
+            mistake: the mistake.
+            views: the last frame and this one; none without a last one.
+        """
+        right = mistake.undone(PosedViews(views, self.poses))
+        alone = np.stack([self.poses[0], right.poses[1]])
+        plane = self.plane
+        if plane is not None and mistake.scale > 1:
+            plane = replace(plane, offset=plane.offset / mistake.scale)
+        if plane is not None and mistake.focal != 1:
+            normal = plane.normal * [mistake.focal, mistake.focal, 1]
+            length = float(np.linalg.norm(normal))
+            plane = Plane(normal / length, plane.offset / length)
+
+        other = replace(self, plane=plane, mistake=mistake)
+        if mistake.scale > 1:
+            scale = 1 / mistake.scale
+            other = replace(other, depths=scale * self.depths, scale=scale)
+            return [other.agreeing(right.views, right.poses)]
+
+        tried = [alone, right.poses] if mistake.scale < 1 else [alone]
+        return [
+            replace(other, poses=poses).agreeing(right.views, poses) for poses in tried
+        ]
+
+    def agreeing(self, views: Sequence[SurfaceView], poses: Float) -> Reading:
+        """Return the reading with its agreement with the last frame.
+
+        Where the last frame is confirmed by the frame as it is, no other reading agrees.
+
+        Args:
+            views: the last frame and this one; none without a last one.
+            poses: of both, camera-to-world, (2, 4, 4).
+        """
+        if not views:
+            return self
+        nats = WORLD_CHANGED
+        if self.agreement <= 0:
+            nats = 0.0 if in_one_place(poses, self.depths[1]) else agree(views, poses)
+        return replace(self, agreement=nats)
+
+
+def check_mistakes(seen: SegmentedFrame, known: KnownFrames) -> list[ViewWarning]:
+    """Warn if a frame was probably read with a mistake, or shows what few right frames do.
+
+    Args:
+        seen: the frame with its surfaces.
+        known: what it is compared with.
+
+    Raises:
+        ObservationError: it was certainly read with a mistake, which is named.
+    """
+    frame = seen.frame
+    up = known.up
+    if up is None:
+        shown = [plane for plane in known.planes if plane is not None]
+        up = shown[0].normal if shown else None
+    known = replace(known, up=None if frame.pose is None else up)
+    last = known.frames[-1] if known.frames else frame
+    rng = np.random.default_rng(0)
+    views = [SurfaceView.of(one, rng, whole=True) for one in (last, frame)]
+    poses = np.stack([last.camera_to_world, frame.camera_to_world])
+    plane, flatter = _largest_plane(seen, known.up)
+    read = Reading(frame, known, plane, frame.depth_range, poses)
+    if known.frames:
+        read = replace(read, agreement=agree(views, poses))
+    others = []
+    if known.target is not None:
+        words = "target and pose are of different worlds"
+        other = replace(read, known=replace(known, target=None))
+        others.append(replace(other, mistake=Mistake("world", words)))
+    if known.frames:
+        words = "the pose is of another world than the last one"
+        other = replace(read, known=replace(known, frames=()), agreement=0.0)
+        others.append(replace(other, mistake=Mistake("world", words)))
+    stored = Stored(frame.intrinsics[0, 0], step=0.001 if frame.counted else 0.0)
+    of_focal_length = []
+    for mistake in mistakes(stored):
+        if mistake.name == "range":
+            # nats if all samples lie on a plane in one reading, and none in the other
+            other = replace(read, flatness=320.0 * flatter, mistake=mistake)
+            others.append(other)
+        elif mistake.focal != 1:
+            of_focal_length += read.without(mistake, views if known.frames else ())
+        elif mistake.prior and (frame.pose is not None or mistake.scale > 1):
+            others += read.without(mistake, views if known.frames else ())
+
+    told = _told(read, others)
+    if told is not None:
+        right, warning, kind = told
+        if right < REFUSED:
+            raise ObservationError(warning.message, kind)
+        return [replace(warning, message=f"{warning.message}?")]
+    told = _told(read, of_focal_length)
+    if told is None:
+        return []
+    # the plane may be a ramp
+    return [ViewWarning("intrinsics", told[1].message, holds=False)]
+
+
+def _told(
+    read: Reading, others: Sequence[Reading]
+) -> tuple[float, ViewWarning, str] | None:
+    """Return the probability that a frame is right, what is said, and the likeliest mistake's name;
+    None for nothing.
+
+    Args:
+        read: the frame as it was handed in.
+        others: readings with a mistake undone.
+    """
+    facts = read.facts()
+    as_read = np.array([fact.nats for fact in facts])
+    gains = np.array([[fact.nats for fact in one.facts()] for one in others]) - as_read
+    undone = [one.mistake for one in others if one.mistake is not None]
+    nats = gains.sum(1) + np.log([mistake.prior for mistake in undone])
+    right = 1 / (1 + np.exp(np.minimum(nats, 500)).sum())
+    if right >= 0.5:
+        # few right frames show what this one does
+        rare = (as_read <= RARE_FACT) & (gains > TOLD).any(0)
+        if not rare.any():
+            return None
+        nats = np.where((gains[:, rare] > TOLD).any(1), nats, -np.inf)
+
+    best = int(nats.argmax())
+    order = np.argsort(-gains[best])
+    told = order[gains[best, order] >= min(TOLD, gains[best].max())]
+    # each mistake once, and of focal lengths the likeliest
+    named: dict[str, str] = {}
+    for row in np.argsort(-nats, kind="stable"):
+        one = undone[row]
+        if nats[row] > nats[best] - np.log(3):
+            named.setdefault(one.sentence if one.focal == 1 else one.name, one.sentence)
+    words = ", and ".join(facts[row].words for row in told)
+    message = f"{words}: {'; or '.join(named.values())}"
+    return right, ViewWarning(facts[told[0]].warning, message), undone[best].name
+
+
+def _coincidence(difference: float, error: float) -> float:
+    """Return the evidence of two lengths that half of all right readings have equal, nats.
+
+    Of lengths of which nothing is known, all of 1 mm to 1 km are alike likely.
+
+    Args:
+        difference: of their logarithms.
+        error: standard deviation of the difference where they are equal.
+    """
+    return float(np.log(0.5 + 0.5 * np.log(1e6) * _normal(difference, error)))
+
+
+def _normal(value: float, deviation: float) -> float:
+    """Return the density of a normal distribution with mean 0."""
+    density = np.exp(-0.5 * (value / deviation) ** 2)
+    return float(density / (np.sqrt(2 * np.pi) * deviation))
+
+
+def _largest_plane(
+    seen: SegmentedFrame, up: Float | None
+) -> tuple[Plane | None, float]:
+    """Return the largest plane, in the camera frame, and the gain of a range.
+
+    A level plane is taken for the largest one unless another has twice as many samples.
+
+    Returns:
+        The plane; None if there is none. The share of samples that lie on a plane only if the depth
+        is read as range along each ray.
+    """
+    frame = seen.frame
+    samples = seen.surface_samples
+    rng = np.random.default_rng(0)
+    flat = samples if up is None else samples.some(~steep(samples, up))
+    shares = [float(level.plane.holds(flat).mean()) for level in seen.levels]
+    share = max(shares, default=0.0)
+    plane = seen.levels[int(np.argmax(shares))].plane if shares else None
+
+    largest = find_plane(samples, rng)
+    flatter = gain_as_range(frame, largest, samples, rng)
+    if up is not None and share < 1 / 3 and largest is not None:
+        larger = largest.holds(samples).mean() > 2 * share
+        plane = largest if larger else plane
+    if plane is None:
+        return None, flatter
+    pose = frame.camera_to_world
+    normal = pose[:3, :3].T @ plane.normal
+    return Plane(normal, float(plane.height(pose[:3, 3]))), flatter

@@ -13,7 +13,7 @@ from nextview.geometry.axes import three, upright_axes
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.choosing import choose_instance
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import REPEATED, KnownFrames, check_mistakes
+from nextview.sensing.known_frames import REPEATED, KnownFrames
 from nextview.sensing.masks import (
     SPHERE_MARGIN,
     above_plane,
@@ -21,6 +21,7 @@ from nextview.sensing.masks import (
     inside_mask,
     inside_sphere,
 )
+from nextview.sensing.mistakes import check_mistakes
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.observation import Observation
 from nextview.sensing.planes import Plane

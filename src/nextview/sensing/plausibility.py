@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.viewsphere import VISITED_ANGLE, angle_between, direction_of
 from nextview.sensing.mistakes import in_poses
 from nextview.sensing.observation import Observation
 from nextview.sensing.view_warning import ViewWarning
@@ -153,3 +154,26 @@ def _seen_through(first: Observation, second: Observation) -> float:
             there = depth[row + dy, column + dx]
             missing &= (there == 0) | (there > points[inside, 2] + 0.1)
     return float(missing.mean())
+
+
+def repeated_observation(seen: Observation, earlier: Sequence[Observation]) -> bool:
+    """Return True if an observation repeats the image of an earlier one.
+
+    Two renders of a symmetric object may also be identical, but only after a rotation about the
+    vertical.
+
+    Args:
+        seen: the observation.
+        earlier: the earlier observations.
+    """
+    towards = direction_of(seen.pose)
+    return any(
+        one.seen
+        and np.array_equal(one.depth, seen.depth)
+        and (
+            angle_between(direction_of(one.pose), towards) <= VISITED_ANGLE
+            or not np.allclose(one.pose[2], seen.pose[2], atol=1e-4)
+            or bool(check_views(one, seen))
+        )
+        for one in earlier
+    )

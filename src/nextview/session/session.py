@@ -41,10 +41,14 @@ from nextview.recognition.protocol import (
 )
 from nextview.segmentation.instances import Segmenter
 from nextview.sensing.frame import Frame
-from nextview.sensing.known_frames import REPEATED, repeated, repeated_observation
+from nextview.sensing.known_frames import REPEATED, repeated
 from nextview.sensing.observation import Camera, Observation
 from nextview.sensing.observed_object import ObservedObject
-from nextview.sensing.plausibility import check_last_view, check_observation
+from nextview.sensing.plausibility import (
+    check_last_view,
+    check_observation,
+    repeated_observation,
+)
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, checked_limits, in_words
