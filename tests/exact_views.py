@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.sensing.facets import noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.observation import Observation
@@ -112,7 +111,7 @@ def framed(
         object_frame.pose_in_world(observation.pose),
         pixel_centre=0.5,
     )
-    sighting = sighting_of(frame, target, plane, noise_of(frame), denoise=False)
+    sighting = sighting_of(frame, target, plane, frame.noise, denoise=False)
     return replace(observation, sighting=sighting, object_frame=object_frame)
 
 

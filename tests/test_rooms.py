@@ -9,7 +9,7 @@ from factories import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 
 from nextview.data.samples import sample_mesh
 from nextview.sensing import Frame, ObservedObject
-from nextview.sensing.facets import Noise
+from nextview.sensing.noise import Noise
 from nextview.sensing.planes import Plane, sample
 from nextview.sensing.walls import find_walls
 

@@ -12,8 +12,9 @@ from scipy.ndimage import binary_dilation
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing import ObjectFrame
-from nextview.sensing.facets import Noise, estimate_noise, fit_facets
+from nextview.sensing.facets import fit_facets
 from nextview.sensing.mask_edges import trimmed
+from nextview.sensing.noise import Noise, estimate_noise
 from nextview.sensing.object_frame import enclose, smallest_circle
 from nextview.sensing.planes import Samples, find_plane
 

@@ -15,8 +15,8 @@ import numpy as np
 from nextview.captured.check import evenly_spread
 from nextview.captured.frames import Capture
 from nextview.files import new_file
-from nextview.sensing.facets import MEDIAN_OF_NORMAL, noise_of
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import MEDIAN_OF_NORMAL
 from nextview.sensing.planes import TILT, Plane, Samples, find_plane, sample
 from nextview.sensing.registration import CAMERA_AIM, CAMERA_PLACE
 from nextview.types import Float
@@ -174,7 +174,7 @@ def depth_quality(frames: Sequence[Frame], still: bool = True) -> DepthQuality:
         still: whether what they show stands still in this world.
     """
     rng = np.random.default_rng(0)
-    noises = [noise_of(frame) for frame in frames]
+    noises = [frame.noise for frame in frames]
     seen = np.concatenate([frame.depth[frame.depth > 0][::SPARSE] for frame in frames])
     depths = np.percentile(seen, (10, 50, 90))
 

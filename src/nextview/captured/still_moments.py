@@ -8,7 +8,6 @@ from scipy import ndimage
 
 from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.facets import noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.registration import tolerance_of
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
@@ -72,7 +71,7 @@ def has_changed(before: Frame, after: Frame) -> bool:
         before: a frame.
         after: another frame of the same size and pose.
     """
-    noise = noise_of(before)
+    noise = before.noise
     valid = (before.depth > 0) & (after.depth > 0)
     depth = np.minimum(before.depth, after.depth)
     limit = np.sqrt(2) * tolerance_of(depth, noise)

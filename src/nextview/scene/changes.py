@@ -17,7 +17,8 @@ from scipy import ndimage
 
 from nextview.scene.followed import SURPRISE
 from nextview.sensing.frame import Frame
-from nextview.sensing.view import FEWEST_PIXELS, LEAST_ERROR, View, stride_of
+from nextview.sensing.noise import LEAST_ERROR
+from nextview.sensing.view import FEWEST_PIXELS, View, stride_of
 from nextview.things.library import Hypotheses, Library
 from nextview.things.register import register
 from nextview.things.score import BLOCK, OUTLIER, STEEPEST, Score, score, total

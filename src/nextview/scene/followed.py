@@ -9,8 +9,8 @@ from scipy.special import expit, logit
 
 from nextview.scene.body import WIDEST, Body
 from nextview.scene.motion import BodyState
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import Noise
 from nextview.sensing.planes import Plane
 from nextview.sensing.view import LEVEL, View
 from nextview.things.contour import contour_equations

@@ -37,14 +37,14 @@ from nextview.scene.view_policies import (
     ScenePolicy,
 )
 from nextview.segmentation.instances import Segmenter, instances_of
-from nextview.sensing.frame import Frame
+from nextview.sensing.frame import Frame, shown_before
 from nextview.sensing.known_frames import REPEATED, KnownFrames, repeated
 from nextview.sensing.masks import inside_box
 from nextview.sensing.mistakes import check_mistakes
 from nextview.sensing.object_frame import Box
 from nextview.sensing.segmented_frame import segmented_frame
 from nextview.sensing.tabletop import TableTop
-from nextview.sensing.view import View, shown_before
+from nextview.sensing.view import View
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.limits import Limits, checked_limits
 from nextview.session.reach import (
@@ -228,7 +228,7 @@ class Scene:
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
-        """Open issues: parts of the frames left out, unexplained points, no visible ground."""
+        """Open issues: parts left out, unexplained points, no visible ground, a doubtful unit."""
         return self._state.remarks
 
     @property
@@ -571,10 +571,10 @@ class Scene:
         Raises:
             ObservationError: there is no ground, or the frame was read with a mistake.
         """
+        instances = instances_of(self.segmentation, frame, self.up)
         inside = frame.depth > 0 if frame.mask is None else frame.mask
         if self.region is not None:
             inside = inside & inside_box(frame, self.region)
-        instances = instances_of(self.segmentation, frame, self.up)
         known = np.zeros(frame.shape, bool)
         for empty in self.background:
             known |= shown_before(frame, empty)

@@ -23,8 +23,8 @@ from nextview.scene.followed import (
 )
 from nextview.scene.motion import MotionModel
 from nextview.scene.scene import Scene
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import Noise
 from nextview.sensing.planes import Plane
 from nextview.sensing.view import View
 

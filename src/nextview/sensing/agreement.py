@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from nextview.sensing.facets import noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.planes import find_plane, sample
 from nextview.sensing.registration import CAMERA_AIM, CAMERA_PLACE, tolerance_of
@@ -73,7 +72,6 @@ class SurfaceView:
         intrinsics[:2, 2] += 0.5
         depth = frame.depth[::side, ::side]
         small = Frame(depth.copy(), intrinsics, pixel_centre=0.5)
-        noise = noise_of(small)
 
         measured = np.where(depth > 0, depth, np.float32(np.inf))
         nearest = ndimage.minimum_filter(measured, 3, mode="nearest")
@@ -89,12 +87,12 @@ class SurfaceView:
             if not whole and middle.any():  # nor the far background
                 usable &= depth < 1.5 * np.median(middle[middle > 0])
         points = small.positions_in_camera(*np.nonzero(usable))
-        by_noise = tolerance_of(points[:, 2], noise, share=0.0)
+        by_noise = tolerance_of(points[:, 2], small.noise, share=0.0)
 
         standing = np.ones(len(points), bool)
         if not whole and mask is None:
             # The plane is searched in the camera frame, because the pose may be wrong.
-            plane = find_plane(sample(small, small.depth > 0, noise), rng)
+            plane = find_plane(sample(small, small.depth > 0, small.noise), rng)
             if plane is not None:
                 standing = plane.height(points) > 0.012 * points[:, 2] + by_noise
         most = 500 if whole else 200  # points that are projected into other frames

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,13 @@ from nextview.errors import ObservationError
 from nextview.geometry.camera import LARGEST_ENTRY, array_of, numbers
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
+from nextview.sensing.noise import (
+    ALIKE,
+    LEAST_ERROR,
+    ROWS_MEASURED,
+    Noise,
+    estimate_noise,
+)
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 Part = tuple[slice, slice]  # rows and columns of an image
@@ -152,6 +160,7 @@ class Frame:
         """Return the frame with another depth image, (H, W) float32, metres."""
         other = copy(self)  # skips validation
         object.__setattr__(other, "depth", depth)
+        vars(other).pop("noise", None)
         return other
 
     @property
@@ -163,6 +172,12 @@ class Frame:
     def camera_to_world(self) -> Float:
         """Pose of the camera, or the identity if there is none."""
         return np.eye(4) if self.pose is None else self.pose
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Noise of the depth."""
+        few = slice(None, None, max(1, self.shape[0] // ROWS_MEASURED))
+        return estimate_noise(self.depth[few], self.depth[few] > 0)
 
     @property
     def depth_range(self) -> Float:
@@ -189,6 +204,20 @@ class Frame:
         """
         pose = self.camera_to_world
         return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
+
+    def points(self, mask: Mask) -> Float:
+        """Return the world positions of some 500 measured pixels of a mask.
+
+        Args:
+            mask: (H, W) bool.
+
+        Returns:
+            Positions, (N, 3) float64, metres.
+        """
+        part = within(mask)
+        rows, columns = np.nonzero(mask[part] & (self.depth[part] > 0))
+        few = slice(None, None, max(1, len(rows) // 500))
+        return self.positions(rows[few] + part[0].start, columns[few] + part[1].start)
 
     def positions_in_camera(self, rows: Index, columns: Index) -> Float:
         """Return the positions of pixels in the camera frame.
@@ -249,6 +278,39 @@ def one_stand(one: PosedCamera, other: PosedCamera) -> bool:
 def stands_still(frame: PosedCamera, earlier: Iterable[PosedCamera]) -> bool:
     """Return True if a camera with a name took a frame and all earlier ones from one place."""
     return frame.camera != "" and all(one_stand(one, frame) for one in earlier)
+
+
+def shown_before(frame: Frame, empty: Frame) -> Mask:
+    """Return the pixels that show what a frame of the empty place shows, too, (H, W) bool.
+
+    Args:
+        frame: the frame.
+        empty: of the same place without things, from anywhere.
+    """
+    rows, columns = np.nonzero(frame.depth)
+    pose = empty.camera_to_world
+    points = (frame.positions(rows, columns) - pose[:3, 3]) @ pose[:3, :3]
+    ahead = points[:, 2] > 0
+    place = np.full((len(points), 2), -1.0)
+    place[ahead] = empty.pinhole.project(points[ahead])
+    column, row = np.floor(place).astype(int).T
+    height, width = empty.shape
+    seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+
+    # between the depths of neighbouring pixels: a surface may be steep
+    row = row[seen]
+    column = column[seen]
+    nearest = ndimage.minimum_filter(np.where(empty.depth > 0, empty.depth, np.inf), 3)
+    farthest = ndimage.maximum_filter(empty.depth, 3)
+    rows = rows[seen]
+    columns = columns[seen]
+    z = points[seen, 2]
+    margin = ALIKE * np.hypot(frame.noise.at(z) * z**2, LEAST_ERROR * z)
+    found = np.zeros(frame.shape, bool)
+    found[rows, columns] = (z > nearest[row, column] - margin) & (
+        z < farthest[row, column] + margin
+    )
+    return found
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import binary_erosion, label, minimum_filter, uniform_filter
 
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import holes_of, within
+from nextview.sensing.noise import Noise
 from nextview.types import Float32, Mask
 
 EDGE_ERROR = 6  # pixels, largest error of a mask's edge

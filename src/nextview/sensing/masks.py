@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import WHOLE, Frame, Part, within
 from nextview.sensing.mask_edges import SQUARE_WIDTH, trimmed
+from nextview.sensing.noise import Noise
 from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Float32, Mask

@@ -224,7 +224,7 @@ class ObservedObject:
         warnings += tuple(self._known_frames.check(frame, plane))
 
         mask = self._without_plane(pixels, segmented, plane)
-        seen = sighting_of(frame, mask, plane, segmented.noise, self.denoise)
+        seen = sighting_of(frame, mask, plane, frame.noise, self.denoise)
         seen = replace(seen, warnings=warnings)
         displaced = None
         if before.sightings and self.known is None:
@@ -352,10 +352,10 @@ class ObservedObject:
         if frame.mask is not None and self.known is not None:
             return pixels  # the size does not depend on pixels at the edge
         if frame.mask is not None or self.known is None:
-            return inside_mask(frame, pixels, plane, seen.noise)
+            return inside_mask(frame, pixels, plane, frame.noise)
         mask = pixels
         if plane is not None:
-            mask = pixels & above_plane(frame, plane, seen.noise)
+            mask = pixels & above_plane(frame, plane, frame.noise)
         if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             raise ObservationError(
                 "nothing is seen where the object should be: a wrong pose, or a wrong box?"

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial import ConvexHull, QhullError
 
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import Noise
 from nextview.types import Float, Floats, Index, Mask
 
 # cosine of the largest tilt of a support plane, due to calibration errors
@@ -140,6 +141,19 @@ def axes_along(plane: Plane) -> Float:
     first = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(plane.normal, first)])
+
+
+def sides_of(points: Float) -> Float | None:
+    """Return the sides of the convex hull of points, (N, 2), metres.
+
+    Returns:
+        The sides, (K, 3): a point (x, y) is inside if no element of ``sides @ (x, y, 1)`` is above
+        0. None for collinear points.
+    """
+    try:
+        return ConvexHull(points).equations
+    except (QhullError, ValueError):
+        return None
 
 
 def steep(samples: Samples, up: Float) -> Mask:

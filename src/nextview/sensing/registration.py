@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from nextview.errors import ObservationError
-from nextview.sensing.facets import Facets, Noise, noise_of
+from nextview.sensing.facets import Facets
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import Noise
 from nextview.sensing.planes import find_plane, sample
 from nextview.sensing.sighting import Sighting, sighting_of
 from nextview.types import Float, Index, Mask
@@ -481,7 +482,7 @@ def camera_offsets(moments: Sequence[Sequence[Frame]]) -> list[CameraOffset]:
 
 def _whole(frame: Frame, camera: int) -> Surface | None:
     """Return the surface of everything in a frame; None if too little is visible."""
-    noise = noise_of(frame)
+    noise = frame.noise
     unposed = frame.with_pose(np.eye(4))
     try:
         facets = sighting_of(unposed, frame.depth > 0, None, noise).facets

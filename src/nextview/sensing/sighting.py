@@ -11,8 +11,9 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.errors import ObservationError
-from nextview.sensing.facets import SIZE, Facets, Noise, fit_facets
+from nextview.sensing.facets import SIZE, Facets, fit_facets
 from nextview.sensing.frame import Frame, within
+from nextview.sensing.noise import Noise
 from nextview.sensing.object_frame import ObjectFrame, enclose
 from nextview.sensing.planes import Plane
 from nextview.sensing.view_warning import ViewWarning

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nextview.errors import ObservationError
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.masks import above_plane
+from nextview.sensing.noise import Noise
 from nextview.sensing.planes import Plane
 from nextview.sensing.segmented_frame import SegmentedFrame
 from nextview.sensing.view_warning import ViewWarning
@@ -94,7 +94,7 @@ class TableTop:
     @property
     def noise(self) -> Noise:
         """Noise of the depth of the frame."""
-        return self.seen.noise
+        return self.frame.noise
 
     @property
     def other_surfaces(self) -> Mask:
@@ -112,7 +112,7 @@ def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:
     height = frame.along(plane.normal, plane.offset)
     for level in seen.levels:
         on = level.pixels
-        height[on] = frame.along(level.plane.normal, level.plane.offset)[on]
+        height[on] = level.height[on]
 
     above = np.zeros(frame.shape, bool)
     for mask, carrier in zip(seen.masks, seen.carriers, strict=True):
@@ -123,5 +123,5 @@ def _heights(seen: SegmentedFrame, plane: Plane) -> tuple[Float32, Mask]:
         under = carrier.plane
         raised = frame.along(under.normal, under.offset, part)
         height[part][own] = raised[own]
-        above[part] |= own & above_plane(frame, under, seen.noise, part)
+        above[part] |= own & above_plane(frame, under, frame.noise, part)
     return height, above

@@ -14,18 +14,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from nextview.segmentation.instances import Instances
-from nextview.sensing.facets import LEAST_NOISE, Noise, noise_of
 from nextview.sensing.frame import Frame, one_stand
+from nextview.sensing.noise import ALIKE, LEAST_ERROR, LEAST_NOISE, Noise
 from nextview.types import Float, Float32, Index, Mask
 
 GRID_COLUMNS = 400  # columns of the grid on which hypotheses are scored, about
-# standard deviation of a measured depth, relative, at least: real depth is bent
-LEAST_ERROR = 0.0025
 LEVEL = 2.5  # standard deviations of the depth, within which a pixel lies on a plane
 ON_PLANE = 0.015  # metres from a plane, within which a pixel may show it
 LEAST_PLANE = 0.1  # share of an image that shows a plane on which noise is measured
 MEAN_OF_HALF = 0.3246  # mean of the smaller half of the sizes of normal errors
-ALIKE = 3.0  # standard deviations between two measurements of one place
 LARGER = 1.2  # times the largest thing, above which an instance is none
 OUTLIERS = 0.05, 0.95  # quantiles of the coordinates of an instance
 FEWEST_PIXELS = 30  # grid pixels of a segment that is searched for things, at least
@@ -104,7 +101,7 @@ class View:
             widest: diameter of the largest thing, metres.
             known: pixels that show what was there before all things, (H, W) bool; None for none.
         """
-        noise = _as_on_plane(noise_of(frame), frame, height)
+        noise = _as_on_plane(frame.noise, frame, height)
         sigma = noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         # what lies on a plane within the noise is explained by the plane
         level = (np.abs(height) < LEVEL * sigma) & (frame.depth > 0)
@@ -312,39 +309,6 @@ def _as_on_plane(noise: Noise, frame: Frame, height: Float32) -> Noise:
         return noise
     half = np.partition(off, len(off) // 2)[: len(off) // 2]
     return replace(noise, sigmas=noise.sigmas * half.mean() / MEAN_OF_HALF)
-
-
-def shown_before(frame: Frame, empty: Frame) -> Mask:
-    """Return the pixels that show what a frame of the empty place shows, too, (H, W) bool.
-
-    Args:
-        frame: the frame.
-        empty: of the same place without things, from anywhere.
-    """
-    rows, columns = np.nonzero(frame.depth)
-    pose = empty.camera_to_world
-    points = (frame.positions(rows, columns) - pose[:3, 3]) @ pose[:3, :3]
-    ahead = points[:, 2] > 0
-    place = np.full((len(points), 2), -1.0)
-    place[ahead] = empty.pinhole.project(points[ahead])
-    column, row = np.floor(place).astype(int).T
-    height, width = empty.shape
-    seen = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-
-    # between the depths of neighbouring pixels: a surface may be steep
-    row = row[seen]
-    column = column[seen]
-    nearest = ndimage.minimum_filter(np.where(empty.depth > 0, empty.depth, np.inf), 3)
-    farthest = ndimage.maximum_filter(empty.depth, 3)
-    rows = rows[seen]
-    columns = columns[seen]
-    z = points[seen, 2]
-    margin = ALIKE * np.hypot(noise_of(frame).at(z) * z**2, LEAST_ERROR * z)
-    found = np.zeros(frame.shape, bool)
-    found[rows, columns] = (z > nearest[row, column] - margin) & (
-        z < farthest[row, column] + margin
-    )
-    return found
 
 
 def _connected(

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
+from nextview.sensing.noise import Noise
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.planes import Plane, sample
 from nextview.sensing.registration import tolerance_of

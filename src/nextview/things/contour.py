@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from nextview.sensing.view import LEAST_ERROR, View
+from nextview.sensing.noise import LEAST_ERROR
+from nextview.sensing.view import View
 from nextview.things.library import Hypotheses, Library
 from nextview.things.score import FARTHEST, LEFT_OVER, OUTLIER, PIXEL_GAIN, cast
 from nextview.types import Float, Float32, Index, Mask
