@@ -15,6 +15,7 @@ from nextview.things.surface import Surface
 SHAPE = 240, 320
 INTRINSICS = pinhole_matrix(300.0, 300.0, 160.0, 120.0)
 LARGE = 1.0  # metres, of the largest thing
+UP = np.array([0.0, 0, 1])
 
 
 def surface(name: str, mesh: trimesh.Trimesh) -> Surface:
@@ -90,4 +91,4 @@ def drawn(things, pose, told=None, left_out=()) -> View:
     none = np.zeros(SHAPE, bool)
     instances = Instances(masks, owner == 0, none)
     height = np.where(owner == 0, 0, np.inf).astype(np.float32)
-    return View.of(frame, instances, depth > 0, height, LARGE)
+    return View.of(frame, instances, depth > 0, height, UP, LARGE)

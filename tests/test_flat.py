@@ -13,6 +13,7 @@ SHAPE = 120, 160
 INTRINSICS = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
 FRONT = np.s_[40:80, 60:100]  # of a box, in the middle of the image
 WALL = 1.0
+UP = np.array([0.0, 0, 1])
 
 
 def view_of(depth, *masks) -> View:
@@ -23,7 +24,7 @@ def view_of(depth, *masks) -> View:
     none = np.zeros(SHAPE, bool)
     instances = Instances(masks, none, none)
     height = np.full(SHAPE, np.inf, np.float32)
-    return View.of(frame, instances, measured > 0, height, np.inf)
+    return View.of(frame, instances, measured > 0, height, UP, np.inf)
 
 
 def box_before_a_wall(depth: float, shadow: int = 0):

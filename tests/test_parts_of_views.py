@@ -19,6 +19,7 @@ from nextview.simulation.simulated import SimulatedCamera
 
 K = np.array([[300.0, 0, 80], [0, 300, 60], [0, 0, 1]])
 ON_NO_PLANE = np.full((120, 160), np.inf, np.float32)
+UP = np.array([0.0, 0, 1])
 
 
 def split_view(pieces=None, behind=0.6, widest=0.3):
@@ -30,7 +31,7 @@ def split_view(pieces=None, behind=0.6, widest=0.3):
     shown[40:80, 60:100] = True
     none = np.zeros(depth.shape, bool)
     found = Instances((shown,), none, none, pieces)
-    return View.of(frame, found, depth > 0, ON_NO_PLANE, widest), shown
+    return View.of(frame, found, depth > 0, ON_NO_PLANE, UP, widest), shown
 
 
 def test_a_stranger_ends_where_the_depth_jumps():

@@ -608,6 +608,7 @@ class Scene:
             replace(instances, masks=masks),
             inside,
             top.height,
+            top.up,
             self._widest,
             known,
         )

@@ -42,6 +42,7 @@ class Grid:
         piece: number of the piece that each pixel belongs to, (h, w); 0 for none.
         sizes: number of pixels of each piece, (pieces + 1,).
         surface: pixels of what carries things, (h, w) bool.
+        height: above what carries it, (h, w) float32, metres; infinite where nothing is known.
         pitch: angle between neighbouring pixels, radians.
     """
 
@@ -52,6 +53,7 @@ class Grid:
     piece: NDArray[np.int32]
     sizes: Index
     surface: Mask
+    height: Float32
     pitch: float
 
 
@@ -69,6 +71,9 @@ class View:
         pieces: number of the piece that each pixel belongs to, (H, W) int32; 0 for none.
         surface: pixels of what carries things, (H, W) bool.
         inside: pixels that are to be explained, (H, W) bool.
+        height: of each pixel above what carries it, (H, W) float32, metres; infinite where nothing
+            is known.
+        up: direction of this height, (3,), world.
     """
 
     frame: Frame
@@ -79,6 +84,8 @@ class View:
     pieces: NDArray[np.int32]
     surface: Mask
     inside: Mask
+    height: Float32
+    up: Float
     _grids: dict[int, Grid] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -88,6 +95,7 @@ class View:
         instances: Instances,
         inside: Mask,
         height: Float32,
+        up: Float,
         widest: float,
         known: Mask | None = None,
     ) -> View:
@@ -97,7 +105,9 @@ class View:
             frame: of a depth camera.
             instances: what its segmentation says.
             inside: pixels that are to be explained, (H, W) bool.
-            height: of each pixel above the plane that carries it, (H, W) float32, metres.
+            height: of each pixel above the plane that carries it, (H, W) float32, metres; infinite
+                where none is known.
+            up: direction of this height, (3,), world.
             widest: diameter of the largest thing, metres.
             known: pixels that show what was there before all things, (H, W) bool; None for none.
         """
@@ -131,6 +141,8 @@ class View:
             pieces,
             surface,
             inside,
+            height,
+            up,
         )
 
     def seen_from(self, camera: Float) -> View:
@@ -191,6 +203,7 @@ class View:
             piece,
             np.bincount(piece.ravel()),
             self.surface[::stride, ::stride],
+            self.height[::stride, ::stride],
             stride / float(self.frame.intrinsics[0, 0]),
         )
 

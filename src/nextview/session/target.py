@@ -36,12 +36,15 @@ def view_of(observation: Observation) -> View:
         plane = sighting.plane
 
     height = np.full(frame.shape, NOT_LEVEL, np.float32)
+    up = np.array([0.0, 0.0, 1.0])
     if plane is not None:
         height = frame.along(plane.normal, plane.offset * scale)
+        up = plane.normal
     none = np.zeros(frame.shape, bool)
     measured = frame.depth > 0
     instances = Instances((target & measured,), none, none)
-    return View.of(frame, instances, measured, height, np.inf, measured & ~target)
+    rest = measured & ~target
+    return View.of(frame, instances, measured, height, up, np.inf, rest)
 
 
 def into_object(observation: Observation) -> Float:

@@ -11,14 +11,15 @@ from scipy.special import expit, softmax
 from nextview.recognition.poses import PoseCandidate, distinct
 from nextview.things.register import POINT_INFORMATION, normal_equations
 from nextview.things.score import PIXEL_GAIN
+from nextview.things.support import supported
 from nextview.things.world import STRANGER_GAIN, Thing, World
 from nextview.types import Float, Index
 
 PIXELS_ALIKE = 6.0  # pixels of the grid whose errors are alike: their nats count once
 TOTAL_ERROR = 0.015  # of what a hypothesis explains: error by its pose and scan
-# log-odds that a name is right: of the share of what it could explain, of the logarithm of what it
-# explains, and of its lead over other names, up to LARGEST_LEAD of what it explains
-CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -13.0, 13.0, 0.65, 17.4
+# log-odds that a name is right, beside those that it stands: of the share of what it could explain,
+# of the logarithm of what it explains, and of its lead over other names, up to LARGEST_LEAD of that
+CONSTANT, OF_SHARE, OF_GAIN, OF_LEAD = -15.5, 12.5, 1.0, 15.0
 LARGEST_LEAD = 0.2  # of what it explains: a larger lead counts as much
 CONFIDENT = 0.97  # belief from which on a name is confident
 LIKELY = 0.5  # belief below which an object is unknown
@@ -38,6 +39,7 @@ class Named:
         gain: what the likeliest hypothesis explains and nothing else does, nats.
         lead: over the likeliest other name or size, as a share of what it explains.
         share: of what it could explain.
+        support: how much likelier right than wrong poses are to stand as it does, nats.
         most: probability that no other name or size explains the views; ``right`` is no higher.
     """
 
@@ -47,6 +49,7 @@ class Named:
     gain: float
     lead: float
     share: float
+    support: float
     most: float
 
     def beliefs(self, world: World) -> dict[str, float]:
@@ -82,34 +85,39 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     of_row = totals[rows == thing.row]
     names = np.array(world.library.names)[world.hypotheses.things[rows]]
     kept = (totals > 0) & (totals <= of_row) & ~np.isin(names, list(ruled_out))
-    # the same thing in another size is something that was not taught
+    rows = rows[kept]
+    totals = totals[kept]
     taught = world.hypotheses.taught[rows]
-    resized = totals[kept & ~taught].max(initial=0.0)
-    rows = rows[kept & taught]
-    totals = totals[kept & taught]
-    if not len(rows):
+    if not taught.any():
         return None
-    order = np.argsort(-totals, kind="stable")
-    rows = rows[order]
-    totals = totals[order]
+
+    carriers = [one.row for one in world.things if one.row >= 0 and one is not thing]
+    support = supported(world, rows, np.array(carriers, np.int64))
+    error = score_error(float(totals[taught].max()))
+    logits = totals / error + support
+    # the same thing in another size is something that was not taught
+    resized = [each[~taught].max(initial=0.0) for each in (totals, logits)]
+    order = np.flatnonzero(taught)[np.argsort(-logits[taught], kind="stable")]
+    rows, totals, support, logits = (
+        each[order] for each in (rows, totals, support, logits)
+    )
 
     seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
-    every = np.append(totals, [resized, STRANGER_GAIN * seen])
-    beliefs = softmax(every / score_error(float(totals[0])))
+    beliefs = softmax(np.append(logits, [resized[1], STRANGER_GAIN * seen / error]))
     probabilities = beliefs[:-2]
     alike = beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
-    lead = float(1 - totals[others].max(initial=resized) / max(totals[0], 1.0))
+    lead = float(1 - totals[others].max(initial=resized[0]) / max(totals[0], 1.0))
     # what other things and planes explain as well does not speak for it
     gain = float(totals[0] - of_row.max() + thing.gain)
     share = gain / max(1.0, PIXEL_GAIN * seen)
     odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(gain, 1.0))
-    odds += OF_LEAD * min(lead, LARGEST_LEAD)
+    odds += OF_LEAD * min(lead, LARGEST_LEAD) + support[0]
     # of two that explain the views alike, neither is sure
     alike += probabilities[others].sum()
     most = float(1 - alike / beliefs[:-1].sum())
     right = min(float(expit(odds)), most)
-    return Named(rows, probabilities, right, gain, lead, share, most)
+    return Named(rows, probabilities, right, gain, lead, share, float(support[0]), most)
 
 
 def why_in_doubt(world: World, found: Named) -> str:
@@ -135,6 +143,7 @@ def why_in_doubt(world: World, found: Named) -> str:
         ),
         "few pixels show it": OF_GAIN * (np.log(max(found.gain, 1.0)) - np.log(1000)),
         alike: OF_LEAD * (min(found.lead, LARGEST_LEAD) - LARGEST_LEAD),
+        "it would not stand in this pose": found.support,
     }
     return min(terms, key=lambda one: terms[one])
 
