@@ -10,7 +10,8 @@ know one half of them. Of each name that a scene considers this keeps its eviden
 It prints how often names are right by their present belief, and the best weights: a right name
 counts one, a confident one two, a wrong name takes a half away. Allowed are confident wrong names
 of three in a hundred of a drawn part (five, where one half is known), one on the taught things of
-real frames, and ``--strangers`` on real things that nobody taught. Frames that were fitted do not judge the fit: ``nextview-lab benchmark tables`` does.
+real frames, and ``--strangers`` on real things that nobody taught. Frames that were fitted do not
+judge the fit: ``nextview-lab benchmark tables`` does.
 """
 
 from __future__ import annotations

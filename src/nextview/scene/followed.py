@@ -69,8 +69,20 @@ def view_to_follow(frame: Frame, noise: Noise, ground: Plane | None) -> View:
             height < LEVEL * noise.at(np.maximum(frame.depth, 0.1)) * frame.depth**2
         )
     none = np.zeros(frame.shape, np.int32)
-    camera = frame.camera_to_world
-    return View(frame, camera, noise, none, none, none, surface, frame.depth > 0)
+    # it may be lifted
+    unknown = np.full(frame.shape, np.inf, np.float32)
+    return View(
+        frame,
+        frame.camera_to_world,
+        noise,
+        none,
+        none,
+        none,
+        surface,
+        frame.depth > 0,
+        unknown,
+        np.array([0.0, 0.0, 1.0]),
+    )
 
 
 def followed(library: Library, view: View, body: Body) -> Followed:

@@ -98,12 +98,13 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     # the same thing in another size is something that was not taught
     resized = [each[~taught].max(initial=0.0) for each in (totals, logits)]
     order = np.flatnonzero(taught)[np.argsort(-logits[taught], kind="stable")]
-    rows, totals, support, logits = (
-        each[order] for each in (rows, totals, support, logits)
-    )
+    rows = rows[order]
+    totals = totals[order]
 
     seen = sum(one.seen for one in world.scores[rows[0]] if one is not None)
-    beliefs = softmax(np.append(logits, [resized[1], STRANGER_GAIN * seen / error]))
+    beliefs = softmax(
+        np.append(logits[order], [resized[1], STRANGER_GAIN * seen / error])
+    )
     probabilities = beliefs[:-2]
     alike = beliefs[-2]
     others = world.hypotheses.things[rows] != world.hypotheses.things[rows[0]]
@@ -111,13 +112,14 @@ def named(world: World, thing: Thing, ruled_out: Collection[str]) -> Named | Non
     # what other things and planes explain as well does not speak for it
     gain = float(totals[0] - of_row.max() + thing.gain)
     share = gain / max(1.0, PIXEL_GAIN * seen)
+    standing = float(support[order[0]])
     odds = CONSTANT + OF_SHARE * share + OF_GAIN * np.log(max(gain, 1.0))
-    odds += OF_LEAD * min(lead, LARGEST_LEAD) + support[0]
+    odds += OF_LEAD * min(lead, LARGEST_LEAD) + standing
     # of two that explain the views alike, neither is sure
     alike += probabilities[others].sum()
     most = float(1 - alike / beliefs[:-1].sum())
     right = min(float(expit(odds)), most)
-    return Named(rows, probabilities, right, gain, lead, share, float(support[0]), most)
+    return Named(rows, probabilities, right, gain, lead, share, standing, most)
 
 
 def why_in_doubt(world: World, found: Named) -> str:

@@ -88,5 +88,7 @@ def _above(world: World, row: int, carriers: Index, up: Float, deepest: float) -
     starts += library.centres[some.things][:, None]
     down = np.repeat(-up @ axes, len(points), 0)[:, None]
     things = np.repeat(some.things, len(points))
-    depth, _ = library.caster.cast(things, starts.reshape(-1, 3), down)
+    depth, _ = library.caster.cast(
+        things, starts.reshape(-1, 3).astype(np.float32), down.astype(np.float32)
+    )
     return float(depth.min(initial=np.inf)) - deepest
