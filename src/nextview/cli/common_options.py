@@ -16,23 +16,10 @@ from nextview.session.session import FrameCamera
 from nextview.session.system import is_frames, simulated
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
-NamedSplit = Literal["train", "test", "val"]
+
+
 Three = tuple[float, float, float]
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Parallel processes.
-
-    Attributes:
-        workers: number of processes; by default one per core.
-        scheduler: address of a dask.distributed scheduler to use instead, such as
-            tcp://HOST:8786.
-    """
-
-    workers: int | None = None
-    scheduler: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Show progress on standard error: a bar in a terminal, otherwise lines of text."""
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -54,58 +53,6 @@ def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
     before, total = next(steps)
     track((done for done, _ in steps), total, what)
     return before, total
-
-
-def track_all(
-    done: Iterable[tuple[str, str | None]],
-    total: int,
-    what: str,
-    before: int = 0,
-) -> list[str]:
-    """Show the progress of a job and print the reasons of failed items.
-
-    Args:
-        done: name of each finished item, with None or the reason why it failed.
-        total: number of items.
-        what: name of the work.
-        before: number of items that were finished before this run.
-
-    Returns:
-        The reasons of the failed items.
-    """
-    failed: list[str] = []
-
-    def counts() -> Iterator[int]:
-        for n, (_, reason) in enumerate(done, before + 1):
-            failed.extend([reason] if reason else [])
-            yield n
-
-    track(counts(), total, what)
-    for reason in failed:
-        console.print(reason, style="yellow", soft_wrap=True)
-    return failed
-
-
-def say_done(where: Path, done: str, before: int, total: int) -> None:
-    """Print a summary of a run of a resumable stage.
-
-    Args:
-        where: output of the stage.
-        done: participle of the work, such as "measured" or "planned".
-        before: number of objects that were finished before this run.
-        total: number of all objects.
-    """
-    if before == total:
-        console.print(
-            f"{where}: nothing was left to do; all {total} objects were {done} before",
-            soft_wrap=True,
-        )
-        return
-    earlier = f", {before} were before" if before else ""
-    console.print(
-        f"{where}: {total - before} of {total} objects {done} now{earlier}",
-        soft_wrap=True,
-    )
 
 
 def _show_bar(done: Iterable[int], total: int, what: str) -> None:

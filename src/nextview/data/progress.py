@@ -3,10 +3,8 @@
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+from collections.abc import Callable, Iterable
 
-Result = TypeVar("Result")
 TrackProgress = Callable[[Iterable[int], int, str], None]
 """Exhausts an iterable of counts of finished items, given their total and the name of the work.
 
@@ -46,28 +44,3 @@ def in_lines(done: Iterable[int], total: int, what: str, /) -> None:
             print(line, file=sys.stderr, flush=True)
             last = now
             wait = min(2 * wait, LONGEST_WAIT)
-
-
-def collected(
-    results: Iterable[Result],
-    total: int,
-    what: str,
-    track: TrackProgress,
-) -> list[Result]:
-    """Return results that are computed one after the other, and show the progress.
-
-    Args:
-        results: as yet not computed.
-        total: their number.
-        what: name of the work.
-        track: shows the progress.
-    """
-    found: list[Result] = []
-
-    def counts() -> Iterator[int]:
-        for one in results:
-            found.append(one)
-            yield len(found)
-
-    track(counts(), total, what)
-    return found

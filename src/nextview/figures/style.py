@@ -1,17 +1,14 @@
 """Common style of all figures: narrow, so that they can be read on a phone."""
 
-import re
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nextview.figures.fonts import fit_fonts
@@ -81,13 +78,6 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
         return figure, axes
 
 
-def percent_axis(axis: Axis) -> None:
-    """Format the ticks of an axis in percent, with as few digits as possible."""
-    axis.set_major_formatter(
-        FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %")
-    )
-
-
 def legend(axes: Axes, title: str | None = None) -> None:
     """Draw a legend in two columns below the axes.
 
@@ -122,21 +112,6 @@ def heat(values: Floats) -> NDArray[np.uint8]:
         np.uint8
     )
     return np.where(known[..., None], colours, np.array(UNKNOWN_COLOUR, np.uint8))
-
-
-def to_svg(figure: Figure) -> str:
-    """Return a figure as reproducible SVG text."""
-    text = StringIO()
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure.savefig(
-            text,
-            format="svg",
-            bbox_inches="tight",
-            pad_inches=0.05,
-            metadata={"Date": None},
-        )
-    # characters that XML does not allow
-    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())
 
 
 def to_png(figure: Figure, path: Path) -> None:

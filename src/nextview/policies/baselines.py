@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nextview.errors import PolicyError
-from nextview.geometry.viewsphere import Viewpoints, ViewSphere
+from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import (
     EpisodeState,
     Scope,
@@ -203,55 +202,6 @@ class MostVisible:
             state,
             self.view_values(state) + 1e-6 * rng.random(state.visited.shape),
         )
-
-
-@dataclass(frozen=True)
-class ViewList:
-    """Follows a fixed list of views.
-
-    Attributes:
-        views: of each episode in order, (E, k), starting with the first view.
-        needs: required inputs, see ``Policy.needs``.
-    """
-
-    views: Index
-    needs: tuple[str, ...] = ()
-
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """Take the next view of the list.
-
-        Args:
-            state: the state of B episodes with V candidate views.
-            rng: source of all random numbers.
-
-        Returns:
-            The next view of each episode, (B,) int64.
-
-        Raises:
-            PolicyError: the list is exhausted.
-        """
-        if state.step >= self.views.shape[1]:
-            raise PolicyError(f"only {self.views.shape[1]} views are listed")
-        return self.views[state.episodes, state.step]
-
-
-def orbit(sphere: ViewSphere, starts: Index, k: int) -> Index:
-    """Return the next views around the ring of each start, then around the ring above.
-
-    The lowest ring follows the top one.
-
-    Args:
-        sphere: the candidate views.
-        starts: first view of each episode, (E,) int64.
-        k: number of views.
-
-    Returns:
-        The views in order, (E, k) int64.
-    """
-    n = sphere.azimuths
-    step = np.arange(k)
-    ring = (sphere.ring[starts][:, None] + step // n) % sphere.rings
-    return ring * n + (sphere.azimuth_index[starts][:, None] + step) % n
 
 
 def ranked(values: Floats, k: int) -> Index:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import number, whole
 from nextview.errors import ModelError, RiskError, UsageError
-from nextview.types import Float, Float32, Floats, Index, Mask
+from nextview.types import Float, Float32, Floats, Mask
 
 
 def fuse(logits: Floats, temperature: float = 1.0) -> Float:
@@ -102,21 +102,6 @@ def log_evidence_of(
         np.broadcast_to(azimuth, logits.shape[:-1]),
     ).swapaxes(-1, -2)
     return np.concatenate([logits, pointing.reshape(*logits.shape[:-1], -1)], -1)
-
-
-def of_true_class(logs: Float, labels: Index) -> Float:
-    """Return the log-belief in the true class.
-
-    Args:
-        logs: logits up to a constant, (N, ..., C).
-        labels: true classes, (N,) int64.
-
-    Returns:
-        Log-belief, (N, ...) float64.
-    """
-    top = logs.max(-1)
-    of_truth = logs[np.arange(len(labels)), ..., labels]
-    return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))
 
 
 class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

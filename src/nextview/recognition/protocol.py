@@ -6,12 +6,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
 from nextview.checks import number
 from nextview.errors import UsageError
-from nextview.geometry.viewsphere import azimuth_of, direction_of
-from nextview.recognition.belief import MUCH, Calibration, log_evidence_of
+from nextview.recognition.belief import MUCH, Calibration
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
@@ -173,27 +170,6 @@ def check_unknown(rate: float, recogniser: Recogniser) -> None:
             f"{recogniser.name}: the share of known objects called unknown is 0 or above"
             f" {least:.4g}, the smallest p-value of these models, not {rate:g}"
         )
-
-
-def log_evidence_of_views(
-    recogniser: Recogniser,
-    observations: Sequence[Observation],
-) -> Floats:
-    """Return what a recogniser says of each view, in a form that can be summed over views.
-
-    Args:
-        recogniser: is asked once.
-        observations: V views.
-
-    Returns:
-        (V, D): see ``log_evidence_of``.
-
-    Raises:
-        ModelError: its answer is none.
-    """
-    evidence = recogniser(observations)
-    azimuths = azimuth_of(np.stack([direction_of(each.pose) for each in observations]))
-    return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
 
 
 def classes_of_other_size(

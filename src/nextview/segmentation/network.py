@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from nextview.errors import ModelError
-from nextview.files import HashText, read_record, write_record
+from nextview.files import HashText, read_record
 from nextview.runtime import check_end, open_onnx, run_onnx
 from nextview.segmentation.features import PICTURE_CHANNELS, SIDE_MULTIPLE
 from nextview.types import Float32
@@ -119,16 +119,6 @@ def read_segmentation_card(path: Path) -> SegmentationCard:
             " export it anew"
         )
     return card
-
-
-def write_segmentation_card(path: Path, card: SegmentationCard) -> None:
-    """Write a card; one that exists is replaced.
-
-    Args:
-        path: of the card.
-        card: its content.
-    """
-    write_record(path, card, overwrite=True)
 
 
 class SegmentationNetwork:

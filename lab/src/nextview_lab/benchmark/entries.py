@@ -15,7 +15,7 @@ from nextview.policies.base import (
     best_in_window,
     best_view,
 )
-from nextview.policies.baselines import orbit, ranked
+from nextview.policies.baselines import ranked
 from nextview.policies.maps import MapPeak, peaks_first
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import (
@@ -25,13 +25,13 @@ from nextview.policies.registry import (
     map_policy_names,
     policy_names,
 )
-from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
+from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, map_name
 from nextview.recognition.model_card import DISCRIMINATE
 from nextview.types import Float, Floats, Index
 from nextview_lab.benchmark.thing_policies import OF_MEMORIES
 from nextview_lab.benchmark.true_maps import TRUE, known_maps, true_measure
-from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.predictions import Predictions, of_true_class
 from nextview_lab.errors import EntryError
 
 
@@ -442,3 +442,22 @@ class OracleGain:
         )
 
         return of_true_class(logs, self.labels[objects])
+
+
+def orbit(sphere: ViewSphere, starts: Index, k: int) -> Index:
+    """Return the next views around the ring of each start, then around the ring above.
+
+    The lowest ring follows the top one.
+
+    Args:
+        sphere: the candidate views.
+        starts: first view of each episode, (E,) int64.
+        k: number of views.
+
+    Returns:
+        The views in order, (E, k) int64.
+    """
+    n = sphere.azimuths
+    step = np.arange(k)
+    ring = (sphere.ring[starts][:, None] + step // n) % sphere.rings
+    return ring * n + (sphere.azimuth_index[starts][:, None] + step) % n

@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from nextview.figures.style import (
     ACCENT,
@@ -14,7 +16,6 @@ from nextview.figures.style import (
     LIGHT_BLUE,
     legend,
     new_figure,
-    percent_axis,
 )
 from nextview.recognition.map_names import LCM, LEM
 from nextview_lab.benchmark.comparison import SIGNIFICANT, Tables, values_of
@@ -190,3 +191,10 @@ def confusion_matrix(e: Evaluation, n_views: int, classes: Sequence[str]) -> Fig
     title = "one view" if n_views == 1 else f"all {n_views} views fused"
     axes.set_title(title, fontsize=10, loc="left")
     return figure
+
+
+def percent_axis(axis: Axis) -> None:
+    """Format the ticks of an axis in percent, with as few digits as possible."""
+    axis.set_major_formatter(
+        FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %")
+    )

@@ -1,13 +1,16 @@
 """Format numbers and fill templates for the HTML pages of benchmarks and evaluations."""
 
 import base64
+import re
 from collections.abc import Mapping
+from io import StringIO
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from nextview.figures.style import to_svg
+from nextview.figures.style import FIGURE_STYLE
 from nextview.recognition.map_names import measure_of
 from nextview_lab.benchmark.entries import knows_truth
 from nextview_lab.benchmark.text_tables import NONE, points
@@ -107,3 +110,18 @@ def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:
         "splits": ", ".join(f"{n} {name or 'unnamed'}" for name, n in splits),
         "the same mesh under another label": ", ".join(conflicting) or "none",
     }
+
+
+def to_svg(figure: Figure) -> str:
+    """Return a figure as reproducible SVG text."""
+    text = StringIO()
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure.savefig(
+            text,
+            format="svg",
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None},
+        )
+    # characters that XML does not allow
+    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from nextview.errors import NextviewError, PolicyError, UsageError
-from nextview.policies.base import Evidence, Policy
-from nextview.policies.baselines import ViewList
+from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.recognition.belief import FixedLength, Stopping
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.own_stopping import Rule, own_stopping
@@ -25,6 +24,36 @@ from nextview_lab.errors import EntryError
 
 THESIS_THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # of the thesis (section 5.3)
 EPISODES_TOGETHER = 4096  # episodes of fixed views per batch
+
+
+@dataclass(frozen=True)
+class ViewList:
+    """Follows a fixed list of views.
+
+    Attributes:
+        views: of each episode in order, (E, k), starting with the first view.
+        needs: required inputs, see ``Policy.needs``.
+    """
+
+    views: Index
+    needs: tuple[str, ...] = ()
+
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
+        """Take the next view of the list.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+
+        Raises:
+            PolicyError: the list is exhausted.
+        """
+        if state.step >= self.views.shape[1]:
+            raise PolicyError(f"only {self.views.shape[1]} views are listed")
+        return self.views[state.episodes, state.step]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from nextview.checks import number_of, one_line, whole
-from nextview.data.progress import TrackProgress, collected, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ResultsError, UsageError
 from nextview.files import check_new, command, read_record
 from nextview.geometry.mesh import load_mesh
@@ -41,6 +41,7 @@ from nextview_lab.benchmark.submit import (
 )
 from nextview_lab.benchmark.text_tables import Board, Column
 from nextview_lab.data.metrics import add_s
+from nextview_lab.data.progress import collected
 from nextview_lab.extras import extras
 
 with extras():

@@ -15,8 +15,14 @@ import numpy as np
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, rotation_z
+from nextview.geometry.viewsphere import (
+    ViewSphere,
+    azimuth_of,
+    direction_of,
+    rotation_z,
+)
 from nextview.policies.base import EpisodeState
+from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import find_models
 from nextview.recognition.own_recogniser import own_recogniser
@@ -25,7 +31,6 @@ from nextview.recognition.protocol import (
     JudgesTogether,
     LooksAhead,
     Recogniser,
-    log_evidence_of_views,
 )
 from nextview.sensing.observation import Observation
 from nextview.session.recogniser import ThingRecogniser, open_recogniser
@@ -34,7 +39,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.surface import Surface
-from nextview.types import Float
+from nextview.types import Float, Floats
 from nextview.views.expected_views import Outlook
 from nextview_lab.data.metrics import add_s
 
@@ -358,3 +363,24 @@ def hiding_boxes(
             break
 
     return min(found, key=lambda pair: pair[0])[1]
+
+
+def log_evidence_of_views(
+    recogniser: Recogniser,
+    observations: Sequence[Observation],
+) -> Floats:
+    """Return what a recogniser says of each view, in a form that can be summed over views.
+
+    Args:
+        recogniser: is asked once.
+        observations: V views.
+
+    Returns:
+        (V, D): see ``log_evidence_of``.
+
+    Raises:
+        ModelError: its answer is none.
+    """
+    evidence = recogniser(observations)
+    azimuths = azimuth_of(np.stack([direction_of(each.pose) for each in observations]))
+    return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)

@@ -1,13 +1,13 @@
 """``nextview-lab render``, ``measure`` and ``predict``: make and use view stores."""
 
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from nextview.cli.common_options import NamedSplit, Workers
-from nextview.cli.progress import console, follow, say_done, track_all
+from nextview.cli.progress import console, follow, track
 from nextview.errors import DatasetError, ModelError, UsageError
 from nextview.geometry.mesh import MAX_FACES
 from nextview.geometry.viewsphere import ViewSphere
@@ -18,6 +18,22 @@ from nextview_lab.data.predictions import Predictions
 from nextview_lab.data.splits import some_objects
 from nextview_lab.data.store import ViewStore
 from nextview_lab.data.surfaces import mesh_views
+
+NamedSplit = Literal["train", "test", "val"]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Parallel processes.
+
+    Attributes:
+        workers: number of processes; by default one per core.
+        scheduler: address of a dask.distributed scheduler to use instead, such as
+            tcp://HOST:8786.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
 
 
 def render(
@@ -222,3 +238,55 @@ def summed_up(p: Predictions) -> list[str]:
         lines.append(f"{here.sum()} {split} objects: {shares}".replace("  ", " "))
 
     return lines
+
+
+def track_all(
+    done: Iterable[tuple[str, str | None]],
+    total: int,
+    what: str,
+    before: int = 0,
+) -> list[str]:
+    """Show the progress of a job and print the reasons of failed items.
+
+    Args:
+        done: name of each finished item, with None or the reason why it failed.
+        total: number of items.
+        what: name of the work.
+        before: number of items that were finished before this run.
+
+    Returns:
+        The reasons of the failed items.
+    """
+    failed: list[str] = []
+
+    def counts() -> Iterator[int]:
+        for n, (_, reason) in enumerate(done, before + 1):
+            failed.extend([reason] if reason else [])
+            yield n
+
+    track(counts(), total, what)
+    for reason in failed:
+        console.print(reason, style="yellow", soft_wrap=True)
+    return failed
+
+
+def say_done(where: Path, done: str, before: int, total: int) -> None:
+    """Print a summary of a run of a resumable stage.
+
+    Args:
+        where: output of the stage.
+        done: participle of the work, such as "measured" or "planned".
+        before: number of objects that were finished before this run.
+        total: number of all objects.
+    """
+    if before == total:
+        console.print(
+            f"{where}: nothing was left to do; all {total} objects were {done} before",
+            soft_wrap=True,
+        )
+        return
+    earlier = f", {before} were before" if before else ""
+    console.print(
+        f"{where}: {total - before} of {total} objects {done} now{earlier}",
+        soft_wrap=True,
+    )

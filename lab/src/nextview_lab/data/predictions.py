@@ -16,12 +16,7 @@ from nextview.errors import DAMAGED, DatasetError, option
 from nextview.files import decode_record, new_file, regular_file
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
-from nextview.recognition.belief import (
-    PLAIN_SUM,
-    Calibration,
-    log_evidence_of,
-    of_true_class,
-)
+from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.sensing.observation import enough_shows
 from nextview.types import Float, Float32, Index, Mask
 from nextview_lab.data.splits import deduplicated, duplicate_groups, some_objects
@@ -480,3 +475,18 @@ def _read(path: Path) -> dict[str, NDArray]:
                     f"{member.filename} announces more than it holds"
                 )
         return dict(file)
+
+
+def of_true_class(logs: Float, labels: Index) -> Float:
+    """Return the log-belief in the true class.
+
+    Args:
+        logs: logits up to a constant, (N, ..., C).
+        labels: true classes, (N,) int64.
+
+    Returns:
+        Log-belief, (N, ...) float64.
+    """
+    top = logs.max(-1)
+    of_truth = logs[np.arange(len(labels)), ..., labels]
+    return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))

@@ -14,16 +14,9 @@ from pathlib import Path
 import tyro
 
 from nextview.cli.exit_status import orderly_end
-from nextview.figures.style import (
-    ACCENT,
-    BLUE,
-    FAINT,
-    legend,
-    new_figure,
-    percent_axis,
-    to_png,
-)
+from nextview.figures.style import ACCENT, BLUE, FAINT, legend, new_figure, to_png
 from nextview.files import new_file
+from nextview_lab.benchmark.figures import percent_axis
 from nextview_lab.benchmark.statistics import wilson
 
 BELIEFS = (0.5, 0.8, 0.95, 0.97, 1.01)  # a confident name has at least the last but one

@@ -21,11 +21,10 @@ from nextview.recognition.belief import (
     RiskBounds,
     SizeEvidence,
     fuse,
-    of_true_class,
 )
 from nextview.recognition.model_card import ModelCard
 from nextview.types import Float, Floats, Index, Mask
-from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.predictions import Predictions, of_true_class
 from nextview_lab.data.splits import deduplicated
 from nextview_lab.data.store import ViewStore
 from nextview_lab.errors import PredictionsError

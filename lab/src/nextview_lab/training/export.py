@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from nextview.data.progress import TrackProgress, collected, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, sha256_of
 from nextview.recognition.inference import (
@@ -28,6 +28,7 @@ from nextview.types import Float32, Index
 from nextview_lab.data.measures import find_measure
 from nextview_lab.data.metrics import map_scores, recogniser_scores
 from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.progress import collected
 from nextview_lab.data.splits import deduplicate
 from nextview_lab.data.store import ViewStore
 from nextview_lab.extras import extras

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.data.progress import TrackProgress, collected, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.policies.base import Policy
@@ -29,6 +29,7 @@ from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_
 from nextview.runtime import open_onnx
 from nextview.types import Float, Float32, Floats
 from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.progress import collected
 from nextview_lab.extras import extras
 from nextview_lab.training.export import export_onnx
 from nextview_lab.training.fitting_set import hold_out, load_sensed

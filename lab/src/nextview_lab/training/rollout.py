@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from nextview.policies.base import EpisodeState, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import INPUTS, VISIBILITY, CellFrame, Gain, maps_of
-from nextview.recognition.belief import PLAIN_SUM, FixedLength, of_true_class
+from nextview.recognition.belief import PLAIN_SUM, FixedLength
 from nextview.recognition.map_names import in_order
 from nextview.session.episode import Step, run_episodes
 from nextview.types import Float, Index, Mask
-from nextview_lab.data.predictions import Predictions
+from nextview_lab.data.predictions import Predictions, of_true_class
 from nextview_lab.errors import PredictionsError
 from nextview_lab.training.card_fits import fit_temperature
 from nextview_lab.training.fitting_set import for_fitting

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from nextview.data.progress import TrackProgress, collected, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import ModelError
-from nextview.files import command, new_folder, sha256_of
+from nextview.files import command, new_folder, sha256_of, write_record
 from nextview.segmentation.features import SIDE_MULTIPLE
 from nextview.segmentation.network import (
     PICTURE_INPUT,
     PICTURE_OUTPUT,
     SegmentationNetwork,
     new_card,
-    write_segmentation_card,
 )
 from nextview_lab.data.labelled_frames import LabelledFrames, output_scores
+from nextview_lab.data.progress import collected
 from nextview_lab.extras import extras
 from nextview_lab.training.architectures import SegmentationNet
 from nextview_lab.training.export import Exported, check_new_model, export_onnx
@@ -89,7 +89,7 @@ def export_segmentation(
             held_out=noted.held_out,
             note=note,
         )
-        write_segmentation_card(part, card)
+        write_record(part, card, overwrite=True)
     return Exported(out / f"{name}.json", difference)
 
 
@@ -109,7 +109,7 @@ def _write_weights(
         bits,
         SIDE_MULTIPLE,
     )
-    write_segmentation_card(card, new_card(card.stem, sha256_of(weights)))
+    write_record(card, new_card(card.stem, sha256_of(weights)), overwrite=True)
 
 
 def folded(network: SegmentationNet) -> SegmentationNet:
