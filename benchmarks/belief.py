@@ -1,6 +1,6 @@
 """Fit the belief in a name to drawn frames and real ones: what each term of it should weigh.
 
-    python -m benchmarks.belief [DATA] [--strangers 5]
+    python -m benchmarks.belief [DATA] [--strangers 4]
 
 DATA is that of ``benchmarks.gate``. Its tables, hidden and moved things are shown to scenes, and
 each of its real frames to a scene of its own: to scenes that know all things, and to others that
@@ -208,7 +208,7 @@ def worth_of(right: gate.Mask, named: gate.Mask, sure: gate.Mask) -> float:
 
 def main(
     data: tyro.conf.Positional[Path] = Path(os.environ.get("NEXTVIEW_DATA", "data")),
-    strangers: int = 5,
+    strangers: int = 4,
     frames: Path = Path("~/.cache/nextview/gate"),
 ) -> None:
     """Fit the belief in a name.

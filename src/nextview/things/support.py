@@ -31,35 +31,50 @@ def supported(world: World, rows: Index, carriers: Index) -> Float:
     Returns:
         0 where nothing is known to carry them.
     """
-    some = world.hypotheses[rows]
-    corners = world.library.corners[some.things] * some.sizes[:, None]
-    corners = corners @ some.rotations.swapaxes(1, 2) + some.centres[:, None]
     found = np.zeros(len(rows))
-    for k, row in enumerate(rows):
-        gaps = []
-        for view, one in zip(world.views, world.scores[row], strict=True):
-            if one is None:
-                continue
-            cells = one.cells[one.gain > 0]
-            cells = cells[:: max(1, len(cells) // CARRIER_PIXELS)]
-            plane = view.points(cells) @ view.up - view.grid().height.ravel()[cells]
-            plane = plane[np.isfinite(plane)]
-            if not len(plane):
-                continue
-            away = np.linalg.norm(some.centres[k] - view.camera[:3, 3])
-            error = HEIGHT_ERROR * float(away)
-            gap = float((corners[k] @ view.up).min() - np.median(plane))
-            if gap > error:
-                above = _above(world, row, carriers, view.up, 3 * error)
-                gap = min(gap, abs(above))
-            gaps.append(gap / error)
-        if gaps:
-            stands = np.exp(-(np.median(gaps) ** 2) / 2)
-            found[k] = np.log(
-                stands * (1 - CARRIED) / STANDS_WRONG
-                + (1 - stands) * CARRIED / (1 - STANDS_WRONG)
-            )
+    for k, row in enumerate(rows.tolist()):
+        gaps = _gaps(world, row, carriers)
+        if not gaps:
+            continue
+
+        stands = np.exp(-(np.median(gaps) ** 2) / 2)
+        found[k] = np.log(
+            stands * (1 - CARRIED) / STANDS_WRONG
+            + (1 - stands) * CARRIED / (1 - STANDS_WRONG)
+        )
     return found
+
+
+def _gaps(world: World, row: int, carriers: Index) -> list[float]:
+    """Return how far a hypothesis is above what carries it in each view, errors; negative below.
+
+    Args:
+        world: the world.
+        row: of the hypothesis.
+        carriers: rows of things that it may stand on, (K,) int64.
+    """
+    some = world.hypotheses
+    corners = world.library.corners[some.things[row]] * some.sizes[row]
+    corners = corners @ some.rotations[row].T + some.centres[row]
+    gaps = []
+    for view, one in zip(world.views, world.scores[row], strict=True):
+        if one is None:
+            continue
+        cells = one.cells[one.gain > 0]
+        cells = cells[:: max(1, len(cells) // CARRIER_PIXELS)]
+        plane = view.points(cells) @ view.up - view.grid().height.ravel()[cells]
+        plane = plane[np.isfinite(plane)]
+        if not len(plane):
+            continue
+
+        away = np.linalg.norm(some.centres[row] - view.camera[:3, 3])
+        error = HEIGHT_ERROR * float(away)
+        gap = float((corners @ view.up).min() - np.median(plane))
+        # what is not on the plane may be on another thing
+        if gap > error:
+            gap = min(gap, abs(_above(world, row, carriers, view.up, 3 * error)))
+        gaps.append(gap / error)
+    return gaps
 
 
 def _above(world: World, row: int, carriers: Index, up: Float, deepest: float) -> float:
